@@ -1,0 +1,33 @@
+"""The errors that torchslam raises on purpose. All derive from `TorchslamError`; the message says what, where and what to do."""
+
+
+class TorchslamError(Exception):
+    """Base of every error that torchslam raises on purpose."""
+
+
+class ConfigError(TorchslamError):
+    """A configuration file or a `--set` value is unknown, of the wrong type or out of range."""
+
+
+class SequenceError(TorchslamError):
+    """A sequence as a whole cannot be read: missing lists, doubled timestamps, no images."""
+
+
+class CalibrationError(SequenceError):
+    """A camera calibration is missing or wrong: NaN, negative focal length, too few numbers."""
+
+
+class FrameError(TorchslamError):
+    """One image of a sequence cannot be read or has another size. A run skips the frame and counts it."""
+
+
+class TrajectoryError(TorchslamError):
+    """A trajectory file or object is malformed, or two of them have nothing in common."""
+
+
+class DownloadError(TorchslamError):
+    """A download or an archive is incomplete, unsafe or not what it should be."""
+
+
+class InitializationError(TorchslamError):
+    """No map could be initialised; the message says why (standstill, pure rotation, too few matches)."""

@@ -1,0 +1,128 @@
+"""The values that travel between the stages of the pipeline: small frozen dataclasses of tensors.
+
+Letters in shapes: B batch, N keypoints, M matches, L points; H, W image height and width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a sequence.
+
+    index:     position in the sequence, from 0
+    timestamp: seconds
+    image:     (1, 1, H, W) float32 in [0, 1], grey
+    name:      what the image is called in messages (its path, or `video.mp4#17`)
+    T_cw_groundtruth: (4, 4) float64 world to camera, where the sequence knows it. Read only by simulated features,
+               by scale from ground truth and by evaluation.
+    """
+
+    index: int
+    timestamp: float
+    image: Tensor
+    name: str = ""
+    T_cw_groundtruth: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Features:
+    """A batch of keypoints with descriptors. Invalid rows (`mask` False) are finite.
+
+    keypoints:   (B, N, 2) pixels (x, y) of the full-resolution image; (0, 0) is the centre of the top left pixel
+    scores:      (B, N) response of the detector, higher is better
+    scales:      (B, N) size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0)
+    angles:      (B, N) radians, clockwise in the image (from x towards y)
+    descriptors: (B, N, 32) uint8, 256 bits packed least significant first; or (B, N, D) floats of unit length
+    mask:        (B, N) bool, True where the row is a keypoint
+    """
+
+    keypoints: Tensor
+    scores: Tensor
+    scales: Tensor
+    angles: Tensor
+    descriptors: Tensor
+    mask: Tensor
+
+    def __getitem__(self, rows: slice) -> Features:
+        """A part of the batch, by slice."""
+        return Features(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def to(self, device: torch.device | str) -> Features:
+        return Features(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Matches:
+    """A batch of matches between two sets of features. Invalid rows have index 0 and `mask` False.
+
+    indices_1: (B, M) int64 rows in the first set
+    indices_2: (B, M) int64 rows in the second set
+    distances: (B, M) float32: Hamming distance in bits, or 1 - cosine
+    mask:      (B, M) bool
+    weights:   (B, M) soft matching weights where they were asked for, else None
+    """
+
+    indices_1: Tensor
+    indices_2: Tensor
+    distances: Tensor
+    mask: Tensor
+    weights: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time, ordered by timestamp.
+
+    timestamps: (N,) float64 seconds
+    T_wc:       (N, 4, 4) camera to world
+    """
+
+    timestamps: Tensor
+    T_wc: Tensor
+
+    def __len__(self) -> int:
+        return int(self.timestamps.shape[0])
+
+    @property
+    def positions_w(self) -> Tensor:
+        """(N, 3) camera centres."""
+        return self.T_wc[:, :3, 3]
+
+
+class State(Enum):
+    """What the system is doing."""
+
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What came out of one frame.
+
+    state:       after the frame
+    T_cw:        (4, 4) pose of the frame, world to camera; None while initializing or lost
+    is_keyframe: whether the frame became a keyframe
+    matches:     map points matched in this frame
+    inliers:     of these, those that agree with the pose
+    reason:      in words, why there is no pose or why the frame is a keyframe; empty otherwise
+    stage_ms:    milliseconds per stage
+    """
+
+    index: int
+    timestamp: float
+    state: State
+    T_cw: Tensor | None
+    is_keyframe: bool = False
+    matches: int = 0
+    inliers: int = 0
+    reason: str = ""
+    stage_ms: dict[str, float] = field(default_factory=dict)
