@@ -1,0 +1,40 @@
+"""Fixtures that every test may use: device, dtype, the real sequences, one torch thread."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+# Two torch threads on two busy cores wait for each other at barriers.
+torch.set_num_threads(1)
+
+DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return torch.device(request.param)
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+    return request.param
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def data_dir() -> Iterator[Path]:
+    """The folder of real sequences; the test is skipped where it is missing."""
+    if not DATA_DIR.is_dir():
+        pytest.skip(f"no real sequences at {DATA_DIR}; set TORCHSLAM_DATA to the folder that has them")
+    yield DATA_DIR
