@@ -1,0 +1,67 @@
+# The two commands a newcomer needs are `make demo` and `make test`; both make their own environment first.
+#   VENV=path      use (or create) another virtual environment than .venv
+#   PYTHON=python  the interpreter that creates it
+#   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
+
+PYTHON ?= python3
+VENV ?= .venv
+PYTEST_ARGS ?=
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# Stamps: an environment is made again only when what it is made from has changed.
+INSTALLED := $(VENV)/.torchslam-installed
+INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
+INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
+
+.PHONY: help demo test lint types format benchmarks clean distclean
+.DEFAULT_GOAL := help
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */\1\t/' | expand -t 14
+
+demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a table
+	$(BIN)/torchslam demo --output results/demo
+
+test: lint  ## lint, then the tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(INSTALLED_DEV) types  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED_DEV)  ## mypy alone
+	$(BIN)/mypy
+
+format: $(INSTALLED_DEV)  ## rewrite the sources in the house style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against the peers
+	$(BIN)/python experiments/benchmarks/run.py
+
+clean:  ## remove results and caches, keep the environment
+	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean  ## remove the environment too
+	rm -rf .venv *.egg-info
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+# torch comes first, alone: the build named in constraints.txt then satisfies everything that depends on it.
+# pip learned --group in 25.1.
+$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --upgrade 'pip>=25.1'
+	$(PIP) torch
+	$(PIP) --editable .
+	@touch $@
+
+$(INSTALLED_DEV): $(INSTALLED)
+	$(PIP) --group test --group lint
+	@touch $@
+
+$(INSTALLED_BENCHMARKS): $(INSTALLED)
+	$(PIP) --group benchmarks
+	@touch $@
