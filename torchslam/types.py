@@ -77,6 +77,53 @@ class Matches:
 
 
 @dataclass(frozen=True)
+class View:
+    """What the system sees of one frame: its keypoints as the geometry uses them, unbatched.
+
+    keypoints:   (N, 2) pixels, in the dtype of the geometry (float64 unless configured)
+    scales:      (N,) pixels: the standard deviation of a keypoint grows with the size of its pyramid level
+    angles:      (N,) radians
+    descriptors: (N, D)
+    mask:        (N,) bool
+    """
+
+    index: int
+    timestamp: float
+    keypoints: Tensor
+    scales: Tensor
+    angles: Tensor
+    descriptors: Tensor
+    mask: Tensor
+    T_cw_groundtruth: Tensor | None = None
+
+    @classmethod
+    def of(cls, frame: Frame, features: Features, dtype: torch.dtype) -> View:
+        """The first element of a batch of features, in the dtype of the geometry."""
+        return cls(
+            frame.index,
+            frame.timestamp,
+            features.keypoints[0].to(dtype),
+            features.scales[0].to(dtype),
+            features.angles[0].to(dtype),
+            features.descriptors[0],
+            features.mask[0],
+            None if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth.to(dtype),
+        )
+
+    @property
+    def max_scale(self) -> float:
+        """The coarsest scale among the keypoints; 1 for a detector with a single scale."""
+        return float(self.scales.where(self.mask, 1.0).max())
+
+    @property
+    def features(self) -> Features:
+        """The keypoints as a batch of one, for matching."""
+        scores = torch.ones_like(self.scales)
+        columns = (self.keypoints, scores, self.scales, self.angles, self.descriptors, self.mask)
+        return Features(*(column[None] for column in columns))
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """Camera poses over time, ordered by timestamp.
 

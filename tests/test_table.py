@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchslam.table import Table
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=12))
+def test_rows_come_back_in_the_order_they_went_in(sizes: list[int]) -> None:
+    table, expected = Table(), []
+    for size in sizes:
+        values = torch.arange(size) + 1000 * len(expected)
+        ids = table.append(number=values, place=values[:, None].double().expand(size, 3))
+        assert ids.tolist() == list(range(sum(map(len, expected)), len(table)))
+        expected.append(values)
+    assert torch.equal(table["number"], torch.cat(expected))
+    assert table["place"].shape == (len(table), 3)
+    assert table["place"].dtype == torch.float64
+
+
+def test_capacity_doubles_so_most_appends_do_not_move_the_storage() -> None:
+    table = Table()
+    places = set()
+    for _ in range(1000):
+        table.append(number=torch.ones(1))
+        places.add(table["number"].data_ptr())
+    assert len(places) <= 6
+
+
+def test_a_column_is_a_view_of_the_storage() -> None:
+    table = Table()
+    table.append(number=torch.zeros(3))
+    table["number"][1] = 5.0
+    assert table["number"].tolist() == [0.0, 5.0, 0.0]
+
+
+def test_what_is_stored_carries_no_graph() -> None:
+    table = Table()
+    table.append(number=torch.ones(2, requires_grad=True) * 2)
+    assert not table["number"].requires_grad
+
+
+def test_columns_that_differ_are_refused() -> None:
+    table = Table()
+    with pytest.raises(ValueError, match="differ in length"):
+        table.append(a=torch.zeros(2), b=torch.zeros(3))
+    table.append(a=torch.zeros(2))
+    with pytest.raises(ValueError, match="columns are"):
+        table.append(b=torch.zeros(2))

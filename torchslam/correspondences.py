@@ -1,0 +1,101 @@
+"""Who matches whom: views with views, map points with a view. The configured thresholds meet the pure matchers here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.config import MatchingConfig
+from torchslam.features import match, match_projected
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.map import Map
+from torchslam.types import View
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Map points that a camera may see: ids (n,), pixels (n, 2), scales (n,) expected, angles (n,) last seen."""
+
+    ids: Tensor
+    pixels: Tensor
+    scales: Tensor
+    angles: Tensor
+
+
+def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
+    """The threshold for this kind of descriptor: bits, or 1 - cosine."""
+    return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
+
+
+def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) keypoints of two views that match: mutual, by ratio, one to one."""
+    matches = match(
+        view_1.features,
+        view_2.features,
+        ratio=settings.ratio,
+        mutual=True,
+        max_distance=max_distance(view_1.descriptors, settings),
+    )
+    found = matches.mask[0]
+    return matches.indices_1[0][found], matches.indices_2[0][found]
+
+
+def project_points(
+    slam_map: Map, ids: Tensor, T_cw: Tensor, camera: Camera, max_view_angle_deg: float, max_scale: float
+) -> Projected:
+    """The points (n,) in front of the camera, inside the image and seen from a similar side as before.
+
+    Expected scales stay between 1 and `max_scale`, the coarsest that the detector has.
+    """
+    points = slam_map.points
+    positions_w = points["positions_w"][ids]
+    pixels, valid = camera.project(transform(T_cw, positions_w))
+    rays_w = positions_w - se3_inverse(T_cw)[:3, 3]
+    distance = torch.linalg.vector_norm(rays_w, dim=-1)
+    cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance.clamp(min=1e-12)
+    least = math.cos(math.radians(max_view_angle_deg))
+    kept = torch.nonzero(valid & camera.in_image(pixels) & (cosine > least))[:, 0]
+    ids = ids[kept]
+    scales = (points["reach"][ids] / distance[kept].clamp(min=1e-12)).clamp(1.0, max_scale)
+    return Projected(ids, pixels[kept], scales, points["angles"][ids])
+
+
+def match_near(
+    slam_map: Map, projected: Projected, view: View, radius_px: float, settings: MatchingConfig, ratio: float
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) point ids and keypoints that match within a radius around the projection, one to one.
+
+    The radius is in pixels of the pyramid level at which the point is expected.
+    """
+    descriptors = slam_map.points["descriptors"][projected.ids]
+    if len(projected.ids) == 0:
+        return projected.ids, projected.ids
+    matches = match_projected(
+        descriptors[None],
+        projected.pixels[None],
+        (radius_px * projected.scales)[None],
+        view.features,
+        scales=projected.scales[None],
+        max_distance=max_distance(descriptors, settings),
+        ratio=ratio,
+    )
+    found = matches.mask[0]
+    return projected.ids[matches.indices_1[0][found]], matches.indices_2[0][found]
+
+
+def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) point ids and keypoints that match by descriptor alone, wherever they are in the image."""
+    if len(ids) == 0:
+        return ids, ids
+    matches = match(
+        slam_map.point_features(ids),
+        view.features,
+        ratio=settings.ratio,
+        mutual=True,
+        max_distance=max_distance(view.descriptors, settings),
+    )
+    found = matches.mask[0]
+    return ids[matches.indices_1[0][found]], matches.indices_2[0][found]

@@ -1,0 +1,169 @@
+"""The first map: two views, an essential matrix, triangulated points, and the judgement whether they are worth a start."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config, InitializationConfig
+from torchslam.correspondences import match_views
+from torchslam.geometry import Camera, Triangulation, estimate_relative_pose, triangulate
+from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.types import View
+
+
+@dataclass(frozen=True)
+class Start:
+    """A pair of views good enough to start a map.
+
+    reference, view: the two views; the camera of the reference is the world
+    T_cw:      (4, 4) pose of the second view
+    points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
+    """
+
+    reference: View
+    view: View
+    T_cw: Tensor
+    points_w: Tensor
+    keypoints_1: Tensor
+    keypoints_2: Tensor
+
+
+class Initializer:
+    """Tries every frame against a reference frame until two of them make a map worth having."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.camera = camera
+        self.config = config
+        self.views: list[View] = []  # the reference and what came after it
+
+    @property
+    def reference(self) -> View:
+        return self.views[0]
+
+    def step(self, view: View) -> tuple[Start | None, str]:
+        """A start, or None and the reason in words."""
+        if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
+            self.views = [view]
+            return None, "took a reference frame"
+        self.views.append(view)
+        first, second = match_views(self.reference, view, self.config.matching)
+        least = self.config.initialization.min_matches
+        if len(first) < least:
+            self.views = [view]
+            return None, f"too few matches with the reference frame: {len(first)}, {least} are needed"
+        return self._relate(view, first, second)
+
+    def _relate(self, view: View, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
+        """The relative pose of the two views, unless the image stands still."""
+        settings = self.config.initialization
+        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
+        moved = float(torch.linalg.vector_norm(pixels_2 - pixels_1, dim=-1).median())
+        if moved < settings.min_motion_px:
+            return None, f"the camera stands still: the image moved by {moved:.1f} px"
+        relative = estimate_relative_pose(
+            pixels_1[None],
+            pixels_2[None],
+            self.camera,
+            self.camera,
+            threshold=settings.threshold_px,
+            seed=self.config.seed,
+        )
+        if not bool(relative.success[0]):
+            return None, f"no translation between the frames: {relative.model[0]} explains the matches"
+        inliers = torch.nonzero(relative.inliers[0])[:, 0]
+        return self._judge(view, relative.T_21[0], first[inliers], second[inliers])
+
+    def _judge(self, view: View, T_cw: Tensor, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
+        """Triangulate, refine both together, and count the points that are worth something."""
+        settings = self.config.initialization
+        T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
+        scales = torch.maximum(self.reference.scales[first], view.scales[second])
+        seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
+        good = is_good(seen, scales, self.camera, settings)
+        reason = why_not(good, seen, len(first), settings)
+        if reason:
+            return None, reason
+        keep = torch.nonzero(good)[:, 0]
+        poses, points_w, accurate = refine_pair(
+            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], scales[keep], self.camera
+        )
+        if int(accurate.sum()) < settings.min_points:
+            return (
+                None,
+                f"too few points survive refinement: {int(accurate.sum())}, {settings.min_points} are needed",
+            )
+        keep = keep[accurate]
+        return Start(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
+
+
+def is_good(seen: Triangulation, scales: Tensor, camera: Camera, settings: InitializationConfig) -> Tensor:
+    """(n,) which triangulated points count for a start.
+
+    With the criterion "uncertainty": the standard deviation of a depth z seen under the parallax a is about
+    z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
+    With "parallax": when the angle is large enough.
+    """
+    is_close = torch.maximum(seen.errors_1, seen.errors_2) < 2 * settings.threshold_px * scales
+    if settings.criterion == "parallax":
+        return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
+    relative_std = scales / (camera.focal * seen.angles.clamp(min=1e-9))
+    return seen.mask & is_close & (relative_std < settings.max_depth_std)
+
+
+def why_not(good: Tensor, seen: Triangulation, matches: int, settings: InitializationConfig) -> str:
+    """Why these points are no start; empty when they are."""
+    count = int(good.sum())
+    in_front = float(seen.mask.float().mean())
+    if in_front < 0.8:
+        return f"matches behind a camera: only {in_front:.0%} lie in front of both"
+    mean_angle = math.degrees(float(seen.angles[seen.mask].mean()))
+    if count < settings.min_points:
+        return f"too little parallax: {count} points have enough, {settings.min_points} are needed (mean {mean_angle:.2f} degrees)"
+    if settings.criterion == "parallax":
+        if mean_angle < settings.min_mean_parallax_deg:
+            return f"too little parallax: {mean_angle:.2f} degrees in the mean, {settings.min_mean_parallax_deg} are needed"
+    elif count < settings.min_good_share * matches:
+        return f"depths too uncertain: {count} of {matches} are known well enough, {settings.min_good_share:.0%} are needed"
+    return ""
+
+
+def refine_pair(
+    T_cw: Tensor, points_w: Tensor, pixels_1: Tensor, pixels_2: Tensor, scales: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bundle adjustment of two views with the first one fixed.
+
+    Returns the second pose (4, 4), with the length of the baseline as it was, the points (n, 3) and which of them
+    (n,) agree with both views.
+    """
+    n = len(points_w)
+    device = points_w.device
+    T = torch.stack([torch.eye(4, dtype=T_cw.dtype, device=device), T_cw])
+    frame_index = torch.arange(2, device=device).repeat_interleave(n)
+    point_index = torch.arange(n, device=device).repeat(2)
+    pixels = torch.cat([pixels_1, pixels_2])
+    weights = scales.repeat(2) ** -2
+    fixed = torch.tensor([True, False], device=device)
+    problem = BundleProblem(
+        T, points_w, frame_index, point_index, pixels, camera, weights=weights, fixed_frames=fixed
+    )
+    solution = bundle_adjust(problem, kernel="huber", scale=2.0, iterations=10, backward="detached")
+    factor = torch.linalg.vector_norm(T_cw[:3, 3]) / torch.linalg.vector_norm(solution.T_cw[1, :3, 3])
+    refined = solution.T_cw[1].clone()
+    refined[:3, 3] *= factor
+    points_w = solution.points_w * factor
+    check = triangulation_errors(
+        torch.stack([T[0], refined]), points_w, torch.stack([pixels_1, pixels_2]), camera
+    )
+    return refined, points_w, (check < 5.991 * scales**2).all(0)
+
+
+def triangulation_errors(T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
+    """(V, n) squared reprojection errors of points (n, 3) in V views, infinite behind a camera."""
+    points_c = points_w @ T_cw[:, :3, :3].mT + T_cw[:, None, :3, 3]
+    projected, valid = camera.project(points_c)
+    return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)

@@ -1,0 +1,82 @@
+"""Bundle adjustment of a part of the map: which keyframes are free, which are fixed, what happens to outliers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchslam.config import BundleConfig
+from torchslam.geometry import Camera, transform
+from torchslam.map import Map, Observations
+from torchslam.solvers import BundleProblem, bundle_adjust
+
+CHI_SQUARE = 5.991  # 95 % of two degrees of freedom
+HUBER = CHI_SQUARE**0.5
+
+
+def adjust(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig) -> None:
+    """Adjust a keyframe, the ones that see most of its points, and all points that these see.
+
+    Other keyframes that see these points take part with fixed poses, and so does the first keyframe of the map.
+    """
+    near = slam_map.covisible(keyframe, settings.window - 1)
+    free = torch.cat([near.new_tensor([keyframe]), near])
+    free = free[free != 0]
+    shared = slam_map.observers(slam_map.points_seen_by(free))
+    shared[free] = 0
+    order = torch.sort(shared, descending=True, stable=True)
+    fixed = order.indices[: settings.max_fixed][order.values[: settings.max_fixed] > 0]
+    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations)
+
+
+def adjust_all(slam_map: Map, camera: Camera, settings: BundleConfig) -> None:
+    """Adjust the whole map, the first keyframe fixed."""
+    everyone = torch.arange(slam_map.num_keyframes)
+    adjust_keyframes(slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations)
+
+
+def adjust_keyframes(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera, iterations: int) -> None:
+    """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
+    keyframes = torch.sort(torch.cat([free, fixed])).values
+    is_point = torch.zeros(len(slam_map.points), dtype=torch.bool)
+    is_point[slam_map.points_seen_by(free)] = True
+    seen = slam_map.observations(keyframes)
+    seen = select(seen, is_point[seen.point_index])
+    twice = torch.bincount(seen.point_index, minlength=len(slam_map.points)) >= 2
+    seen = select(seen, twice[seen.point_index])
+    if len(seen) == 0:
+        return
+    point_ids, point_index = torch.unique(seen.point_index, return_inverse=True)
+    problem = BundleProblem(
+        slam_map.T_cw[keyframes],
+        slam_map.positions_w[point_ids],
+        torch.searchsorted(keyframes, seen.keyframe_index),
+        point_index,
+        seen.pixels,
+        camera,
+        weights=seen.scales**-2,
+        fixed_frames=torch.isin(keyframes, fixed),
+    )
+    solution = bundle_adjust(problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached")
+    if not bool(solution.success):
+        return
+    slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
+    slam_map.points["positions_w"][point_ids] = solution.points_w
+    drop_outliers(slam_map, seen, camera)
+    slam_map.refresh(keyframes)
+
+
+def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
+    """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
+    points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
+    projected, valid = camera.project(points_c)
+    errors = ((projected[:, 0] - seen.pixels) ** 2).sum(-1)
+    wrong = ~valid[:, 0] | (errors > CHI_SQUARE * seen.scales**2)
+    slam_map.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
+    touched = torch.unique(seen.point_index[wrong])
+    slam_map.kill(touched[slam_map.observation_counts()[touched] < 2])
+
+
+def select(seen: Observations, rows: Tensor) -> Observations:
+    """Some of the observations, by mask or index."""
+    return Observations(*(getattr(seen, name)[rows] for name in Observations.__dataclass_fields__))

@@ -1,0 +1,254 @@
+"""The map: points, keyframes and who observes whom, as tensors that grow.
+
+Points are never removed, only marked dead, so an id stays valid for the whole run. The table of keyframes holds
+for each keypoint the id of the point it observes, or -1: every list of observations is a view of that table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry import se3_inverse
+from torchslam.table import Table
+from torchslam.types import Features, View
+
+NO_POINT = -1
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
+
+    keyframe_index, keypoint_index, point_index: (O,) int64
+    pixels: (O, 2); scales: (O,) pixels
+    """
+
+    keyframe_index: Tensor
+    keypoint_index: Tensor
+    point_index: Tensor
+    pixels: Tensor
+    scales: Tensor
+
+    def __len__(self) -> int:
+        return len(self.point_index)
+
+
+class Map:
+    """Points and keyframes of one world frame."""
+
+    def __init__(self) -> None:
+        self.points = Table()
+        self.keyframes = Table()
+
+    # --- size and plain access -------------------------------------------------------------------------------
+
+    @property
+    def num_keyframes(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def num_points(self) -> int:
+        """How many points are alive."""
+        return int(self.points["alive"].sum()) if len(self.points) else 0
+
+    @property
+    def T_cw(self) -> Tensor:
+        """(K, 4, 4) poses of the keyframes, world to camera."""
+        return self.keyframes["T_cw"]
+
+    @property
+    def positions_w(self) -> Tensor:
+        """(L, 3) positions of all points ever made, dead ones included."""
+        return self.points["positions_w"]
+
+    def living_points(self) -> Tensor:
+        """(L',) ids of the points that are alive."""
+        return torch.nonzero(self.points["alive"])[:, 0]
+
+    def point_features(self, point_ids: Tensor) -> Features:
+        """The points (n,) as a batch of one of features without a place in an image, for matching by descriptor."""
+        points = self.points
+        ones = torch.ones_like(points["reach"][point_ids])[None]
+        return Features(
+            keypoints=ones.new_zeros(1, len(point_ids), 2),
+            scores=ones,
+            scales=ones,
+            angles=points["angles"][point_ids][None],
+            descriptors=points["descriptors"][point_ids][None],
+            mask=points["alive"][point_ids][None],
+        )
+
+    # --- growing ---------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, view: View, T_cw: Tensor) -> int:
+        """Add a keyframe that observes nothing yet; returns its index."""
+        ids = self.keyframes.append(
+            T_cw=T_cw[None],
+            frame_index=torch.tensor([view.index], device=T_cw.device),
+            timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=T_cw.device),
+            keypoints=view.keypoints[None],
+            scales=view.scales[None],
+            angles=view.angles[None],
+            descriptors=view.descriptors[None],
+            mask=view.mask[None],
+            point_ids=torch.full((1, len(view.mask)), NO_POINT, device=T_cw.device),
+        )
+        return int(ids[0])
+
+    def add_points(self, positions_w: Tensor, descriptors: Tensor, keyframe: int) -> Tensor:
+        """Add points (n, 3) with descriptors (n, D), first seen in a keyframe; returns their ids (n,).
+
+        Their view directions and scales are set by `refresh`, once they are observed.
+        """
+        n, like = len(positions_w), positions_w
+        frame_index = self.keyframes["frame_index"][keyframe].expand(n)
+        return self.points.append(
+            positions_w=positions_w,
+            descriptors=descriptors,
+            normals_w=like.new_zeros(n, 3),
+            reach=like.new_zeros(n),
+            angles=like.new_zeros(n),
+            last_seen=frame_index,
+            born=torch.full((n,), keyframe, device=like.device),
+            times_visible=torch.ones(n, dtype=torch.int64, device=like.device),
+            times_found=torch.ones(n, dtype=torch.int64, device=like.device),
+            alive=torch.ones(n, dtype=torch.bool, device=like.device),
+            replaced_by=torch.full((n,), NO_POINT, device=like.device),
+        )
+
+    # --- observations ----------------------------------------------------------------------------------------
+
+    def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
+        """Note that keypoints (n,) of a keyframe see points (n,)."""
+        self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
+
+    def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
+        """Drop observations, given by keyframe (n,) and keypoint (n,)."""
+        self.keyframes["point_ids"][keyframe_index, keypoint_index] = NO_POINT
+
+    def observations(self, keyframes: Tensor | None = None) -> Observations:
+        """All observations by the keyframes (k,) of this list; by all keyframes without it."""
+        if keyframes is None:
+            keyframes = torch.arange(self.num_keyframes, device=self.T_cw.device)
+        table = self.keyframes["point_ids"][keyframes]
+        row, keypoint = torch.nonzero(table >= 0, as_tuple=True)
+        keyframe = keyframes[row]
+        return Observations(
+            keyframe,
+            keypoint,
+            table[row, keypoint],
+            self.keyframes["keypoints"][keyframe, keypoint],
+            self.keyframes["scales"][keyframe, keypoint],
+        )
+
+    def observers(self, point_ids: Tensor, keyframes: Tensor | None = None) -> Tensor:
+        """(K,) how many of the points (n,) each keyframe observes; or each keyframe of a list (k,)."""
+        wanted = torch.zeros(len(self.points) + 1, dtype=torch.bool, device=point_ids.device)
+        wanted[point_ids] = True
+        table = self.keyframes["point_ids"]
+        return wanted[table if keyframes is None else table[keyframes]].sum(
+            1
+        )  # NO_POINT reads the last entry, which is never set
+
+    def observation_counts(self) -> Tensor:
+        """(L,) how many keyframes observe each point."""
+        table = self.keyframes["point_ids"].flatten()
+        return torch.bincount(table[table >= 0], minlength=len(self.points))
+
+    def view(self, keyframe: int) -> View:
+        """What a keyframe saw."""
+        row = self.keyframes
+        return View(
+            int(row["frame_index"][keyframe]),
+            float(row["timestamp"][keyframe]),
+            *(row[name][keyframe] for name in ("keypoints", "scales", "angles", "descriptors", "mask")),
+        )
+
+    def covisible(self, keyframe: int, count: int, min_shared: int = 15) -> Tensor:
+        """(<= count,) keyframes that share most points with this one, best first, itself excluded."""
+        seen = self.keyframes["point_ids"][keyframe]
+        shared = self.observers(seen[seen >= 0])
+        shared[keyframe] = 0
+        order = torch.sort(shared, descending=True, stable=True)
+        return order.indices[:count][order.values[:count] >= min_shared]
+
+    def points_seen_by(self, keyframes: Tensor) -> Tensor:
+        """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""
+        table = self.keyframes["point_ids"][keyframes].flatten()
+        return torch.unique(table[table >= 0])
+
+    # --- changing --------------------------------------------------------------------------------------------
+
+    def kill(self, point_ids: Tensor) -> None:
+        """Mark points (n,) dead and drop their observations."""
+        if len(point_ids) == 0:
+            return
+        self.points["alive"][point_ids] = False
+        doomed = torch.zeros(len(self.points) + 1, dtype=torch.bool, device=point_ids.device)
+        doomed[point_ids] = True
+        table = self.keyframes["point_ids"]
+        table[doomed[table]] = NO_POINT
+
+    def replace(self, old: Tensor, new: Tensor) -> None:
+        """Merge points: every observation of old (n,) becomes one of new (n,); old are dead from now on.
+
+        A keyframe that saw both keeps its observation of the new point alone.
+        """
+        if len(old) == 0:
+            return
+        renamed = torch.arange(len(self.points) + 1, device=old.device)
+        renamed[-1] = NO_POINT
+        renamed[old] = new
+        table = self.keyframes["point_ids"]
+        touched = torch.nonzero((renamed[table] != table).any(1))[:, 0]
+        rows = table[touched]
+        changed = renamed[rows]
+        already = torch.zeros(len(touched), len(self.points) + 1, dtype=torch.bool, device=old.device)
+        already.scatter_(1, rows.where(rows >= 0, len(self.points)), True)
+        is_moved = changed != rows
+        clash = is_moved & already.gather(1, changed.clamp(min=0))
+        table[touched] = changed.masked_fill(clash, NO_POINT)
+        self.points["alive"][old] = False
+        self.points["replaced_by"][old] = new
+        for counter in ("times_visible", "times_found"):
+            self.points[counter].index_add_(0, new, self.points[counter][old])
+
+    def resolve(self, point_ids: Tensor) -> Tensor:
+        """The living heirs of merged points (n,); points that were not merged stay themselves."""
+        heir = self.points["replaced_by"][point_ids]
+        while bool((heir >= 0).any()):
+            point_ids = torch.where(heir >= 0, heir, point_ids)
+            heir = self.points["replaced_by"][point_ids]
+        return point_ids
+
+    def refresh(self, keyframes: Tensor) -> None:
+        """Take view direction, scale and descriptor of the points that these keyframes (k,) see from their newest observation.
+
+        `reach` is distance times keypoint scale: from distance d the point is expected at scale reach / d.
+        """
+        seen = self.observations(torch.sort(keyframes).values)  # the newest keyframe comes last and wins
+        if len(seen) == 0:
+            return
+        newest = torch.full((len(self.points),), -1, device=keyframes.device)
+        newest = newest.scatter_reduce(
+            0, seen.point_index, torch.arange(len(seen), device=keyframes.device), "amax"
+        )
+        ids = torch.nonzero(newest >= 0)[:, 0]
+        row = newest[ids]
+        keyframe, keypoint = seen.keyframe_index[row], seen.keypoint_index[row]
+        centres_w = se3_inverse(self.T_cw[keyframe])[:, :3, 3]
+        rays_w = self.positions_w[ids] - centres_w
+        distance = torch.linalg.vector_norm(rays_w, dim=-1)
+        self.points["normals_w"][ids] = rays_w / distance[:, None].clamp(min=1e-12)
+        self.points["reach"][ids] = distance * seen.scales[row]
+        self.points["angles"][ids] = self.keyframes["angles"][keyframe, keypoint]
+        self.points["descriptors"][ids] = self.keyframes["descriptors"][keyframe, keypoint]
+
+    def rescale(self, factor: float) -> None:
+        """Multiply all lengths of the world by a factor."""
+        self.points["positions_w"].mul_(factor)
+        self.points["reach"].mul_(factor)
+        self.keyframes["T_cw"][:, :3, 3].mul_(factor)

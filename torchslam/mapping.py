@@ -1,0 +1,120 @@
+"""What happens when a frame becomes a keyframe: observe, cull, triangulate, fuse, adjust."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.correspondences import match_near, project_points
+from torchslam.errors import ConfigError
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.initialization import Start
+from torchslam.local_bundle import adjust
+from torchslam.map import Map
+from torchslam.new_points import triangulate_against
+from torchslam.stopwatch import Stopwatch
+from torchslam.tracking import Tracked
+from torchslam.types import View
+
+
+class Mapper:
+    """Grows the map, keyframe by keyframe."""
+
+    def __init__(self, camera: Camera, config: Config, slam_map: Map, clock: Stopwatch) -> None:
+        self.camera = camera
+        self.config = config
+        self.map = slam_map
+        self.clock = clock
+
+    def start(self, start: Start) -> tuple[int, int]:
+        """Make the first map of two views, at the configured scale; returns the two keyframes."""
+        factor = world_scale(start, self.config.scale)
+        T_cw = start.T_cw.clone()
+        T_cw[:3, 3] *= factor
+        first = self.map.add_keyframe(start.reference, torch.eye(4, dtype=T_cw.dtype, device=T_cw.device))
+        second = self.map.add_keyframe(start.view, T_cw)
+        ids = self.map.add_points(start.points_w * factor, start.view.descriptors[start.keypoints_2], second)
+        self.map.observe(first, start.keypoints_1, ids)
+        self.map.observe(second, start.keypoints_2, ids)
+        self.map.refresh(torch.tensor([first, second]))
+        return first, second
+
+    def insert(self, view: View, tracked: Tracked) -> int:
+        """Make a tracked frame a keyframe; returns its index."""
+        settings = self.config.mapping
+        with self.clock("mapping"):
+            keyframe = self.map.add_keyframe(view, tracked.T_cw)
+            self.map.observe(keyframe, tracked.keypoints, tracked.point_ids)
+            if settings.cull:
+                self.cull_recent_points(keyframe)
+            neighbours = self.map.covisible(keyframe, 2 * settings.neighbours)
+            for neighbour in neighbours[: settings.neighbours].tolist():
+                triangulate_against(self.map, keyframe, neighbour, self.camera, self.config)
+            self.map.refresh(torch.tensor([keyframe]))
+            if settings.fuse:
+                self.fuse(keyframe, neighbours)
+        if self.config.bundle.enabled:
+            with self.clock("bundle"):
+                adjust(self.map, keyframe, self.camera, self.config.bundle)
+        return keyframe
+
+    def cull_recent_points(self, keyframe: int) -> None:
+        """Kill young points that are rarely found where they should be visible, or that nobody else has seen."""
+        points = self.map.points
+        age = keyframe - points["born"]
+        is_young = points["alive"] & (age <= 3)
+        is_rarely_found = (
+            points["times_found"] < self.config.mapping.min_found_share * points["times_visible"]
+        )
+        is_lonely = (age >= 2) & (self.map.observation_counts() < 3) & (points["born"] > 1)
+        self.map.kill(torch.nonzero(is_young & (is_rarely_found | is_lonely))[:, 0])
+
+    def fuse(self, keyframe: int, neighbours: Tensor) -> None:
+        """Find the points of this keyframe in its neighbours and theirs in it; merge what turns out to be one point."""
+        own = self.map.points_seen_by(torch.tensor([keyframe]))
+        for neighbour in neighbours.tolist():
+            self._fuse_into(neighbour, own[self.map.points["alive"][own]])
+        self._fuse_into(keyframe, self.map.points_seen_by(neighbours))
+
+    def _fuse_into(self, keyframe: int, point_ids: Tensor) -> None:
+        """Match points (n,) that a keyframe does not see yet to its keypoints, free or not."""
+        seen = self.map.keyframes["point_ids"][keyframe]
+        new = point_ids[~torch.isin(point_ids, seen)]
+        view, T_cw = self.map.view(keyframe), self.map.T_cw[keyframe]
+        tracking = self.config.tracking
+        projected = project_points(
+            self.map, new, T_cw, self.camera, tracking.max_view_angle_deg, view.max_scale
+        )
+        ids, keypoints = match_near(self.map, projected, view, 3.0, self.config.matching, ratio=1.0)
+        pixels, valid = self.camera.project(transform(T_cw, self.map.positions_w[ids]))
+        errors = ((pixels - view.keypoints[keypoints]) ** 2).sum(-1)
+        agrees = valid & (errors < tracking.chi_square * view.scales[keypoints] ** 2)
+        ids, keypoints = ids[agrees], keypoints[agrees]
+        taken = seen[keypoints]
+        is_free = taken < 0
+        self.map.observe(keyframe, keypoints[is_free], ids[is_free])
+        self._merge(ids[~is_free], taken[~is_free])
+
+    def _merge(self, one: Tensor, other: Tensor) -> None:
+        """Merge pairs of points (n,): the one with more observations stays."""
+        counts = self.map.observation_counts()
+        is_one_better = counts[one] > counts[other]
+        self.map.replace(torch.where(is_one_better, other, one), torch.where(is_one_better, one, other))
+
+
+def world_scale(start: Start, kind: str) -> float:
+    """The factor from the unit baseline of a start to the lengths of the world.
+
+    unit: the median depth in the first camera is one. groundtruth: the baseline has its true length.
+    Raises ConfigError when the true poses are asked for and are not known.
+    """
+    if kind == "unit":
+        return 1.0 / float(start.points_w[:, 2].median())
+    truth_1, truth_2 = start.reference.T_cw_groundtruth, start.view.T_cw_groundtruth
+    if truth_1 is None or truth_2 is None:
+        raise ConfigError(
+            'scale = "groundtruth" needs a sequence with ground truth at the first keyframes; use scale = "unit"'
+        )
+    true_baseline = torch.linalg.vector_norm(se3_inverse(truth_2)[:3, 3] - se3_inverse(truth_1)[:3, 3])
+    return float(true_baseline / torch.linalg.vector_norm(start.T_cw[:3, 3]))

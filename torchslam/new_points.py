@@ -1,0 +1,99 @@
+"""New map points from two keyframes: matches along epipolar lines, triangulated and checked."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config, MatchingConfig
+from torchslam.correspondences import max_distance
+from torchslam.features import descriptor_distances
+from torchslam.geometry import Camera, se3_inverse, skew, transform, triangulate
+from torchslam.map import NO_POINT, Map
+from torchslam.types import View
+
+
+def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Camera, config: Config) -> None:
+    """Add the points that two keyframes see with enough parallax and that neither has in the map yet."""
+    settings = config.mapping
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbour]
+    if not has_baseline(slam_map, keyframe, neighbour, settings.min_baseline):
+        return
+    view_1, view_2 = slam_map.view(keyframe), slam_map.view(neighbour)
+    free_1 = torch.nonzero(view_1.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))[:, 0]
+    free_2 = torch.nonzero(view_2.mask & (slam_map.keyframes["point_ids"][neighbour] == NO_POINT))[:, 0]
+    T_21 = T_2w @ se3_inverse(T_1w)
+    first, second = match_along_epipolar_lines(
+        view_1, view_2, free_1, free_2, T_21, camera, settings.epipolar_px, config.matching
+    )
+    seen = triangulate(T_1w, T_2w, view_1.keypoints[first], view_2.keypoints[second], camera, camera)
+    scale_1, scale_2 = view_1.scales[first], view_2.scales[second]
+    limit = settings.max_error_chi_square
+    good = seen.mask & (seen.errors_1**2 < limit * scale_1**2) & (seen.errors_2**2 < limit * scale_2**2)
+    good &= seen.angles > math.radians(settings.min_parallax_deg)
+    good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.max_scale)
+    keep = torch.nonzero(good)[:, 0]
+    ids = slam_map.add_points(seen.points_w[keep], view_1.descriptors[first[keep]], keyframe)
+    slam_map.observe(keyframe, first[keep], ids)
+    slam_map.observe(neighbour, second[keep], ids)
+
+
+def has_baseline(slam_map: Map, keyframe: int, neighbour: int, least: float) -> bool:
+    """Whether the two are apart by a share of the median depth that the neighbour sees."""
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbour]
+    seen = slam_map.points_seen_by(torch.tensor([neighbour]))
+    depth = transform(T_2w, slam_map.positions_w[seen])[:, 2].median()
+    baseline = torch.linalg.vector_norm(se3_inverse(T_1w)[:3, 3] - se3_inverse(T_2w)[:3, 3])
+    return bool(baseline > least * depth)
+
+
+def match_along_epipolar_lines(
+    view_1: View,
+    view_2: View,
+    rows_1: Tensor,
+    rows_2: Tensor,
+    T_21: Tensor,
+    camera: Camera,
+    epipolar_px: float,
+    settings: MatchingConfig,
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) keypoints among rows_1 (n1,) and rows_2 (n2,) that are each other's best on the epipolar line.
+
+    The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it.
+    """
+    if len(rows_1) == 0 or len(rows_2) == 0:
+        return rows_1[:0], rows_2[:0]
+    essential = skew(T_21[:3, 3]) @ T_21[:3, :3]
+    planes = camera.unproject(view_1.keypoints[rows_1]) @ essential.mT
+    planes = planes / torch.linalg.vector_norm(planes, dim=-1, keepdim=True).clamp(min=1e-12)
+    rays_2 = camera.unproject(view_2.keypoints[rows_2])
+    sine = (planes.float() @ rays_2.float().mT).abs()
+    allowed = sine < (epipolar_px / camera.focal * view_2.scales[rows_2]).float()
+    distances = descriptor_distances(view_1.descriptors[rows_1][None], view_2.descriptors[rows_2][None])[
+        0
+    ].float()
+    distances = distances.masked_fill(~allowed, torch.inf)
+    nearest_2 = distances.min(1)
+    nearest_1 = distances.argmin(0)
+    is_mutual = nearest_1[nearest_2.indices] == torch.arange(len(rows_1), device=rows_1.device)
+    limit = 0.8 * max_distance(view_1.descriptors, settings)
+    found = torch.nonzero(is_mutual & (nearest_2.values <= limit))[:, 0]
+    return rows_1[found], rows_2[nearest_2.indices[found]]
+
+
+def has_consistent_scale(
+    points_w: Tensor,
+    T_1w: Tensor,
+    T_2w: Tensor,
+    scale_1: Tensor,
+    scale_2: Tensor,
+    max_scale: float,
+    factor: float = 1.8,
+) -> Tensor:
+    """(n,) whether a point's size in the two images agrees with its distances: scale falls as distance grows."""
+    distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
+    distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
+    expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(1.0, max_scale)
+    return (scale_2 < factor * expected) & (scale_2 * factor > expected)

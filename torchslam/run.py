@@ -1,0 +1,128 @@
+"""A whole sequence through the system, and what it leaves behind."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence
+from torchslam.errors import ConfigError, FrameError
+from torchslam.extraction import simulated_extractor
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.local_bundle import adjust_all
+from torchslam.map import Map
+from torchslam.types import State, StepResult, Trajectory
+
+if TYPE_CHECKING:
+    from torchslam.slam import SLAM
+
+
+@dataclass(frozen=True)
+class Run:
+    """The result of a run.
+
+    trajectory:  every posed frame; keyframes: the keyframes alone
+    results:     one per processed frame
+    skipped:     the frames that could not be read, in words
+    interrupted: whether the run was stopped by the user
+    failure:     why there is no map; empty when there is one
+    """
+
+    trajectory: Trajectory
+    keyframes: Trajectory
+    map: Map
+    camera: Camera
+    config: Config
+    results: list[StepResult]
+    skipped: list[str]
+    interrupted: bool
+    failure: str
+
+
+def run_sequence(slam: SLAM, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
+    """Feed every frame of a sequence to the system.
+
+    A frame that cannot be read is skipped with a warning and counted; an interrupt ends the run and keeps what
+    there is.
+    """
+    if slam.extractor is None:
+        slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
+    results: list[StepResult] = []
+    skipped: list[str] = []
+    interrupted = False
+    try:
+        for index in range(len(sequence)):
+            try:
+                frame = sequence[index]
+            except FrameError as error:
+                warnings.warn(f"skipped a frame: {error}", stacklevel=2)
+                skipped.append(str(error))
+                continue
+            results.append(slam.step(frame))
+            if progress is not None:
+                progress(results[-1])
+    except KeyboardInterrupt:
+        interrupted = True
+    return finish(slam, results, skipped, interrupted)
+
+
+def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupted: bool) -> Run:
+    """Adjust the whole map if so configured, and gather what the run leaves behind."""
+    has_map = slam.map.num_keyframes > 0
+    if has_map and slam.config.bundle.enabled and slam.config.bundle.final:
+        adjust_all(slam.map, slam.camera, slam.config.bundle)
+    return Run(
+        slam.trajectory(),
+        keyframe_trajectory(slam.map),
+        slam.map,
+        slam.camera,
+        slam.config,
+        results,
+        skipped,
+        interrupted,
+        "" if has_map else why_no_map(results, skipped),
+    )
+
+
+def keyframe_trajectory(slam_map: Map) -> Trajectory:
+    """The keyframes, camera to world, in order of time."""
+    if slam_map.num_keyframes == 0:
+        return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+    return Trajectory(slam_map.keyframes["timestamp"].clone(), se3_inverse(slam_map.T_cw))
+
+
+def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
+    """One sentence for the user: how many frames were tried, what kept them from starting a map, the last attempt."""
+    if not results:
+        return (
+            f"no frame could be read; {len(skipped)} were skipped, the first because {skipped[0]}"
+            if skipped
+            else "the sequence has no frames"
+        )
+    attempts = [
+        result.reason
+        for result in results
+        if result.state is State.INITIALIZING and "reference" not in result.reason
+    ]
+    if not attempts:
+        return f"no map was initialised: {len(results)} frames are too few, two with parallax are needed"
+    kind, _ = Counter(reason.split(":")[0] for reason in attempts).most_common(1)[0]
+    last = next(reason for reason in reversed(attempts) if reason.split(":")[0] == kind)
+    return f"no map was initialised in {len(results)} frames: {last}"
+
+
+def true_poses(sequence: Sequence) -> torch.Tensor:
+    """(F, 4, 4) the true poses, world to camera, of the frames that have one."""
+    known = (sequence.pose(index) for index in range(len(sequence)))
+    poses = [pose for pose in known if pose is not None]
+    if not poses:
+        raise ConfigError(
+            f"{sequence.name} has no ground truth: simulated features need it; use --features orb"
+        )
+    return torch.stack(poses).to(torch.float64)

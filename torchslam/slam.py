@@ -1,0 +1,121 @@
+"""Monocular SLAM, the way of a frame:
+
+frame -> features -> track (or initialise, or lose) -> keyframe? -> map -> StepResult
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from torchslam.config import Config
+from torchslam.errors import ConfigError
+from torchslam.extraction import Extractor, image_extractor
+from torchslam.geometry import Camera
+from torchslam.history import History
+from torchslam.initialization import Initializer
+from torchslam.keyframes import why_keyframe
+from torchslam.map import Map
+from torchslam.mapping import Mapper
+from torchslam.data.sequence import Sequence
+from torchslam.run import Run, run_sequence
+from torchslam.stopwatch import Stopwatch
+from torchslam.tracking import Tracked, Tracker
+from torchslam.types import Frame, State, StepResult, Trajectory, View
+
+MIN_KEYFRAMES = 4  # a map that is lost before it has this many was a bad start
+
+
+class SLAM:
+    """Give it frames one after the other; ask it for the map and the trajectory at any time."""
+
+    def __init__(
+        self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
+    ) -> None:
+        self.config = config or Config()
+        self.camera = camera.to(dtype=torch.float64)
+        if extractor is None and self.config.features.kind != "simulated":
+            extractor = image_extractor(self.config)
+        self.extractor = extractor  # None: `run` makes simulated features from the true poses of the sequence
+        self.clock = Stopwatch()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the map and wait for a new start."""
+        self.state = State.INITIALIZING
+        self.map = Map()
+        self.history = History()
+        self.initializer = Initializer(self.camera, self.config)
+        self.tracker = Tracker(self.camera, self.config, self.map)
+        self.mapper = Mapper(self.camera, self.config, self.map, self.clock)
+
+    @torch.no_grad()
+    def step(self, frame: Frame) -> StepResult:
+        """Process one frame. A frame without a pose is no error: the result says why there is none."""
+        if self.extractor is None:
+            raise ConfigError(
+                "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
+            )
+        with self.clock("features"):
+            view = View.of(frame, self.extractor(frame), self.camera.params.dtype)
+        if self.state is State.INITIALIZING:
+            return self._initialize(view)
+        with self.clock("tracking"):
+            tracked = self.tracker.track(view)
+        if tracked is None:
+            return self._lose(view)
+        self.state = State.TRACKING
+        why = why_keyframe(view, tracked, self.tracker.reference, self.map, self.config.keyframes)
+        if why:
+            self.tracker.follow(self.mapper.insert(view, tracked))
+        self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)
+        return self._result(view, why, tracked, is_keyframe=bool(why))
+
+    def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
+        """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
+        return run_sequence(self, sequence, progress)
+
+    def trajectory(self) -> Trajectory:
+        """Every posed frame, by the map as it is now."""
+        return self.history.trajectory(self.map)
+
+    def _initialize(self, view: View) -> StepResult:
+        """Try to start a map; then pose the frames that were seen on the way to it."""
+        with self.clock("initialization"):
+            start, reason = self.initializer.step(view)
+            if start is None:
+                return self._result(view, reason)
+            first, second = self.mapper.start(start)
+            self.tracker.follow(first)
+            for earlier in self.initializer.views:
+                tracked = self.tracker.track(earlier)
+                if tracked is not None:
+                    self.history.add(earlier, tracked, self.tracker.T_cr, self.tracker.reference)
+            self.tracker.follow(second)
+        self.state = State.TRACKING
+        return self._result(view, "started the map", is_keyframe=True)
+
+    def _lose(self, view: View) -> StepResult:
+        """Stay lost and try again with the next frame; a map that is lost right after its start is given up."""
+        self.state = State.LOST
+        reason = "lost"
+        if self.map.num_keyframes < MIN_KEYFRAMES:
+            self.reset()
+            reason = "lost right after the start: starting anew"
+        return self._result(view, reason)
+
+    def _result(
+        self, view: View, reason: str, tracked: Tracked | None = None, is_keyframe: bool = False
+    ) -> StepResult:
+        return StepResult(
+            index=view.index,
+            timestamp=view.timestamp,
+            state=self.state,
+            T_cw=None if tracked is None else self.tracker.T_cw,
+            is_keyframe=is_keyframe,
+            matches=tracked.matches if tracked else 0,
+            inliers=tracked.inliers if tracked else 0,
+            reason=reason,
+            stage_ms=self.clock.take(),
+        )
