@@ -1,0 +1,234 @@
+"""Camera models: pinhole, radial-tangential (Brown-Conrady) and fisheye (Kannala-Brandt).
+
+Camera frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry import distortion
+
+Scalar = float | Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera. Without batch dimensions it broadcasts over any batch of points.
+
+    model:  "pinhole", "radial_tangential" or "fisheye"
+    params: (..., P) fx, fy, cx, cy in pixels, then the distortion: none; k1, k2, p1, p2, k3; or k1, k2, k3,
+    k4 size:   (width, height) in pixels
+
+    Coefficients as in OpenCV. Every method is differentiable with respect to points, pixels and `params`.
+    """
+
+    model: str
+    params: Tensor
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if self.model not in distortion.MODELS:
+            raise ValueError(f"unknown camera model {self.model!r}; known are {', '.join(distortion.MODELS)}")
+        expected = 4 + distortion.MODELS[self.model].num_params
+        if self.params.shape[-1:] != (expected,):
+            shape = tuple(self.params.shape)
+            raise ValueError(f"a {self.model} camera has {expected} parameters, but params has shape {shape}")
+
+    @staticmethod
+    def pinhole(fx: Scalar, fy: Scalar, cx: Scalar, cy: Scalar, size: tuple[int, int]) -> Camera:
+        """A camera without distortion."""
+        return Camera("pinhole", _stack(fx, fy, cx, cy), size)
+
+    @staticmethod
+    def radial_tangential(
+        fx: Scalar,
+        fy: Scalar,
+        cx: Scalar,
+        cy: Scalar,
+        k1: Scalar,
+        k2: Scalar,
+        p1: Scalar,
+        p2: Scalar,
+        k3: Scalar = 0.0,
+        *,
+        size: tuple[int, int],
+    ) -> Camera:
+        """A camera with radial and tangential distortion, as OpenCV's default model."""
+        return Camera("radial_tangential", _stack(fx, fy, cx, cy, k1, k2, p1, p2, k3), size)
+
+    @staticmethod
+    def fisheye(
+        fx: Scalar,
+        fy: Scalar,
+        cx: Scalar,
+        cy: Scalar,
+        k1: Scalar,
+        k2: Scalar,
+        k3: Scalar,
+        k4: Scalar,
+        *,
+        size: tuple[int, int],
+    ) -> Camera:
+        """An equidistant fisheye camera with a polynomial in the angle, as OpenCV's fisheye model."""
+        return Camera("fisheye", _stack(fx, fy, cx, cy, k1, k2, k3, k4), size)
+
+    @property
+    def fx(self) -> Tensor:
+        return self.params[..., 0]
+
+    @property
+    def fy(self) -> Tensor:
+        return self.params[..., 1]
+
+    @property
+    def cx(self) -> Tensor:
+        return self.params[..., 2]
+
+    @property
+    def cy(self) -> Tensor:
+        return self.params[..., 3]
+
+    @property
+    def focal(self) -> Tensor:
+        """(...) the geometric mean of fx and fy, pixels."""
+        return (self.fx * self.fy).sqrt()
+
+    @property
+    def width(self) -> int:
+        return self.size[0]
+
+    @property
+    def height(self) -> int:
+        return self.size[1]
+
+    @property
+    def K(self) -> Tensor:
+        """(..., 3, 3) calibration matrix, without the distortion."""
+        zero, one = torch.zeros_like(self.fx), torch.ones_like(self.fx)
+        entries = (self.fx, zero, self.cx, zero, self.fy, self.cy, zero, zero, one)
+        return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+    @cached_property
+    def limit(self) -> Tensor:
+        """(...) up to where the distortion is monotone: a radius x/z (a ray angle for a fisheye), or
+        infinity.
+        """
+        return self._distortion.limit(self.params.detach()[..., 4:])
+
+    @property
+    def _distortion(self) -> distortion.Distortion:
+        return distortion.MODELS[self.model]
+
+    def with_params(self, params: Tensor) -> Camera:
+        """The same model and size with other parameters."""
+        return replace(self, params=params)
+
+    def to(self, target: torch.device | torch.dtype | str) -> Camera:
+        """The same camera on another device or in another dtype."""
+        return replace(self, params=self.params.to(target))
+
+    def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of points in the camera frame.
+
+        points_c: (..., N, 3). Returns pixels (..., N, 2), always finite, and valid (..., N): in front of the
+        camera and within the monotone part of the distortion. Invalid points get the middle of the image and
+        no gradient.
+        """
+        normalized, valid = self._normalize_points(points_c)
+        distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
+        return self._to_pixels(distorted, valid), valid
+
+    def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pixels as from `project`, with analytic derivatives.
+
+        Returns pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and
+        d pixels / d params (..., N, 2, P). Derivatives of invalid points are zero.
+        """
+        normalized, valid = self._normalize_points(points_c)
+        coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
+        distorted = self._distortion.distort(normalized, coefficients)
+
+        inverse_depth = torch.where(valid, 1 / torch.where(valid, points_c[..., 2], 1.0), 0.0)[
+            ..., None, None
+        ]
+        J_normalized, J_coefficients = self._distortion.jacobians(normalized, coefficients)
+        J_normalized = J_normalized * (focal[..., None] * inverse_depth)
+        J_depth = -(J_normalized @ normalized[..., None])
+        J_points = torch.cat((J_normalized, J_depth), dim=-1)
+
+        J_intrinsics = torch.cat(
+            (torch.diag_embed(distorted), torch.diag_embed(torch.ones_like(distorted))), dim=-1
+        )
+        J_params = torch.cat((J_intrinsics, focal[..., None] * J_coefficients), dim=-1)
+        pixels = self._to_pixels(distorted, valid)
+        return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
+
+    def normalize(self, pixels: Tensor) -> Tensor:
+        """Undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
+
+        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the
+        centre.
+        """
+        distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
+        distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
+        return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
+
+    def unproject(self, pixels: Tensor) -> Tensor:
+        """Bearings, of unit length, of pixels. (..., N, 2) -> (..., N, 3)."""
+        normalized = self.normalize(pixels)
+        ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
+        return ray / ray.norm(dim=-1, keepdim=True)
+
+    def in_image(self, pixels: Tensor, border: float = 0.0) -> Tensor:
+        """Whether pixels lie inside the image, `border` pixels away from its edge.
+
+        (..., N, 2) -> (..., N).
+        """
+        x, y = pixels.unbind(-1)
+        # The image reaches half a pixel beyond the centres of its outermost pixels.
+        low = border - 0.5
+        return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
+
+    def pixel_scale(self, normalized: Tensor) -> Tensor:
+        """Pixels per unit of undistorted image coordinates, locally, without gradient.
+
+        (..., N, 2) -> (..., N).
+        """
+        params = self.params.detach()
+        scale = (params[..., 0] * params[..., 1]).abs().sqrt()[..., None].expand(normalized.shape[:-1])
+        if self.model == "pinhole":
+            return scale
+        J, _ = self._distortion.jacobians(normalized.detach(), params[..., None, 4:])
+        return scale * torch.linalg.det(J).abs().sqrt()
+
+    def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:
+        """Pixels of distorted image coordinates; the middle of the image, a constant, where invalid."""
+        pixels = distorted * self.params[..., None, :2] + self.params[..., None, 2:4]
+        middle = pixels.new_tensor((0.5 * (self.width - 1), 0.5 * (self.height - 1)))
+        return torch.where(valid[..., None], pixels, middle)
+
+    def _normalize_points(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
+        """x/z, y/z, zero where invalid, and validity."""
+        depth = points_c[..., 2]
+        tiny = torch.finfo(depth.dtype).eps
+        valid = (depth > tiny) & torch.isfinite(points_c).all(-1)
+        safe = torch.where(valid[..., None], points_c, 1.0)
+        normalized = safe[..., :2] / safe[..., 2:]
+        if self.model != "pinhole":
+            radius = normalized.detach().norm(dim=-1)
+            valid = valid & (self._distortion.coordinate(radius) < self.limit[..., None])
+        return torch.where(valid[..., None], normalized, 0.0), valid
+
+
+def _stack(*values: Scalar) -> Tensor:
+    """(..., P) from floats and tensors; float64 unless a tensor says otherwise."""
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    dtype = tensors[0].dtype if tensors else torch.float64
+    device = tensors[0].device if tensors else None
+    columns = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
+    return torch.stack(torch.broadcast_tensors(*columns), dim=-1)

@@ -1,0 +1,232 @@
+"""Lens distortions: maps between undistorted (x/z, y/z) and distorted image coordinates at focal length one.
+
+Each model has its map, the map's Jacobians, its inverse, and the limit up to which it is monotone. The
+inverses are solved by Newton's method without a graph; their gradient comes from one differentiable Newton
+step at the solution (implicit function theorem), so it is exact to first order and costs the same however
+many steps were needed. Coefficients are (..., 1 or N, K) against points (..., N, 2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_NEWTON_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """One model: `distort(xy, k)`, `jacobians(xy, k)` = (d/d xy, d/d k), `undistort(xy, k, limit)`,
+    `limit(k)`.
+
+    `limit` is in terms of `coordinate(r)`, of the undistorted radius r.
+    """
+
+    num_params: int
+    distort: Callable[[Tensor, Tensor], Tensor]
+    jacobians: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    undistort: Callable[[Tensor, Tensor, Tensor], Tensor]
+    limit: Callable[[Tensor], Tensor]
+    coordinate: Callable[[Tensor], Tensor]
+
+
+def first_positive_root(coefficients: Tensor) -> Tensor:
+    """Smallest positive root of 1 + c_1 u + ... + c_K u^K, infinity where there is none. (..., K) -> (...).
+
+    Found as the largest real eigenvalue 1/u of the companion matrix of the reversed polynomial, which stays
+    monic whichever coefficients vanish.
+    """
+    degree = coefficients.shape[-1]
+    companion = torch.zeros(*coefficients.shape, degree, dtype=coefficients.dtype, device=coefficients.device)
+    companion[..., 0, :] = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)
+    companion[..., 1:, :-1] = torch.eye(degree - 1, dtype=companion.dtype, device=companion.device)
+    inverse = torch.linalg.eigvals(companion)
+    real = inverse.imag.abs() <= 1e-6 * inverse.abs()
+    largest = torch.where(real, inverse.real, 0.0).amax(-1)
+    return torch.where(largest > 1e-12, 1 / largest.clamp_min(1e-12), torch.inf)
+
+
+def _powers(u: Tensor, count: int) -> Tensor:
+    """u, u^2, ..., u^count along a new last dimension."""
+    return torch.stack([u**k for k in range(1, count + 1)], dim=-1)
+
+
+def _converged(step: Tensor) -> bool:
+    """Whether the largest Newton step has no more effect (a step converges quadratically)."""
+    return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.75
+
+
+def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
+    """-J^-1 residual for 2x2 systems. (..., 2, 2), (..., 2) -> (..., 2)."""
+    (a, b), (c, d) = J[..., 0, :].unbind(-1), J[..., 1, :].unbind(-1)
+    determinant = a * d - b * c
+    determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
+    x, y = residual.unbind(-1)
+    return -torch.stack((d * x - b * y, a * y - c * x), dim=-1) / determinant[..., None]
+
+
+# --- no distortion ---
+
+
+def _identity(xy: Tensor, k: Tensor) -> Tensor:
+    return xy
+
+
+def _identity_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    return eye.expand(*xy.shape, 2), xy.new_zeros(*xy.shape, 0)
+
+
+def _identity_undistort(xy: Tensor, k: Tensor, limit: Tensor) -> Tensor:
+    return xy
+
+
+def _no_limit(k: Tensor) -> Tensor:
+    return k.new_full(k.shape[:-1], torch.inf)
+
+
+# --- radial and tangential (Brown, 1966) ---
+
+
+def _radial_factor(r2: Tensor, k: Tensor) -> Tensor:
+    return 1 + r2 * (k[..., 0] + r2 * (k[..., 1] + r2 * k[..., 4]))
+
+
+def _radial_tangential(xy: Tensor, k: Tensor) -> Tensor:
+    x, y = xy.unbind(-1)
+    p1, p2 = k[..., 2], k[..., 3]
+    r2, xy2 = x * x + y * y, 2 * x * y
+    radial = _radial_factor(r2, k)
+    return torch.stack(
+        (x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)), dim=-1
+    )
+
+
+def _radial_tangential_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d xy. (..., 2, 2)."""
+    x, y = xy.unbind(-1)
+    k1, k2, p1, p2, k3 = k.unbind(-1)
+    r2 = x * x + y * y
+    radial = _radial_factor(r2, k)
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d x = slope x
+    cross = slope * x * y + 2 * (p1 * x + p2 * y)
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return torch.stack((xx, cross, cross, yy), dim=-1).unflatten(-1, (2, 2))
+
+
+def _radial_tangential_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    x, y = xy.unbind(-1)
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    r2 = xx + yy
+    r4 = r2 * r2
+    r6 = r4 * r2
+    rows = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
+    return _radial_tangential_slope(xy, k), torch.stack(rows, dim=-1).unflatten(-1, (2, 5))
+
+
+def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
+    with torch.no_grad():
+        xy = distorted / distorted.norm(dim=-1, keepdim=True).clamp_min(1.0)  # no start far outside
+        edge = torch.where(torch.isfinite(limit), 0.999 * limit, 1e3)[..., None]
+        for _ in range(_NEWTON_STEPS):
+            step = _implicit_step(_radial_tangential_slope(xy, k), _radial_tangential(xy, k) - distorted)
+            xy = xy + step
+            radius = xy.norm(dim=-1, keepdim=True)
+            xy = xy * (edge / radius.clamp_min(1e-12)).clamp_max(1.0)
+            if _converged(step):
+                break
+    if not torch.is_grad_enabled() or not (distorted.requires_grad or k.requires_grad):
+        return xy
+    slope = _radial_tangential_slope(xy, k.detach())
+    step = _implicit_step(slope, _radial_tangential(xy, k) - distorted)
+    clamped = xy.norm(dim=-1, keepdim=True) >= edge * (1 - 1e-9)
+    return xy + torch.where(clamped, 0.0, step - step.detach())
+
+
+def _radial_tangential_limit(k: Tensor) -> Tensor:
+    """The radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
+    return first_positive_root(torch.stack((3 * k[..., 0], 5 * k[..., 1], 7 * k[..., 4]), dim=-1)).sqrt()
+
+
+# --- fisheye (Kannala and Brandt, 2006) ---
+
+
+def _safe_radius(xy: Tensor) -> tuple[Tensor, Tensor]:
+    """(radius, is zero); the radius is one where it is zero, so that its gradient stays finite."""
+    r2 = (xy * xy).sum(-1)
+    zero = r2 < torch.finfo(xy.dtype).tiny ** 0.5
+    return torch.where(zero, 1.0, r2).sqrt(), zero
+
+
+def _bent(angle: Tensor, k: Tensor) -> Tensor:
+    """Distorted angle theta (1 + k1 theta^2 + ... + k4 theta^8)."""
+    u = angle * angle
+    return angle * (1 + u * (k[..., 0] + u * (k[..., 1] + u * (k[..., 2] + u * k[..., 3]))))
+
+
+def _bent_slope(angle: Tensor, k: Tensor) -> Tensor:
+    u = angle * angle
+    return 1 + u * (3 * k[..., 0] + u * (5 * k[..., 1] + u * (7 * k[..., 2] + u * 9 * k[..., 3])))
+
+
+def _fisheye(xy: Tensor, k: Tensor) -> Tensor:
+    radius, zero = _safe_radius(xy)
+    factor = _bent(torch.atan(radius), k) / radius
+    return xy * torch.where(zero, 1.0, factor)[..., None]
+
+
+def _fisheye_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    radius, zero = _safe_radius(xy)
+    angle = torch.atan(radius)
+    factor = torch.where(zero, 1.0, _bent(angle, k) / radius)
+    growth = torch.where(zero, 1.0, _bent_slope(angle, k) / (1 + radius * radius))  # d bent / d radius
+    direction = torch.where(zero[..., None], 0.0, xy / radius[..., None])
+    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    outer = direction[..., :, None] * direction[..., None, :]
+    J_xy = factor[..., None, None] * eye + (growth - factor)[..., None, None] * outer
+    J_k = direction[..., None] * (angle[..., None] * _powers(angle * angle, 4))[..., None, :]
+    return J_xy, J_k
+
+
+def _fisheye_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
+    bent, zero = _safe_radius(distorted)
+    with torch.no_grad():
+        edge = limit.clamp_max(0.5 * math.pi - 1e-3)  # x/z has no meaning at 90 degrees and beyond
+        angle = torch.minimum(bent, edge)
+        for _ in range(_NEWTON_STEPS):
+            slope = _bent_slope(angle, k).clamp_min(1e-3)
+            before = angle
+            angle = torch.minimum((angle - (_bent(angle, k) - bent) / slope).clamp_min(0.0), edge)
+            if _converged(angle - before):
+                break
+        slope = _bent_slope(angle, k).clamp_min(1e-3)
+        clamped = angle >= edge
+    step = -(_bent(angle, k) - bent) / slope
+    angle = angle + torch.where(clamped, 0.0, step - step.detach())
+    factor = torch.tan(angle) / bent
+    return distorted * torch.where(zero, 1.0, factor)[..., None]
+
+
+def _fisheye_limit(k: Tensor) -> Tensor:
+    """The ray angle at which the distorted angle stops growing, at most 90 degrees."""
+    scale = k.new_tensor((3.0, 5.0, 7.0, 9.0))
+    return first_positive_root(k * scale).sqrt().clamp_max(0.5 * math.pi)
+
+
+MODELS = {
+    "pinhole": Distortion(0, _identity, _identity_jacobians, _identity_undistort, _no_limit, torch.abs),
+    "radial_tangential": Distortion(
+        5,
+        _radial_tangential,
+        _radial_tangential_jacobians,
+        _radial_tangential_undistort,
+        _radial_tangential_limit,
+        torch.abs,
+    ),
+    "fisheye": Distortion(4, _fisheye, _fisheye_jacobians, _fisheye_undistort, _fisheye_limit, torch.atan),
+}

@@ -1,0 +1,242 @@
+"""SO(3), SE(3) and Sim(3): exponential, logarithm, adjoint, interpolation, quaternions.
+
+Tangent vectors put translation first: (3,) omega for SO(3), (6,) [rho, omega] for SE(3), (7,) [rho, omega,
+sigma] for Sim(3), where exp(sigma) is the scale. Perturbations act from the left: exp(xi) @ T. Everything is
+differentiable, also at the identity and at rotations by pi. Source: Sola et al., "A micro Lie theory for
+state estimation in robotics", 2018; Eade, "Lie groups for 2D and 3D transformations", 2017.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+# Series in the squared angle: sum over k of (-1)^k x^k / (2k + n)!, exact to 1e-16 for x below 1.
+_SERIES_TERMS = 9
+_SERIES_LIMIT = 1.0
+
+
+def _series(angle_squared: Tensor, n: int) -> Tensor:
+    """sum_k (-x)^k / (2k + n)!, by Horner."""
+    result = torch.full_like(
+        angle_squared, (-1.0) ** (_SERIES_TERMS - 1) / math.factorial(2 * (_SERIES_TERMS - 1) + n)
+    )
+    for k in reversed(range(_SERIES_TERMS - 1)):
+        result = result * angle_squared + (-1.0) ** k / math.factorial(2 * k + n)
+    return result
+
+
+def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 as smooth functions of a^2."""
+    small = angle_squared < _SERIES_LIMIT
+    near = torch.where(small, angle_squared, 0.0)
+    far = torch.where(small, 1.0, angle_squared)
+    angle = far.sqrt()
+    sine, cosine = angle.sin(), angle.cos()
+    a = torch.where(small, _series(near, 1), sine / angle)
+    b = torch.where(small, _series(near, 2), (1 - cosine) / far)
+    c = torch.where(small, _series(near, 3), (angle - sine) / (far * angle))
+    return a, b, c
+
+
+def skew(v: Tensor) -> Tensor:
+    """The matrix of the cross product: skew(v) @ u = v x u. (..., 3) -> (..., 3, 3)."""
+    shape = (*v.shape, 3)
+    return torch.linalg.cross(
+        v[..., None].expand(shape), torch.eye(3, dtype=v.dtype, device=v.device).expand(shape), dim=-2
+    )
+
+
+def vee(W: Tensor) -> Tensor:
+    """The vector of the antisymmetric part of a matrix, the inverse of `skew`. (..., 3, 3) -> (..., 3)."""
+    return 0.5 * torch.stack(
+        (W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]), dim=-1
+    )
+
+
+def rigid(R: Tensor, t: Tensor) -> Tensor:
+    """Homogeneous matrix [R t; 0 1]. (..., 3, 3), (..., 3) -> (..., 4, 4)."""
+    shape = torch.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    top = torch.cat((R.expand(*shape, 3, 3), t.expand(*shape, 3)[..., None]), dim=-1)
+    bottom = torch.zeros(*shape, 1, 4, dtype=top.dtype, device=top.device)
+    bottom[..., 3] = 1.0
+    return torch.cat((top, bottom), dim=-2)
+
+
+def transform(T: Tensor, points: Tensor) -> Tensor:
+    """Points under homogeneous transforms. (..., 4, 4), (..., N, 3) -> (..., N, 3)."""
+    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
+
+
+def so3_exp(omega: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors. (..., 3) radians -> (..., 3, 3)."""
+    a, b, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    W = skew(omega)
+    return torch.eye(3, dtype=omega.dtype, device=omega.device) + a * W + b * (W @ W)
+
+
+def so3_left_jacobian(omega: Tensor) -> Tensor:
+    """J with exp(omega + d) = exp(J d) exp(omega) to first order. (..., 3) -> (..., 3, 3)."""
+    _, b, c = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    W = skew(omega)
+    return torch.eye(3, dtype=omega.dtype, device=omega.device) + b * W + c * (W @ W)
+
+
+def _so3_left_jacobian_inverse(omega: Tensor) -> Tensor:
+    """Inverse of the left Jacobian, for angles below 2 pi. (..., 3) -> (..., 3, 3)."""
+    x = (omega * omega).sum(-1)[..., None, None]
+    _, b, c = _rodrigues(x)
+    small = x < _SERIES_LIMIT
+    d = torch.where(small, _series(torch.where(small, x, 0.0), 4), (0.5 - b) / torch.where(small, 1.0, x))
+    W = skew(omega)
+    factor = (c - 2 * d) / (2 * b)  # (1 - (a/2) cot(a/2)) / a^2 without cancellation
+    return torch.eye(3, dtype=omega.dtype, device=omega.device) - 0.5 * W + factor * (W @ W)
+
+
+def quaternion_from_matrix(R: Tensor) -> Tensor:
+    """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices. (..., 3, 3) -> (..., 4).
+
+    The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd,
+    1978).
+    """
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
+    xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
+    xw, yw, zw = r21 - r12, r02 - r20, r10 - r01
+    xx, yy, zz = 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22
+    ww = 1 + r00 + r11 + r22
+    outer = torch.stack((xx, xy, xz, xw, xy, yy, yz, yw, xz, yz, zz, zw, xw, yw, zw, ww), dim=-1)
+    outer = outer.unflatten(-1, (4, 4))
+    largest = outer.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    q = outer.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
+    q = q / q.norm(dim=-1, keepdim=True)
+    return torch.where(q[..., 3:] < 0, -q, q)
+
+
+def matrix_from_quaternion(q_xyzw: Tensor) -> Tensor:
+    """Rotation matrices of quaternions (x, y, z, w) of any non-zero length. (..., 4) -> (..., 3, 3)."""
+    v, w = q_xyzw[..., :3], q_xyzw[..., 3:, None]
+    twice = 2 / (q_xyzw * q_xyzw).sum(-1)[..., None, None]
+    V = skew(v)
+    return torch.eye(3, dtype=v.dtype, device=v.device) + twice * (w * V + V @ V)
+
+
+def so3_log(R: Tensor) -> Tensor:
+    """Rotation vectors, of length at most pi, of rotation matrices. (..., 3, 3) -> (..., 3) radians."""
+    v, w = quaternion_from_matrix(R).split((3, 1), dim=-1)
+    sine_squared = (v * v).sum(-1, keepdim=True)
+    small = sine_squared < 1e-3
+    sine = torch.where(small, 1.0, sine_squared).sqrt()
+    far = 2 * torch.atan2(sine, w) / sine
+    cosine = torch.where(small, w, 1.0)
+    x = torch.where(small, sine_squared, 0.0) / (cosine * cosine)  # tan^2 of half the angle
+    near = 1 / 13 - x / 15
+    for k in (11, 9, 7, 5, 3, 1):  # atan(y)/y = 1 - y^2/3 + y^4/5 - ...
+        near = 1 / k - x * near
+    near = 2 * near / cosine
+    return torch.where(small, near, far) * v
+
+
+def se3_exp(xi: Tensor) -> Tensor:
+    """Rigid transforms of tangent vectors [rho, omega]. (..., 6) -> (..., 4, 4)."""
+    rho, omega = xi.split(3, dim=-1)
+    a, b, c = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    W = skew(omega)
+    W2 = W @ W
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    V = eye + b * W + c * W2
+    return rigid(eye + a * W + b * W2, (V @ rho[..., None]).squeeze(-1))
+
+
+def se3_log(T: Tensor) -> Tensor:
+    """Tangent vectors [rho, omega] of rigid transforms. (..., 4, 4) -> (..., 6)."""
+    omega = so3_log(T[..., :3, :3])
+    rho = (_so3_left_jacobian_inverse(omega) @ T[..., :3, 3:]).squeeze(-1)
+    return torch.cat((rho, omega), dim=-1)
+
+
+def se3_inverse(T: Tensor) -> Tensor:
+    """Inverse of rigid transforms. (..., 4, 4) -> (..., 4, 4)."""
+    R = T[..., :3, :3].mT
+    return rigid(R, -(R @ T[..., :3, 3:]).squeeze(-1))
+
+
+def se3_adjoint(T: Tensor) -> Tensor:
+    """Ad with T exp(xi) = exp(Ad xi) T. (..., 4, 4) -> (..., 6, 6)."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    top = torch.cat((R, skew(t) @ R), dim=-1)
+    return torch.cat((top, torch.cat((torch.zeros_like(R), R), dim=-1)), dim=-2)
+
+
+def se3_interpolate(T_0: Tensor, T_1: Tensor, fraction: Tensor | float) -> Tensor:
+    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1). (..., 4, 4) twice, (...) -> (..., 4, 4).
+
+    Interpolating the inverses gives the inverse of the interpolation.
+    """
+    fraction = torch.as_tensor(fraction, dtype=T_0.dtype, device=T_0.device)
+    return se3_exp(fraction[..., None] * se3_log(T_1 @ se3_inverse(T_0))) @ T_0
+
+
+# Gauss-Legendre nodes and weights on [0, 1]; 16 of them integrate the scaled rotation below to 1e-15.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()
+
+
+def _sim3_translation_matrix(omega: Tensor, sigma: Tensor) -> Tensor:
+    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^). (..., 3), (...) -> (..., 3, 3).
+
+    By quadrature: no case distinctions for a small angle or scale, and smooth everywhere.
+    """
+    s = torch.tensor(_NODES, dtype=omega.dtype, device=omega.device)
+    weight = torch.tensor(_WEIGHTS, dtype=omega.dtype, device=omega.device) * (s * sigma[..., None]).exp()
+    a, b, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
+    identity, linear, quadratic = weight.sum(-1), (weight * s * a).sum(-1), (weight * s * s * b).sum(-1)
+    W = skew(omega)
+    eye = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    return (
+        identity[..., None, None] * eye + linear[..., None, None] * W + quadratic[..., None, None] * (W @ W)
+    )
+
+
+def sim3_exp(xi: Tensor) -> Tensor:
+    """Similarities [sR t; 0 1] of tangent vectors [rho, omega, sigma], s = exp(sigma).
+
+    (..., 7) -> (..., 4, 4).
+    """
+    rho, omega, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
+    t = (_sim3_translation_matrix(omega, sigma) @ rho[..., None]).squeeze(-1)
+    return rigid(sigma.exp()[..., None, None] * so3_exp(omega), t)
+
+
+def sim3_scale(T: Tensor) -> Tensor:
+    """The scale s of similarities [sR t; 0 1]. (..., 4, 4) -> (...)."""
+    return T[..., 0, :3].norm(dim=-1)
+
+
+def sim3_log(T: Tensor) -> Tensor:
+    """Tangent vectors [rho, omega, sigma] of similarities. (..., 4, 4) -> (..., 7)."""
+    scale = sim3_scale(T)
+    sigma, omega = scale.log(), so3_log(T[..., :3, :3] / scale[..., None, None])
+    W = _sim3_translation_matrix(omega, sigma)
+    rho = torch.linalg.solve_ex(W, T[..., :3, 3:])[0].squeeze(-1)
+    return torch.cat((rho, omega, sigma[..., None]), dim=-1)
+
+
+def sim3_inverse(T: Tensor) -> Tensor:
+    """Inverse of similarities. (..., 4, 4) -> (..., 4, 4)."""
+    inverse = T[..., :3, :3].mT / sim3_scale(T).square()[..., None, None]
+    return rigid(inverse, -(inverse @ T[..., :3, 3:]).squeeze(-1))
+
+
+def sim3_adjoint(T: Tensor) -> Tensor:
+    """Ad with T exp(xi) = exp(Ad xi) T for similarities. (..., 4, 4) -> (..., 7, 7)."""
+    sR, t = T[..., :3, :3], T[..., :3, 3:]
+    R = sR / sim3_scale(T)[..., None, None]
+    zero, column = torch.zeros_like(R), torch.zeros_like(t)
+    top = torch.cat((sR, skew(t.squeeze(-1)) @ R, -t), dim=-1)
+    middle = torch.cat((zero, R, column), dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 6] = 1.0
+    return torch.cat((top, middle, bottom), dim=-2)
