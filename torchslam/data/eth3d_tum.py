@@ -1,0 +1,66 @@
+"""Folders in the layout of ETH3D-SLAM and TUM RGB-D: `rgb.txt`, `groundtruth.txt`, `calibration.txt`.
+
+Sources: https://www.eth3d.net/slam_documentation and https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from torchslam.data.calibration import Calibration, read_calibration
+from torchslam.data.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.text_file import numbered_lines
+from torchslam.data.trajectory_file import read_trajectory
+from torchslam.errors import CalibrationError, SequenceError
+from torchslam.geometry.camera import Camera
+
+CALIBRATION_FILES = ("calibration.txt", "calib.txt")
+
+
+def is_eth3d_tum(path: Path) -> bool:
+    """Whether the folder has a list of images in this layout."""
+    return (path / "rgb.txt").is_file()
+
+
+def open_eth3d_tum(path: Path, camera: Camera | Calibration | None = None) -> ImageSequence:
+    """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
+
+    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
+    """
+    entries = read_image_list(path / "rgb.txt")
+    camera = camera if camera is not None else find_calibration(path)
+    if camera is None:
+        raise CalibrationError(
+            f"{path}: no {' or '.join(CALIBRATION_FILES)} (TUM RGB-D archives carry none); "
+            "give the camera with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or as a calibration file"
+        )
+    truth = path / "groundtruth.txt"
+    groundtruth = read_trajectory(truth) if truth.is_file() else None
+    return ImageSequence(path.name, "ETH3D or TUM folder", entries, camera, groundtruth)
+
+
+def read_image_list(path: Path) -> list[ImageEntry]:
+    """The lines `timestamp file` of a list. Raises SequenceError naming file and line."""
+    entries = []
+    for number, line in numbered_lines(path, SequenceError):
+        where = f"{path}:{number}"
+        words = line.split(maxsplit=1)
+        try:
+            timestamp = float(words[0])
+        except ValueError:
+            timestamp = math.nan
+        if len(words) != 2 or not math.isfinite(timestamp):
+            raise SequenceError(f"{where}: expected `timestamp file`, got `{line}`")
+        entries.append(ImageEntry(timestamp, path.parent / words[1], where))
+    if not entries:
+        raise SequenceError(f"{path}: no images are listed")
+    return entries
+
+
+def find_calibration(path: Path) -> Calibration | None:
+    """The calibration file of a folder, if it has one."""
+    for name in CALIBRATION_FILES:
+        if (path / name).is_file():
+            return read_calibration(path / name)
+    return None

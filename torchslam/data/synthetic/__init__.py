@@ -1,0 +1,7 @@
+"""Rendered sequences with exact ground truth: `synthetic:room` and its relatives."""
+
+from __future__ import annotations
+
+from torchslam.data.synthetic.sequence import SyntheticSequence, open_synthetic
+
+__all__ = ["SyntheticSequence", "open_synthetic"]

@@ -1,0 +1,65 @@
+"""Smooth camera paths through the synthetic scenes, (N, 4, 4) float64 T_wc, from the phase of each frame."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.lie import rigid, so3_exp
+
+
+def loop(phase: Tensor) -> Tensor:
+    """A figure of eight through the middle of the room, one round a phase of 2 pi, held in a hand that sways.
+
+    The sway's periods do not divide the round's, so that no two rounds are the same.
+    """
+    x = 1.1 * torch.sin(phase) + 0.02 * torch.sin(7.3 * phase)
+    y = -0.1 + 0.12 * torch.sin(2.0 * phase + 0.5) + 0.015 * torch.sin(11.7 * phase)
+    z = -0.5 - 0.55 * torch.sin(2.0 * phase) + 0.02 * torch.sin(5.9 * phase + 1.0)
+    yaw = 0.45 * torch.sin(phase - 0.9) + 0.02 * torch.sin(9.1 * phase)
+    pitch = 0.08 * torch.sin(2.0 * phase + 1.3) + 0.015 * torch.sin(8.3 * phase + 0.4)
+    roll = 0.05 * torch.sin(phase + 0.7) + 0.01 * torch.sin(10.3 * phase)
+    return _poses(x, y, z, yaw, pitch, roll)
+
+
+def standstill(phase: Tensor) -> Tensor:
+    """No motion at all."""
+    return _poses(*[torch.zeros_like(phase)] * 6)
+
+
+def rotation(phase: Tensor) -> Tensor:
+    """A camera that turns about its own centre and back."""
+    zero = torch.zeros_like(phase)
+    return _poses(
+        zero, zero, zero, 0.7 * torch.sin(phase), 0.2 * torch.sin(2 * phase), 0.1 * torch.sin(phase)
+    )
+
+
+def sideways(phase: Tensor) -> Tensor:
+    """A slow walk along the wall and back, turned towards it from changing angles."""
+    return _poses(
+        1.2 * torch.sin(phase),
+        0.2 * torch.sin(2 * phase),
+        0.4 * torch.sin(phase + 0.5),
+        -0.25 * torch.sin(phase),
+        0.08 * torch.sin(2 * phase),
+        0.05 * torch.sin(phase),
+    )
+
+
+def phases(frames: int, frames_per_round: int) -> Tensor:
+    """(frames,) the phase of each frame, from 0."""
+    return torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames_per_round)
+
+
+def _poses(x: Tensor, y: Tensor, z: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+    """T_wc from position, metres, and angles, radians: about y, then x, then z of the camera."""
+    zero = torch.zeros_like(x)
+    R_wc = (
+        so3_exp(torch.stack((zero, yaw, zero), dim=-1))
+        @ so3_exp(torch.stack((pitch, zero, zero), dim=-1))
+        @ so3_exp(torch.stack((zero, zero, roll), dim=-1))
+    )
+    return rigid(R_wc, torch.stack((x, y, z), dim=-1))

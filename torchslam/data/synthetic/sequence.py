@@ -1,0 +1,117 @@
+"""Rendered sequences, opened by name: `synthetic:room`, `synthetic:room?frames=240&noise=4`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from urllib.parse import parse_qsl
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.sequence import Sequence
+from torchslam.data.synthetic import paths
+from torchslam.data.synthetic.renderer import Renderer
+from torchslam.data.synthetic.scene import Rectangle, room, wall
+from torchslam.errors import SequenceError
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_inverse
+from torchslam.types import Trajectory
+
+FRAME_RATE = 20.0
+FRAMES_PER_ROUND = 160
+SIZE = (640, 480)
+FOCAL = 500.0
+
+SCENES: dict[str, tuple[Callable[[int], list[Rectangle]], Callable[[Tensor], Tensor]]] = {
+    "room": (room, paths.loop),
+    "planar": (wall, paths.sideways),
+    "rotation": (room, paths.rotation),
+    "standstill": (room, paths.standstill),
+}
+"""By name: what is seen, from a seed, and the path of the camera, from the phase."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What follows the `?` of a synthetic sequence's name.
+
+    frames:   how many; the path is a round of 160 that goes on with another sway
+    seed:     of textures and noise
+    noise:    standard deviation, grey levels of 255
+    blur:     standard deviation of a Gaussian, pixels
+    exposure: amplitude of a slow change of brightness, 0 to 1
+    blank:    1 for grey images instead of rendered ones, where only the poses matter
+    """
+
+    frames: int = FRAMES_PER_ROUND
+    seed: int = 0
+    noise: float = 2.0
+    blur: float = 0.5
+    exposure: float = 0.0
+    blank: int = 0
+
+
+class SyntheticSequence(Sequence):
+    """A scene rendered when a frame is asked for; the same name gives the same bytes."""
+
+    def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
+        options = RenderOptions() if options is None else options
+        _, path = SCENES[scene]
+        T_wc = path(paths.phases(options.frames, FRAMES_PER_ROUND))
+        timestamps = torch.arange(options.frames, dtype=torch.float64) / FRAME_RATE
+        centre = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+        camera = Camera.pinhole(FOCAL, FOCAL, *centre, size=SIZE)
+        super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
+        self._options = options
+        self._poses_cw = se3_inverse(T_wc).numpy()
+
+    def image(self, index: int) -> Tensor:
+        options = self._options
+        if options.blank:
+            return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5)
+        image = _renderer(self.name, options.seed).render(self._poses_cw[index])
+        if options.blur > 0:
+            image = cv2.GaussianBlur(image, (0, 0), options.blur)
+        image *= 1.0 + options.exposure * np.sin(0.1 * index)
+        # Noise of its own for each frame, whatever the order in which they are asked for.
+        rng = np.random.default_rng((options.seed, index))
+        image += options.noise * rng.standard_normal(image.shape, dtype=np.float32)
+        return grey_to_tensor(image.round().clip(0, 255).astype(np.uint8))
+
+    def image_name(self, index: int) -> str:
+        return f"synthetic:{self.name}#{index}"
+
+
+def open_synthetic(name: str) -> SyntheticSequence:
+    """A rendered sequence from `synthetic:SCENE[?key=value&...]`, with the keys of RenderOptions.
+
+    Raises SequenceError for an unknown scene or key, or a value out of range.
+    """
+    scene, _, query = name.removeprefix("synthetic:").partition("?")
+    if scene not in SCENES:
+        raise SequenceError(f"{name}: unknown scene `{scene}`; there are {', '.join(SCENES)}")
+    options = RenderOptions()
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        if key not in asdict(options):
+            raise SequenceError(f"{name}: unknown option `{key}`; there are {', '.join(asdict(options))}")
+        try:
+            value = type(getattr(options, key))(text)
+        except ValueError:
+            raise SequenceError(f"{name}: `{key}` must be a number, got `{text}`") from None
+        if not value >= (1 if key == "frames" else 0):
+            raise SequenceError(f"{name}: `{key}` is out of range: {text}")
+        options = replace(options, **{key: value})
+    return SyntheticSequence(scene, options)
+
+
+@lru_cache(maxsize=2)
+def _renderer(scene: str, seed: int) -> Renderer:
+    """Textures take seconds to make, so that the last scenes are kept."""
+    rectangles, _ = SCENES[scene]
+    K = np.array(((FOCAL, 0, (SIZE[0] - 1) / 2), (0, FOCAL, (SIZE[1] - 1) / 2), (0, 0, 1)))
+    return Renderer(rectangles(seed), K, SIZE)

@@ -1,0 +1,93 @@
+"""Procedural grey textures with corners at every scale, from a seed."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+FINEST = 0.02
+"""Metres: about the smallest shape drawn."""
+COVERAGE = 0.12
+"""The part of a surface that the shapes of one size cover."""
+KINDS = ("polygon", "bar", "ellipse", "letter")
+FRACTION_BITS = 4
+
+
+def surface(rng: np.random.Generator, size: tuple[float, float], texel: float, multiple: int) -> np.ndarray:
+    """A painted surface: shapes of every size from a third of it down to two centimetres, over smooth noise.
+
+    size: (width, height) metres; texel: metres, at most; multiple: of which rows and columns are to be
+    Returns (rows, columns) uint8.
+    """
+    columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
+    image = _noise(rng, rows, columns, texel)
+    extent = min(size) / 3
+    while extent > FINEST:
+        # Shapes of one size leave room, so that the larger ones below them stay visible.
+        count = int(COVERAGE * size[0] * size[1] / (0.3 * extent**2)) + 1
+        _draw_shapes(rng, image, count, extent / texel)
+        extent /= 1.8
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def _noise(rng: np.random.Generator, rows: int, columns: int, texel: float) -> np.ndarray:
+    """Noise of several octaves around a tone of the surface's own, (rows, columns) uint8."""
+    total = np.full((rows, columns), rng.uniform(70, 190), np.float32)
+    for wavelength, amplitude in ((0.9, 30.0), (0.2, 15.0), (0.05, 10.0), (0.015, 8.0)):
+        cells = (max(2, int(rows * texel / wavelength)), max(2, int(columns * texel / wavelength)))
+        coarse = rng.uniform(-amplitude, amplitude, cells).astype(np.float32)
+        total += cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    return total.clip(0, 255).astype(np.uint8)
+
+
+def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent: float) -> None:
+    """Draw `count` random shapes of about `extent` texels, each lighter or darker than what is below it."""
+    rows, columns = image.shape
+    kinds = rng.choice(len(KINDS), count, p=(0.45, 0.25, 0.15, 0.15))
+    centres = rng.uniform((0, 0), (columns, rows), (count, 2))
+    radii = 0.5 * extent * rng.uniform(0.6, 1.4, count)
+    contrasts = rng.uniform(35, 95, count) * rng.choice((-1, 1), count)
+    turns = rng.uniform(0, 2 * np.pi, count)
+    aspects = rng.uniform(0.3, 1.0, count)
+    letters = rng.integers(ord("A"), ord("Z") + 1, count)
+    corners = rng.integers(3, 7, count)
+    jitters = rng.uniform(-0.35, 0.35, (count, 6))
+    for i in range(count):
+        x, y = centres[i]
+        below = int(image[int(y), int(x)])
+        grey = int(np.clip(below + contrasts[i], 0, 255))
+        if abs(grey - below) < 30:
+            grey = int(np.clip(below - contrasts[i], 0, 255))
+        kind, radius = KINDS[kinds[i]], radii[i]
+        if kind == "letter":
+            thickness = max(1, round(radius / 4))
+            cv2.putText(
+                image,
+                chr(letters[i]),
+                (int(x - 0.6 * radius), int(y + 0.7 * radius)),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                radius / 14,
+                grey,
+                thickness,
+                cv2.LINE_AA,
+            )
+        elif kind == "ellipse":
+            axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
+            cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), grey, -1, cv2.LINE_AA)
+        else:
+            sides = 4 if kind == "bar" else corners[i]
+            angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
+            outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
+            _fill(image, outline, turns[i], (x, y), grey)
+
+
+def _fill(
+    image: np.ndarray, outline: np.ndarray, turn: float, centre: tuple[float, float], grey: int
+) -> None:
+    """Fill a polygon, turned about its centre, with its corners off the pixel grid."""
+    cosine, sine = math.cos(turn), math.sin(turn)
+    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + centre
+    fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
+    cv2.fillPoly(image, [fixed], grey, cv2.LINE_AA, FRACTION_BITS)

@@ -1,0 +1,45 @@
+"""Small text files of lists and numbers, read with errors that name file and line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from torchslam.errors import TorchslamError
+
+
+def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
+    """The lines of a file that say something, with their numbers from 1; `#` starts a comment.
+
+    Raises `error` where the file does not exist or is not text.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as cause:
+        raise error(f"{path}: cannot be read: {cause}") from cause
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.split("#", 1)[0].strip()
+        if content:
+            yield number, content
+
+
+def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[float]:
+    """The finite numbers of a line, apart by spaces or commas. Raises `error` at `where` otherwise."""
+    numbers = []
+    for word in text.replace(",", " ").split():
+        try:
+            number = float(word)
+        except ValueError:
+            raise error(f"{where}: `{word}` is not a number") from None
+        if not math.isfinite(number):
+            raise error(f"{where}: `{word}` is not a finite number")
+        numbers.append(number)
+    return numbers
+
+
+def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:
+    """Raises `error` at `where` unless a timestamp is later than the one before it."""
+    if timestamp <= before:
+        relation = "repeats" if timestamp == before else "is earlier than"
+        raise error(f"{where}: timestamp {timestamp!r} {relation} the one before")
