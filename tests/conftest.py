@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,8 +32,8 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
-def data_dir() -> Iterator[Path]:
+def data_dir() -> Path:
     """The folder of real sequences; the test is skipped where it is missing."""
     if not DATA_DIR.is_dir():
         pytest.skip(f"no real sequences at {DATA_DIR}; set TORCHSLAM_DATA to the folder that has them")
-    yield DATA_DIR
+    return DATA_DIR

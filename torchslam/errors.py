@@ -1,4 +1,4 @@
-"""The errors that torchslam raises on purpose. All derive from `TorchslamError`; the message says what, where and what to do."""
+"""The errors that torchslam raises on purpose. A message says what is wrong, where, and what to do."""
 
 
 class TorchslamError(Exception):
@@ -23,6 +23,10 @@ class FrameError(TorchslamError):
 
 class TrajectoryError(TorchslamError):
     """A trajectory file or object is malformed, or two of them have nothing in common."""
+
+
+class ResultsError(TorchslamError):
+    """A results folder or a map file is missing, incomplete or not of this program."""
 
 
 class DownloadError(TorchslamError):

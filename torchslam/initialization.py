@@ -1,4 +1,4 @@
-"""The first map: two views, an essential matrix, triangulated points, and the judgement whether they are worth a start."""
+"""The first map: two views, their relative pose, triangulated points, and whether they are worth a start."""
 
 from __future__ import annotations
 
@@ -121,14 +121,17 @@ def why_not(good: Tensor, seen: Triangulation, matches: int, settings: Initializ
     in_front = float(seen.mask.float().mean())
     if in_front < 0.8:
         return f"matches behind a camera: only {in_front:.0%} lie in front of both"
-    mean_angle = math.degrees(float(seen.angles[seen.mask].mean()))
     if count < settings.min_points:
-        return f"too little parallax: {count} points have enough, {settings.min_points} are needed (mean {mean_angle:.2f} degrees)"
+        return f"too little parallax: {count} points have enough, {settings.min_points} are needed"
     if settings.criterion == "parallax":
-        if mean_angle < settings.min_mean_parallax_deg:
-            return f"too little parallax: {mean_angle:.2f} degrees in the mean, {settings.min_mean_parallax_deg} are needed"
-    elif count < settings.min_good_share * matches:
-        return f"depths too uncertain: {count} of {matches} are known well enough, {settings.min_good_share:.0%} are needed"
+        mean, least = math.degrees(float(seen.angles[seen.mask].mean())), settings.min_mean_parallax_deg
+        return (
+            f"too little parallax: {mean:.1f} degrees in the mean, {least} are needed" if mean < least else ""
+        )
+    if count < settings.min_good_share * matches:
+        return (
+            f"depths too uncertain: {count} of {matches} known well, {settings.min_good_share:.0%} are needed"
+        )
     return ""
 
 

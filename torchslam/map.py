@@ -225,7 +225,7 @@ class Map:
         return point_ids
 
     def refresh(self, keyframes: Tensor) -> None:
-        """Take view direction, scale and descriptor of the points that these keyframes (k,) see from their newest observation.
+        """Take direction, scale and descriptor of the points that keyframes (k,) see from their newest observation.
 
         `reach` is distance times keypoint scale: from distance d the point is expected at scale reach / d.
         """

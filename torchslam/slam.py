@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 
 from torchslam.config import Config
+from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.extraction import Extractor, image_extractor
 from torchslam.geometry import Camera
@@ -18,7 +19,6 @@ from torchslam.initialization import Initializer
 from torchslam.keyframes import why_keyframe
 from torchslam.map import Map
 from torchslam.mapping import Mapper
-from torchslam.data.sequence import Sequence
 from torchslam.run import Run, run_sequence
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking import Tracked, Tracker

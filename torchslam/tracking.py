@@ -1,4 +1,4 @@
-"""Where is the camera now? Predict, match the local map, PnP RANSAC, robust refinement; lost is a state, not a crash."""
+"""Where is the camera now? Predict, match the local map, PnP RANSAC, robust refinement."""
 
 from __future__ import annotations
 
