@@ -1,0 +1,19 @@
+"""Draw the pictures of a run again, from the files in its folder of results."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from torchslam.output.pictures import draw
+from torchslam.output.results import read_results
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+
+
+def execute(options: argparse.Namespace) -> int:
+    for path in draw(read_results(options.directory), options.directory):
+        print(path)
+    return 0

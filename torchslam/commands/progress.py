@@ -1,0 +1,48 @@
+"""The progress bar of a run."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from tqdm import tqdm
+
+from torchslam.types import StepResult
+
+
+class ProgressBar:
+    """Frame, rate, state and points on one line of stderr; warnings are printed above it."""
+
+    def __init__(self, frames: int, count_points: Callable[[], int]) -> None:
+        self._count_points = count_points
+        self._bar = tqdm(
+            total=frames,
+            unit=" frames",
+            file=sys.stderr,
+            dynamic_ncols=True,
+            bar_format="{n_fmt}/{total_fmt} |{bar:24}| {rate_fmt}, {remaining} left{postfix}",
+        )
+        self._warnings = warnings.catch_warnings()
+
+    def update(self, result: StepResult) -> None:
+        """Move on to the frame of a result."""
+        self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
+        self._bar.update(result.index + 1 - self._bar.n)
+
+    def __enter__(self) -> ProgressBar:
+        self._warnings.__enter__()
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = self._show
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._warnings.__exit__(kind, error, trace)
+        self._bar.close()
+
+    def _show(self, message: Warning | str, *where: Any, **more: Any) -> None:
+        tqdm.write(f"torchslam: warning: {message}", file=sys.stderr)

@@ -1,0 +1,56 @@
+"""What happened to every frame, as a CSV file: state, matches, inliers, reason and milliseconds per stage."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchslam.errors import ResultsError
+from torchslam.types import State, StepResult
+
+COLUMNS = ("index", "timestamp", "state", "keyframe", "matches", "inliers", "reason")
+STAGE_SUFFIX = "_ms"
+
+
+def write_frames(path: str | Path, results: Sequence[StepResult]) -> None:
+    """Write one row per frame; a stage that did not run in a frame is left empty. Poses are in the trajectory file."""
+    stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*COLUMNS, *(stage + STAGE_SUFFIX for stage in stages)])
+        for result in results:
+            times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
+            row = [result.index, repr(result.timestamp), result.state.value, int(result.is_keyframe)]
+            writer.writerow([*row, result.matches, result.inliers, result.reason, *times])
+
+
+def read_frames(path: str | Path) -> list[StepResult]:
+    """The rows of a file written by `write_frames`, without poses. Raises ResultsError that names file and line."""
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            return [_result(row, f"{path}:{reader.line_num}") for row in reader]
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _result(row: dict[str, str], where: str) -> StepResult:
+    try:
+        return StepResult(
+            index=int(row["index"]),
+            timestamp=float(row["timestamp"]),
+            state=State(row["state"]),
+            T_cw=None,
+            is_keyframe=bool(int(row["keyframe"])),
+            matches=int(row["matches"]),
+            inliers=int(row["inliers"]),
+            reason=row["reason"],
+            stage_ms={
+                name.removesuffix(STAGE_SUFFIX): float(value)
+                for name, value in row.items()
+                if name.endswith(STAGE_SUFFIX) and value
+            },
+        )
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise ResultsError(f"{where}: not a row of frames.csv: {error}") from None

@@ -1,0 +1,113 @@
+"""All pictures of a run, from its results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchslam.evaluation import Evaluation, evaluate
+from torchslam.geometry import rigid, so3_log, transform
+from torchslam.map import NO_POINT, Map
+from torchslam.output import plots
+from torchslam.output.results import PLOTS, Results, example_keyframe
+from torchslam.types import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw(results: Results, directory: Path) -> list[Path]:
+    """Draw every picture that the results allow into the folder `plots`; returns the files.
+
+    With ground truth, path and map are aligned to it by a similarity.
+    """
+    folder = directory / PLOTS
+    for old in folder.glob("*.png"):
+        old.unlink()
+    paths = []
+    for name, figure in _figures(results):
+        paths.append(folder / f"{name}.png")
+        plots.save(figure, paths[-1])
+    return paths
+
+
+def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
+    if results.frames:
+        yield "tracking", plots.plot_tracking(results.frames)
+        yield "stages", plots.plot_stage_times(results.frames)
+    if not len(results.trajectory):
+        return
+    yield from _scenes(results)
+    if results.example_image is not None:
+        yield "features", _example(results.map, results.example_image)
+
+
+def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
+    points_w = results.map.positions_w[results.map.living_points()]
+    trajectory, keyframes, truth, unit, title = (
+        results.trajectory,
+        results.keyframes,
+        None,
+        "",
+        "Path and map",
+    )
+    evaluation = _evaluation(results)
+    if evaluation is not None:
+        S = evaluation.S_groundtruth_estimate
+        points_w, keyframes, trajectory = transform(S, points_w), _aligned(keyframes, S), evaluation.aligned
+        truth, unit = results.groundtruth, "m"
+        title = f"Path and map, ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
+        yield "errors", _errors(evaluation, results)
+    yield "scene", plots.plot_scene(trajectory, points_w, truth, keyframes, unit, title)
+    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title)
+
+
+def _errors(evaluation: Evaluation, results: Results) -> Figure:
+    estimated, true = evaluation.matched.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
+    errors_rad = so3_log(true.mT @ estimated).norm(dim=-1)
+    title = f"Error against ground truth, aligned by a similarity (scale {evaluation.scale:.4g})"
+    return plots.plot_errors(
+        evaluation.matched.timestamps, evaluation.errors_m, errors_rad, results.frames, title
+    )
+
+
+def _aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
+    """Poses after a similarity (4, 4) of the world."""
+    rotation = S[:3, :3] / torch.linalg.det(S[:3, :3]) ** (1 / 3)
+    return Trajectory(
+        trajectory.timestamps,
+        rigid(rotation @ trajectory.T_wc[:, :3, :3], transform(S, trajectory.positions_w)),
+    )
+
+
+def _evaluation(results: Results) -> Evaluation | None:
+    """The errors against ground truth where the run was evaluated when it ended."""
+    if results.groundtruth is None or "ate_m" not in results.metrics:
+        return None
+    return evaluate(results.trajectory, results.groundtruth)
+
+
+def _example(slam_map: Map, image: Tensor) -> Figure:
+    """The keypoints of the example keyframe; tails lead back to the keyframe before it."""
+    keyframe = example_keyframe(slam_map)
+    columns = slam_map.keyframes
+    mask, ids = columns["mask"][keyframe], columns["point_ids"][keyframe]
+    previous = torch.full((len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype)
+    if keyframe > 0:
+        before = columns["point_ids"][keyframe - 1]
+        previous[before[before >= 0]] = columns["keypoints"][keyframe - 1][before >= 0]
+    counts = torch.cat(
+        (slam_map.observation_counts(), torch.zeros(1, dtype=torch.int64))
+    )  # NO_POINT reads the end
+    return plots.plot_features(
+        image,
+        columns["keypoints"][keyframe][mask],
+        (ids > NO_POINT)[mask],
+        previous[ids][mask],
+        counts[ids][mask],
+        title=f"Frame {int(columns['frame_index'][keyframe])}",
+    )

@@ -1,0 +1,57 @@
+"""Features and matches on an image."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.output.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def plot_features(
+    image: Tensor, keypoints: Tensor, matched: Tensor, previous: Tensor, lengths: Tensor, title: str = ""
+) -> Figure:
+    """Keypoints on an image: map points as dots with a tail to where they were before, the others as rings.
+
+    image:     (H, W) in [0, 1]
+    keypoints: (N, 2) pixels
+    matched:   (N,) bool, those that are map points
+    previous:  (N, 2) pixels of the same map points in an earlier frame, NaN where it did not see them
+    lengths:   (N,) in how many keyframes the point was seen, for the colour
+    """
+    grey = image.detach().cpu().float().numpy()
+    height, width = grey.shape
+    is_matched = matched.cpu().numpy()
+    x, y = keypoints.detach().cpu().double().numpy().T
+    with style.house_style():
+        figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
+        axes = figure.add_subplot()
+        axes.imshow(0.25 + 0.75 * grey, cmap="gray", vmin=0.0, vmax=1.0)
+        axes.plot(x[~is_matched], y[~is_matched], "o", ms=3.2, mfc="none", mec="#f2ede2", mew=0.6, alpha=0.85)
+        _draw_tails(axes, keypoints[matched], previous[matched])
+        counts = lengths.cpu().numpy()[is_matched]
+        dots = axes.scatter(
+            x[is_matched], y[is_matched], 12, counts, cmap="viridis", linewidths=0.3, edgecolors="#10222e"
+        )
+        if is_matched.any():
+            figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.015, label="keyframes that saw the point")
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")
+        axes.grid(visible=False)
+        figures = f"{len(keypoints)} features, {int(is_matched.sum())} of them map points"
+        axes.set_title(f"{title}: {figures}" if title else figures)
+    return figure
+
+
+def _draw_tails(axes: Axes, pixels: Tensor, previous: Tensor) -> None:
+    from matplotlib.collections import LineCollection
+
+    tails = torch.stack([previous, pixels], dim=1).detach().cpu().double().numpy()
+    known = np.isfinite(tails).all(axis=(1, 2))
+    axes.add_collection(LineCollection(list(tails[known]), colors=style.ACCENT, lw=0.9, alpha=0.9))

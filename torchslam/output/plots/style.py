@@ -1,0 +1,123 @@
+"""What all pictures share: palette, type, axes limits that far outliers cannot stretch, saving."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ESTIMATE = "#1d4e74"
+GROUND_TRUTH = "#2f2f2f"
+ACCENT = "#c8553d"
+LOST = "#f3d9d2"
+INITIALIZING = "#f1ecdf"
+MUTED = "#7a7a7a"
+AXES_RGB = ("#d5493f", "#57a145", "#3f8fe8")  # the camera's x, y, z
+STAGES = ("#264653", "#2a9d8f", "#8ab17d", "#e9c46a", "#f4a261", "#e76f51", "#9d4e6c", "#6d6875", "#a3a3a3")
+
+_RC: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8.0,
+    "axes.labelcolor": "#404040",
+    "axes.edgecolor": "#9a9a9a",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e7e5e0",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#606060",
+    "ytick.color": "#606060",
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.facecolor": "white",
+    "savefig.dpi": 150,
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Inside, figures are made in the house style; matplotlib's global settings are restored after."""
+    import matplotlib
+
+    with matplotlib.rc_context(_RC):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of the given size in inches that needs neither a screen nor pyplot's global state."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG; the same figure gives the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with house_style():
+        figure.savefig(path, metadata={"Software": None})
+
+
+def upright_axes(T_wc: np.ndarray) -> tuple[np.ndarray, tuple[str, str, str]]:
+    """The signed axis permutation that brings the cameras' mean up direction closest to +z, and its names.
+
+    T_wc (N, 4, 4) -> matrix (3, 3), labels such as ("x", "z", "-y"). The world's own axes are kept, so the
+    labels stay true: a world whose y points down (cameras, KITTI) is drawn over its x-z plane.
+    """
+    up = -T_wc[:, :3, 1].mean(axis=0) if len(T_wc) else np.array([0.0, 0.0, 1.0])
+    vertical = int(np.abs(up).argmax())
+    sign = 1.0 if up[vertical] >= 0 else -1.0
+    first, second = [axis for axis in range(3) if axis != vertical]
+    rows = np.zeros((3, 3))
+    rows[0, first], rows[1, second], rows[2, vertical] = 1.0, 1.0, sign
+    names = ["xyz"[first], "xyz"[second], ("-" if sign < 0 else "") + "xyz"[vertical]]
+    if np.linalg.det(rows) < 0:  # keep the picture right-handed, not mirrored
+        rows[1] *= -1
+        names[1] = "-" + names[1]
+    return rows, (names[0], names[1], names[2])
+
+
+def robust_box(path: np.ndarray, points: np.ndarray, margin: float = 0.06) -> np.ndarray:
+    """Limits (D, 2) that hold the whole path (N, D) and the bulk of the points (L, D), but no far outliers.
+
+    Points count between their 3rd and 97th percentile, and only as far from the path's centre as 2.5 times
+    the median point is, or 1.5 times the path extends.
+    """
+    if not len(path) and not len(points):
+        return np.tile(np.array([-1.0, 1.0]), (points.shape[-1], 1))
+    anchor = path if len(path) else np.median(points, axis=0, keepdims=True)
+    low, high = anchor.min(axis=0), anchor.max(axis=0)
+    if len(points):
+        centre = (low + high) / 2
+        reach = max(
+            2.5 * float(np.median(np.linalg.norm(points - centre, axis=1))),
+            1.5 * float(np.linalg.norm(high - low)),
+        )
+        point_low, point_high = np.percentile(points, [3.0, 97.0], axis=0)
+        low = np.minimum(low, np.maximum(point_low, centre - reach))
+        high = np.maximum(high, np.minimum(point_high, centre + reach))
+    pad = margin * max(float((high - low).max()), 1e-6)
+    return np.stack([low - pad, high + pad], axis=1)
+
+
+def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(L,) bool: which points (L, D) lie in the limits (D, 2)."""
+    return np.all((points >= box[:, 0]) & (points <= box[:, 1]), axis=1)
+
+
+def thin(count: int, limit: int) -> np.ndarray:
+    """Indices of at most `limit` of `count` rows, evenly spread, first and last included."""
+    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
+
+
+def length_label(unit: str) -> str:
+    """`m` or, where the scale is unknown, a word for it."""
+    return unit if unit else "map units"

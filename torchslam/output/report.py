@@ -1,0 +1,99 @@
+"""The figures of a run: as a dictionary for metrics.json, and as a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import mean, median
+from typing import Any
+
+import torch
+
+from torchslam.evaluation import Evaluation
+from torchslam.run import Run
+from torchslam.types import State, StepResult
+
+
+def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:
+    """The figures of a run.
+
+    frames counts all that the run met, unreadable ones included; posed those with a pose in the trajectory; lost
+    those that tracking gave up on; initialised_at is the index of the frame that made the first map, or None.
+    Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
+    truth, the figures of the evaluation are added.
+    """
+    totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
+    start = next((result for result in run.results if result.state is State.TRACKING), None)
+    figures: dict[str, Any] = {
+        "frames": len(run.results) + len(run.skipped),
+        "posed": len(run.trajectory),
+        "posed_share_after_initialisation": _posed_share(run, start),
+        "lost": sum(result.state is State.LOST for result in run.results),
+        "initialised_at": None if start is None else start.index,
+        "keyframes": len(run.keyframes),
+        "points": run.map.num_points,
+        "fps": 1e3 / mean(totals) if totals else 0.0,
+        "ms_median": median(totals) if totals else 0.0,
+        "ms_p95": float(torch.tensor(totals).quantile(0.95)) if totals else 0.0,
+        "stage_ms": stage_times(run.results),
+        "skipped": run.skipped,
+        "interrupted": run.interrupted,
+        "failure": run.failure,
+    }
+    return figures | (evaluation.as_dict() if evaluation is not None else {})
+
+
+def stage_times(results: Sequence[StepResult]) -> dict[str, dict[str, float]]:
+    """Per stage the median and mean milliseconds over the frames in which it ran, and in how many it ran."""
+    times: dict[str, list[float]] = {}
+    for result in results:
+        for stage, milliseconds in result.stage_ms.items():
+            times.setdefault(stage, []).append(milliseconds)
+    return {
+        stage: {"median": median(values), "mean": mean(values), "frames": len(values)}
+        for stage, values in times.items()
+    }
+
+
+def table(rows: Mapping[str, str]) -> str:
+    """Two columns: label and value."""
+    width = max(map(len, rows), default=0)
+    return "\n".join(f"  {label:<{width}}   {value}" for label, value in rows.items())
+
+
+def summary(figures: Mapping[str, Any]) -> dict[str, str]:
+    """The metrics of a run in words, label by label, for `table`."""
+    frames, skipped = figures["frames"], len(figures["skipped"])
+    rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
+    if figures["initialised_at"] is None:
+        return rows | {"map": f"none: {figures['failure']}"}
+    rows |= {
+        "posed": f"{figures['posed']} ({figures['posed'] / frames:.1%}), "
+        f"{figures['posed_share_after_initialisation']:.1%} since the start at frame {figures['initialised_at']}",
+        "lost": f"{figures['lost']} frames",
+        "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
+        "speed": f"{figures['fps']:.1f} frames/s; {figures['ms_median']:.0f} ms a frame (median), "
+        f"{figures['ms_p95']:.0f} ms (95th percentile)",
+    }
+    return rows | accuracy(figures)
+
+
+def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
+    """The figures of an evaluation in words; nothing where there was no ground truth."""
+    if "ate_m" not in figures:
+        return {}
+    length = figures["path_length_m"]
+    share = f" ({figures['ate_m'] / length:.2%} of the path)" if length > 0 else ""
+    return {
+        "ATE": f"{figures['ate_m']:.4f} m RMSE{share}, Sim(3)-aligned; {figures['ate_se3_m']:.4f} m without the scale",
+        "RPE": f"{figures['rpe']['translation_m']:.4f} m, {figures['rpe']['rotation_deg']:.3f}° a frame",
+        "scale": f"{figures['scale']:.4f} true metres per map unit",
+        "path length": f"{length:.2f} m",
+    }
+
+
+def _posed_share(run: Run, start: StepResult | None) -> float:
+    """Posed frames among those from the first map on."""
+    if start is None:
+        return 0.0
+    since = sum(result.index >= start.index for result in run.results)
+    return int((run.trajectory.timestamps >= start.timestamp).sum()) / since
