@@ -1,0 +1,95 @@
+"""Binary descriptors: 256 bits packed in 32 bytes, and the Hamming distance between them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+# Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
+_GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
+
+
+def pack_bits(bits: Tensor) -> Tensor:
+    """Pack booleans into bytes, least significant bit first: (..., 8 D) bool -> (..., D) uint8.
+
+    Raises ValueError if the last dimension is no multiple of eight.
+    """
+    if bits.shape[-1] % 8:
+        raise ValueError(f"the number of bits must be a multiple of 8, got {bits.shape[-1]}")
+    words = bits.to(torch.bool).contiguous().view(torch.int64)
+    return ((words * _GATHER_BITS) >> 56).to(torch.uint8)
+
+
+def unpack_bits(descriptors: Tensor) -> Tensor:
+    """The bits of packed descriptors, the inverse of `pack_bits`: (..., D) uint8 -> (..., 8 D) bool."""
+    return bit_table(0, 1, descriptors.device)[descriptors.long()].flatten(-2).to(torch.bool)
+
+
+@lru_cache(maxsize=16)
+def bit_table(zero: int, one: int, device: torch.device) -> Tensor:
+    """(256, 8) int8: the bits of every byte, least significant first, with `zero` and `one` in place of 0 and 1."""
+    shifts = torch.arange(8, device=device)
+    bits = (torch.arange(256, device=device)[:, None] >> shifts) & 1
+    return torch.where(bits.bool(), one, zero).to(torch.int8)
+
+
+def spread_bits(descriptors: Tensor, amplitude: int) -> Tensor:
+    """Bits as -amplitude and +amplitude: (..., D) uint8 -> (..., 8 D) int8, one table row (a word) per byte."""
+    words = bit_table(-amplitude, amplitude, descriptors.device).view(torch.int64).view(-1)
+    rows = words.index_select(0, descriptors.reshape(-1).to(torch.int32))
+    return rows.view(torch.int8).view(*descriptors.shape[:-1], -1)
+
+
+def popcount(words: Tensor) -> Tensor:
+    """Number of set bits of each int64 word, by summing neighbouring bit fields (Warren: Hacker's Delight, 2002)."""
+    words = words - ((words >> 1) & 0x5555555555555555)
+    words = (words & 0x3333333333333333) + ((words >> 2) & 0x3333333333333333)
+    words = (words + (words >> 4)) & 0x0F0F0F0F0F0F0F0F
+    return (words * 0x0101010101010101) >> 56
+
+
+def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
+    """Hamming distance row by row: (..., D) uint8 twice, D a multiple of 8 -> (...) int64."""
+    words_1 = descriptors_1.contiguous().view(torch.int64)
+    words_2 = descriptors_2.contiguous().view(torch.int64)
+    return popcount(words_1 ^ words_2).sum(-1)
+
+
+def hamming(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
+    """All Hamming distances between two batches of packed descriptors, exact.
+
+    descriptors_1: (..., N1, D) uint8; descriptors_2: (..., N2, D) uint8. Returns (..., N1, N2) int32, in bits.
+    """
+    bits = 8 * descriptors_1.shape[-1]
+    return (bits - sign_products(descriptors_1, descriptors_2, 1).to(torch.int32)) >> 1
+
+
+def sign_products(descriptors_1: Tensor, descriptors_2: Tensor, amplitude: int) -> Tensor:
+    """Inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
+
+    descriptors_1: (..., N1, D) uint8; descriptors_2: (..., N2, D) uint8; amplitude: at most 64. Returns
+    (..., N1, N2), int32 where the processor multiplies int8 matrices quickly, else float32. Both are exact, as the
+    sums stay below 2^24.
+    """
+    signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
+    if not _fast_int8(descriptors_1.device) or 0 in (*signs_1.shape, *signs_2.shape):
+        return signs_1.float() @ signs_2.float().mT
+    batch = signs_1.shape[:-2]
+    pairs = zip(
+        signs_1.reshape(-1, *signs_1.shape[-2:]), signs_2.reshape(-1, *signs_2.shape[-2:]), strict=True
+    )
+    products = [torch._int_mm(left, right.mT) for left, right in pairs]
+    stacked = products[0] if len(products) == 1 else torch.stack(products)
+    return stacked.view(*batch, *products[0].shape)
+
+
+def _fast_int8(device: torch.device) -> bool:
+    """Whether int8 matrix products beat float32: on x86 processors with AVX-512, through oneDNN."""
+    return (
+        device.type == "cpu"
+        and hasattr(torch, "_int_mm")
+        and torch.backends.mkldnn.is_available()
+        and torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+    )

@@ -1,0 +1,74 @@
+"""Orientation by the intensity centroid and rotated BRIEF descriptors (Rublee et al.: ORB, 2011)."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torchslam.features.bits import pack_bits
+from torchslam.features.corners import gather_patches
+from torchslam.features.pattern import PATTERN
+
+RADIUS = 15
+BLUR_RADIUS = 3
+ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
+
+
+@lru_cache(maxsize=8)
+def _moment_weights(device: torch.device) -> Tensor:
+    """(side^2, 2) float32: x and y of each pixel of the patch within the disk of RADIUS, else 0."""
+    axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
+    return torch.stack([x * disk, y * disk], dim=-1).view(-1, 2).to(device)
+
+
+def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
+    """Angle from each keypoint to the intensity centroid of the disk around it.
+
+    pixels: (P,) uint8 flattened atlas; positions: (N,) int64 into it. Returns (N,) float32 radians in [-pi, pi],
+    from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
+    """
+    patches = gather_patches(pixels, positions, stride, RADIUS)
+    moments = patches.flatten(1).to(torch.float32) @ _moment_weights(pixels.device)
+    return torch.atan2(moments[:, 1], moments[:, 0])
+
+
+def blur(pixels: Tensor, stride: int) -> Tensor:
+    """Smooth a flattened image by a 7x7 near-Gaussian of sigma 1.6 px, in whole numbers.
+
+    pixels: (P,) uint8. Returns (P - 6 stride - 6,) int16, 256 times the blurred value less 2^15: entry i belongs to
+    pixel i + BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
+    """
+    # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
+    smooth = pixels.to(torch.int16) - 128
+    for shift in (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride):
+        length = smooth.shape[0] - shift
+        smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
+    return smooth
+
+
+@lru_cache(maxsize=16)
+def _rotated_offsets(stride: int, device: torch.device) -> Tensor:
+    """(ANGLE_BINS, 512) int32: flat offsets of both ends of all tests, for every rotation of the pattern."""
+    angles = torch.arange(ANGLE_BINS, dtype=torch.float64) * (2 * math.pi / ANGLE_BINS)
+    cos, sin = angles.cos()[:, None], angles.sin()[:, None]
+    ends = torch.tensor(PATTERN, dtype=torch.float64).view(-1, 2, 2).transpose(0, 1).reshape(-1, 2)
+    x, y = (ends[:, 0] * cos - ends[:, 1] * sin).round(), (ends[:, 0] * sin + ends[:, 1] * cos).round()
+    return (y * stride + x).to(device=device, dtype=torch.int32)
+
+
+def describe(blurred: Tensor, positions: Tensor, angles: Tensor, stride: int) -> Tensor:
+    """256 brightness comparisons around each keypoint, turned by its angle.
+
+    blurred: from `blur`; positions: (N,) int64 into the image before blurring, RADIUS + BLUR_RADIUS inside its edges;
+    angles: (N,) radians. Returns (N, 32) uint8.
+    """
+    bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
+    origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)
+    samples = _rotated_offsets(stride, blurred.device).index_select(0, bins) + origins[:, None]
+    first, second = blurred.index_select(0, samples.view(-1)).view(samples.shape).chunk(2, dim=1)
+    return pack_bits(first < second)

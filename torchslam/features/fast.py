@@ -1,0 +1,70 @@
+"""FAST-9 corners (Rosten, Drummond: Machine learning for high-speed corner detection, 2006), on a flat atlas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# The circle of radius 3, (dx, dy), clockwise from the top.
+CIRCLE = (
+    (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
+    (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
+)  # fmt: skip
+
+Extremum = Callable[[Tensor, Tensor], Tensor]
+
+
+def fast_scores(pixels: Tensor, stride: int) -> Tensor:
+    """Score of every pixel: the largest t at which it is brighter or darker by t than nine neighbours in a row.
+
+    pixels: (P,) uint8, a flattened image of row length `stride`. Returns (P,) uint8; 0 where there is no such
+    arc and in the first and last rows, which the circle leaves. A pixel is a FAST-9 corner of threshold t where its
+    score exceeds t.
+    """
+    margin = 3 * stride + 3
+    count = pixels.shape[0] - 2 * margin
+    if count <= 0:
+        return torch.zeros_like(pixels)
+    ring = [pixels.narrow(0, margin + dy * stride + dx, count) for dx, dy in CIRCLE]
+    centre = pixels.narrow(0, margin, count)
+    # The darkest pixel of the brightest arc, and the brightest pixel of the darkest one.
+    bright = _best_arc(ring, torch.minimum, torch.maximum)
+    dark = _best_arc(ring, torch.maximum, torch.minimum)
+    scores = torch.maximum(torch.maximum(bright, centre) - centre, centre - torch.minimum(dark, centre))
+    return F.pad(scores, (margin, margin))
+
+
+def _best_arc(ring: list[Tensor], inner: Extremum, outer: Extremum) -> Tensor:
+    """`outer` over the sixteen arcs of nine of `inner` within the arc.
+
+    Arcs come in pairs that share eight pixels: min(eight, a) and min(eight, b) have the maximum min(eight, max(a, b)).
+    """
+    pairs = [inner(ring[k], ring[k + 1 - 16]) for k in range(1, 16, 2)]
+    fours = [inner(pairs[k], pairs[k + 1 - 8]) for k in range(8)]
+    best: Tensor | None = None
+    for k in range(8):
+        eight = inner(fours[k], fours[k + 2 - 8])  # ring positions 2k+1 ... 2k+8
+        arcs = inner(eight, outer(ring[2 * k], ring[2 * k + 9 - 16]))
+        best = arcs if best is None else outer(best, arcs)
+    assert best is not None
+    return best
+
+
+def suppress_non_maxima(scores: Tensor, stride: int) -> Tensor:
+    """True where a score exceeds all eight neighbours; of equal neighbours the first in reading order wins.
+
+    scores: (P,) uint8, flattened with row length `stride`. Returns (P,) bool, False on the margins.
+    """
+    count = scores.shape[0] - 2 * (stride + 1)
+    if count <= 0:
+        return torch.zeros_like(scores, dtype=torch.bool)
+    left, middle, right = (scores[k : scores.shape[0] - 2 + k] for k in range(3))
+    sideways = torch.maximum(left, right)
+    rows = torch.maximum(sideways, middle)  # rows[i] covers columns i, i+1, i+2
+    centre = middle.narrow(0, stride, count)
+    before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
+    after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
+    return F.pad((centre > before) & (centre >= after), (stride + 1, stride + 1))

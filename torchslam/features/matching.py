@@ -1,0 +1,305 @@
+"""Matching of descriptors: every row against every row, and guided by where a point should appear.
+
+Binary descriptors (uint8) are compared by exact Hamming distance, float descriptors by 1 - cosine. Of equal distances
+the lower index wins, so results do not depend on the device.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.types import Features, Matches
+
+# Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
+_AMPLITUDE = 64
+_INDEX_BITS = 13
+_MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
+
+_BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
+
+
+class _Nearest(NamedTuple):
+    """For each of N1 rows its nearest (B, N1) column, the distances to it and to the second nearest, and whether no
+    other row is nearer to that column."""
+
+    column: Tensor
+    distance: Tensor
+    second: Tensor
+    mutual: Tensor
+
+
+def match(
+    features_1: Features,
+    features_2: Features,
+    ratio: float | None = 0.8,
+    mutual: bool = True,
+    max_distance: float | None = 64,
+    temperature: float | None = None,
+) -> Matches:
+    """Nearest neighbours between two sets of features, all against all.
+
+    features_1, features_2: batches of the same size B; rows outside their masks never match
+    ratio:        the nearest must be closer than `ratio` times the second nearest; None: no such test
+    mutual:       the row must be a nearest neighbour of its match in turn
+    max_distance: Hamming bits, or 1 - cosine for floats; None: no limit
+    temperature:  where given, `weights` are the dual softmax of -distance / temperature at the matches, with gradients
+                  to float descriptors (Sun et al.: LoFTR, 2021, eq. 2)
+
+    Returns Matches with M = N1 rows, row i being keypoint i of the first set. Each keypoint of the second set is used
+    at most once: the lowest distance wins, then the lowest index. Distances of float descriptors carry gradients.
+    Raises ValueError if the descriptors do not go together.
+    """
+    descriptors_1, descriptors_2 = features_1.descriptors, features_2.descriptors
+    _check_descriptors(descriptors_1, descriptors_2)
+    batch, rows, columns = len(descriptors_1), descriptors_1.shape[1], descriptors_2.shape[1]
+    if rows == 0 or columns == 0:
+        return _no_matches(batch, rows, descriptors_1.device)
+    similarity = None
+    if descriptors_1.dtype == torch.uint8:
+        nearest = _nearest_bits(descriptors_1, descriptors_2, features_1.mask, features_2.mask)
+        if temperature is not None:
+            similarity = -hamming(descriptors_1, descriptors_2).float()
+    else:
+        similarity = descriptors_1 @ descriptors_2.mT
+        nearest = _nearest_floats(similarity, features_1.mask, features_2.mask)
+    mask = features_1.mask & features_2.mask.any(1, keepdim=True)
+    if max_distance is not None:
+        mask = mask & (nearest.distance <= max_distance)
+    if ratio is not None:
+        mask = mask & (nearest.distance < ratio * nearest.second)
+    if mutual:
+        mask = mask & nearest.mutual
+    mask = _one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
+    weights = None
+    if temperature is not None and similarity is not None:
+        weights = (
+            _dual_softmax(similarity / temperature, nearest.column, features_1.mask, features_2.mask) * mask
+        )
+    return _matches(nearest.column, nearest.distance, mask, weights)
+
+
+def match_projected(
+    descriptors: Tensor,
+    pixels: Tensor,
+    radius: Tensor | float,
+    features: Features,
+    mask: Tensor | None = None,
+    scales: Tensor | None = None,
+    angles: Tensor | None = None,
+    ratio: float | None = 0.9,
+    max_distance: float | None = 64,
+    scale_tolerance: float = 1.5,
+    angle_tolerance: float = math.pi / 6,
+) -> Matches:
+    """Match points with known descriptors to the keypoints near their predicted pixels.
+
+    descriptors: (B, M, 32) uint8 or (B, M, D) unit-length floats, of the points
+    pixels:      (B, M, 2) where the points should appear; radius: (B, M) or one number, pixels
+    features:    keypoints to match, (B, N, ...)
+    mask:        (B, M) points that take part
+    scales:      (B, M) predicted `Features.scales`; a keypoint's may differ by the factor `scale_tolerance`
+    angles:      (B, M) predicted radians; a keypoint's may differ by `angle_tolerance`
+    ratio:       the nearest must be closer than `ratio` times the nearest of the other keypoints of its scale in the
+                 window (rivals on other levels mostly see the same corner); None: no such test
+    max_distance: Hamming bits, or 1 - cosine for floats; None: no limit
+
+    Returns Matches with M rows: row i is point i, `indices_2` its keypoint; every keypoint is used at most once, by the
+    point of lowest distance, then lowest index. Raises ValueError if the descriptors do not go together.
+    """
+    _check_descriptors(descriptors, features.descriptors)
+    batch, rows, columns = len(pixels), pixels.shape[1], features.keypoints.shape[1]
+    if rows == 0 or columns == 0:
+        return _no_matches(batch, rows, pixels.device)
+    radius = torch.as_tensor(radius, dtype=pixels.dtype, device=pixels.device).expand(batch, rows)
+    mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if mask is None else mask
+    row, column = _window_pairs(
+        pixels.detach(), radius.detach(), mask, features.keypoints.detach(), features.mask
+    )
+
+    keypoint_scales = features.scales.detach().flatten()
+    if scales is not None:
+        factor = keypoint_scales[column] / scales.detach().flatten()[row]
+        near = (factor <= scale_tolerance) & (factor * scale_tolerance >= 1)
+        row, column = row[near], column[near]
+    if angles is not None:
+        turn = features.angles.detach().flatten()[column] - angles.detach().flatten()[row]
+        near = torch.cos(turn) >= math.cos(angle_tolerance)
+        row, column = row[near], column[near]
+
+    distances = _pair_distances(descriptors.flatten(0, 1)[row], features.descriptors.flatten(0, 1)[column])
+    best, accepted, distance = _best_of_pairs(row, column, distances, keypoint_scales, batch * rows, ratio)
+    if max_distance is not None:
+        accepted = accepted & (distance <= max_distance)
+    local = (best % columns).view(batch, rows)
+    distance, accepted = distance.view(batch, rows), accepted.view(batch, rows)
+    return _matches(local, distance, _one_to_one(local, distance.detach(), accepted, columns))
+
+
+def _nearest_bits(descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, mask_2: Tensor) -> _Nearest:
+    """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
+    keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
+    bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
+    columns = keys.shape[2]
+    if columns > 1 << _INDEX_BITS:  # more columns than the free bits can number: wider keys
+        index_bits = columns.bit_length()
+        keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
+    highest = (1 << index_bits) - 1
+    masked = _MASKED << (index_bits - _INDEX_BITS)
+    numbers = highest - torch.arange(columns, device=keys.device) + masked * ~mask_2
+    keys += numbers.to(keys.dtype)[:, None, :]
+    keys += (masked * ~mask_1).to(keys.dtype)[:, :, None]
+
+    def distance(key: Tensor) -> Tensor:
+        return (bits // 2 - (key.to(torch.int64) >> index_bits)).float()
+
+    best, column_best = keys.amax(2), keys.amax(1)
+    column = highest - (best.to(torch.int64) & highest)
+    keys.scatter_(2, column[..., None], 2 * masked)
+    second = distance(keys.amax(2))
+    second = torch.where(second > bits, torch.inf, second)
+    nearest = distance(best)
+    return _Nearest(column, nearest, second, nearest <= distance(column_best).gather(1, column))
+
+
+def _nearest_floats(similarity: Tensor, mask_1: Tensor, mask_2: Tensor) -> _Nearest:
+    """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
+    values = similarity.detach().masked_fill(~(mask_1[:, :, None] & mask_2[:, None, :]), -torch.inf)
+    best, column = values.max(2)
+    mutual = best >= values.amax(1).gather(1, column)
+    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2)
+    return _Nearest(column, 1 - similarity.gather(2, column[..., None])[..., 0], second, mutual)
+
+
+def _dual_softmax(logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor) -> Tensor:
+    """Product of the softmax over columns and over rows at (row, column[row]): (B, N1, N2), (B, N1) -> (B, N1)."""
+    low = torch.finfo(logits.dtype).min / 2
+    logits = logits.masked_fill(~(mask_1[:, :, None] & mask_2[:, None, :]), low)
+    both = logits.softmax(2) * logits.softmax(1)
+    return both.gather(2, column[..., None])[..., 0]
+
+
+def _window_pairs(
+    pixels: Tensor, radius: Tensor, mask: Tensor, keypoints: Tensor, keypoint_mask: Tensor
+) -> tuple[Tensor, Tensor]:
+    """All pairs of a point and a keypoint within its radius: flat rows b * M + i, ascending, and columns b * N + j.
+
+    Keypoints are sorted by band of _BAND rows, then by x: what a window takes of a band is one run in that order.
+    """
+    batch = mask.shape[0]
+    low_band, high_band = (torch.floor((pixels[..., 1] + sign * radius) / _BAND) for sign in (-1, 1))
+    keypoint_band = torch.floor(keypoints[..., 1] / _BAND)
+    # A lone number per (image, band), with room between images for windows that leave the image.
+    first = torch.minimum(low_band.amin(), keypoint_band.amin())
+    per_image = torch.maximum(high_band.amax(), keypoint_band.amax()) - first + 1
+    image = torch.arange(batch, device=pixels.device)[:, None] * per_image - first
+    width = 2 + 2 * torch.maximum((pixels[..., 0].abs() + radius).amax(), keypoints[..., 0].abs().amax())
+
+    def key(band: Tensor, x: Tensor) -> Tensor:
+        return (image.view(-1, *[1] * (band.dim() - 1)) + band).double() * width + x
+
+    keys = key(keypoint_band, keypoints[..., 0]).masked_fill(~keypoint_mask, torch.inf).flatten()
+    keys, order = keys.sort(stable=True)
+    spans = int((high_band - low_band).masked_fill(~mask, 0).amax()) + 1
+    bands = low_band[..., None] + torch.arange(spans, device=pixels.device)
+    used = mask[..., None] & (bands <= high_band[..., None])
+    left, right = (
+        torch.searchsorted(keys, key(bands, (pixels[..., 0] + sign * radius)[..., None]), right=sign > 0)
+        for sign in (-1, 1)
+    )
+    counts = torch.where(used, right - left, 0).flatten()
+    run = torch.repeat_interleave(counts)
+    starts = left.flatten() - (counts.cumsum(0) - counts)
+    row, column = run // spans, order[torch.arange(run.shape[0], device=run.device) + starts[run]]
+    offset = keypoints.flatten(0, 1)[column] - pixels.flatten(0, 1)[row]
+    inside = offset.square().sum(-1) <= radius.flatten()[row] ** 2
+    return row[inside], column[inside]
+
+
+def _pair_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
+    """Distance row by row, float32 for bits, with gradients for floats."""
+    if descriptors_1.dtype == torch.uint8:
+        return hamming_pairs(descriptors_1, descriptors_2).float()
+    return 1 - (descriptors_1 * descriptors_2).sum(-1)
+
+
+def _best_of_pairs(
+    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor, rows: int, ratio: float | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each row the nearest column, whether it passes the ratio test, and its distance (with its graph): (rows,).
+
+    The ratio is taken to the nearest other column of the same scale. Rows without pairs get column 0, not accepted.
+    """
+    values = distances.detach()
+    nearest = _lowest(row, values, rows)
+    pair = torch.arange(row.shape[0], device=row.device)
+    winner = values == nearest[row]
+    # Lowest column among equals, then the pair that holds it.
+    unset = torch.iinfo(torch.int64).max
+    best = row.new_full((rows,), unset).scatter_reduce(0, row[winner], column[winner], "amin")
+    chosen = column == best[row]
+    best_pair = row.new_zeros(rows).scatter(0, row[chosen], pair[chosen])
+    found = best != unset
+    best = torch.where(found, best, 0)
+    distance = torch.where(found, nearest, torch.inf)
+    if distances.requires_grad:
+        distance = torch.where(found, distances[best_pair], torch.inf)
+    if ratio is not None:
+        rival = ~chosen & (scales[column] / scales[best][row] - 1).abs().lt(0.05)
+        second = _lowest(row[rival], values[rival], rows)
+        found = found & (nearest < ratio * second)
+    return best, found, distance
+
+
+def _lowest(groups: Tensor, values: Tensor, num_groups: int) -> Tensor:
+    """The lowest value of each group: (P,) int64, (P,) -> (num_groups,), infinity for empty groups."""
+    return values.new_full((num_groups,), torch.inf).scatter_reduce(0, groups, values, "amin")
+
+
+def _one_to_one(column: Tensor, distances: Tensor, mask: Tensor, columns: int) -> Tensor:
+    """Keep of the masked rows that share a column the one of lowest distance, then of lowest index: (B, M) each."""
+    batch, rows = column.shape
+    offset = torch.arange(batch, device=column.device)[:, None] * columns
+    target = (column + offset).flatten()
+    distances = torch.where(mask, distances, torch.inf).flatten()
+    winner = mask.flatten() & (distances == _lowest(target, distances, batch * columns)[target])
+    row = torch.arange(batch * rows, device=column.device)
+    first = row.new_full((batch * columns,), batch * rows)
+    first = first.scatter_reduce(0, target[winner], row[winner], "amin")
+    return (winner & (first[target] == row)).view(batch, rows)
+
+
+def _matches(column: Tensor, distances: Tensor, mask: Tensor, weights: Tensor | None = None) -> Matches:
+    """Matches of row i with column[i] where the mask is set; index and distance 0 elsewhere."""
+    row = torch.arange(column.shape[1], device=column.device).expand_as(column)
+    zero = torch.zeros_like(distances)
+    return Matches(
+        torch.where(mask, row, 0),
+        torch.where(mask, column, 0),
+        torch.where(mask, distances, zero),
+        mask,
+        weights,
+    )
+
+
+def _no_matches(batch: int, rows: int, device: torch.device) -> Matches:
+    index = torch.zeros(batch, rows, dtype=torch.int64, device=device)
+    return Matches(index, index, index.float(), index.bool())
+
+
+def _check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
+    same = descriptors_1.dtype == descriptors_2.dtype and descriptors_1.shape[-1] == descriptors_2.shape[-1]
+    if (
+        descriptors_1.dim() != 3
+        or descriptors_2.dim() != 3
+        or len(descriptors_1) != len(descriptors_2)
+        or not same
+    ):
+        raise ValueError(
+            f"descriptors must be two (B, N, D) of one type, got {tuple(descriptors_1.shape)} {descriptors_1.dtype} "
+            f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"
+        )

@@ -1,0 +1,91 @@
+"""The image pyramid, packed in one flat atlas so that every dense step is one operation for all levels.
+
+All levels of an image lie in one rectangle with a common row stride. In the flattened rectangle the neighbour
+(dx, dy) of pixel p is p + dy * stride + dx, on every level alike. Neighbourhoods reach over a level's edge into
+another level; keypoints keep a border from the edge, so these values are never used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Where the levels of a pyramid lie in the atlas. Everything in pixels of the atlas.
+
+    sizes:  (height, width) of each level; corners: (top, left) of each level; scales: full-resolution pixels
+    (x, y) per pixel of the level.
+    """
+
+    sizes: tuple[tuple[int, int], ...]
+    corners: tuple[tuple[int, int], ...]
+    scales: tuple[tuple[float, float], ...]
+    rows: int
+    stride: int
+
+
+@lru_cache(maxsize=32)
+def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) -> Atlas:
+    """Sizes of the levels and their places: each level goes on the first shelf with room, or opens a new one."""
+    sizes = [
+        (max(1, round(height / scale_factor**k)), max(1, round(width / scale_factor**k)))
+        for k in range(num_levels)
+    ]
+    corners: list[tuple[int, int]] = []
+    shelves: list[list[int]] = []  # [top, height, used width]
+    bottom = 0
+    for h, w in sizes:
+        shelf = next((s for s in shelves if s[1] >= h and s[2] + w <= width), None)
+        if shelf is None:
+            shelf = [bottom, h, 0]
+            shelves.append(shelf)
+            bottom += h
+        corners.append((shelf[0], shelf[2]))
+        shelf[2] += w
+    scales = tuple((width / w, height / h) for h, w in sizes)
+    return Atlas(tuple(sizes), tuple(corners), scales, bottom, width)
+
+
+def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:
+    """The pyramid: (B, 1, H, W) -> one (B, 1, h, w) per level, each resized bilinearly from the one before."""
+    levels = [images]
+    for size in atlas.sizes[1:]:
+        levels.append(F.interpolate(levels[-1], size=size, mode="bilinear", align_corners=False))
+    return levels
+
+
+def fill_atlas(levels: list[Tensor], atlas: Atlas) -> Tensor:
+    """Levels with values in [0, 1] quantised to bytes at their places: (B, rows, stride) uint8."""
+    filled = torch.zeros(
+        levels[0].shape[0], atlas.rows, atlas.stride, dtype=torch.uint8, device=levels[0].device
+    )
+    for level, (top, left), (h, w) in zip(levels, atlas.corners, atlas.sizes, strict=True):
+        # Through int16: torch converts float to int16 and int16 to bytes with vector instructions.
+        quantised = level[:, 0].mul(255).add_(0.5).to(torch.int16)
+        filled[:, top : top + h, left : left + w] = quantised
+    return filled
+
+
+def gather_level_patches(
+    levels: list[Tensor], images: Tensor, level: Tensor, xy: Tensor, radius: int
+) -> Tensor:
+    """Patches around keypoints on their own levels, with gradients to the levels.
+
+    images, level: (N,) int64, which image and level; xy: (N, 2) int64, pixels of the level, at least `radius` inside.
+    Returns (N, side, side).
+    """
+    device = xy.device
+    heights, widths = (torch.tensor([lv.shape[d] for lv in levels], device=device) for d in (-2, -1))
+    areas = heights * widths * levels[0].shape[0]
+    starts = areas.cumsum(0) - areas
+    flat = torch.cat([lv.reshape(-1) for lv in levels])
+    centres = starts[level] + (images * heights[level] + xy[:, 1]) * widths[level] + xy[:, 0]
+    axis = torch.arange(-radius, radius + 1, device=device)
+    rows = centres[:, None] + widths[level][:, None] * axis
+    return flat[rows[:, :, None] + axis]
