@@ -34,6 +34,6 @@ def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: flo
     interval = times[right] - times[left]
     fraction = ((timestamps - times[left]) / torch.where(interval > 0, interval, 1.0)).clamp(0, 1)
     T_wc = se3_interpolate(trajectory.T_wc[left], trajectory.T_wc[right], fraction.to(trajectory.T_wc))
-    # A pose at exactly this time is taken as it is, without the rounding of log and exp.
-    exact = (times[right] == timestamps)[:, None, None]
+    # At a pose's own time and beyond the ends it is taken as it is, without the rounding of log and exp.
+    exact = ((fraction >= 1) | (interval == 0))[:, None, None]
     return torch.where(exact, trajectory.T_wc[right], T_wc), distances <= tolerance

@@ -1,0 +1,206 @@
+"""ETH3D and TUM folders: what is read, and what every kind of damage leads to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from torchslam.data import open_sequence
+from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
+
+Folder = Callable[..., Path]
+
+
+def test_reads_frames_camera_and_groundtruth(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    sequence = open_sequence(folder)
+    assert (len(sequence), sequence.name, sequence.size) == (5, "sequence", (64, 48))
+    assert sequence.frame_rate == pytest.approx(10.0)
+    assert sequence.camera.model == "pinhole"
+    assert sequence.camera.params.tolist() == [60.0, 61.0, 31.5, 23.5]
+    assert sequence.groundtruth is not None
+    assert len(sequence.groundtruth) == 7
+
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, 1000.2)
+    assert frame.image.shape == (1, 1, 48, 64)
+    assert frame.image.dtype == torch.float32
+    grey = cv2.imread(str(folder / "rgb" / "2.png"), cv2.IMREAD_GRAYSCALE)
+    assert torch.equal(frame.image[0, 0], torch.from_numpy(grey).float() / 255)
+    assert frame.T_cw_groundtruth is not None
+    torch.testing.assert_close(frame.T_cw_groundtruth[:3, 3], torch.tensor([-0.2, 0, 0], dtype=torch.float64))
+
+
+def test_frames_beyond_the_groundtruth_have_no_pose(tum_folder: Folder) -> None:
+    sequence = open_sequence(tum_folder())
+    assert sequence[3].T_cw_groundtruth is not None
+    assert sequence[4].T_cw_groundtruth is None
+
+
+def test_groundtruth_is_optional(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    (folder / "groundtruth.txt").unlink()
+    sequence = open_sequence(folder)
+    assert sequence.groundtruth is None
+    assert sequence[0].T_cw_groundtruth is None
+
+
+def test_part_is_renumbered_and_keeps_its_poses(tum_folder: Folder) -> None:
+    sequence = open_sequence(tum_folder(), limit=2, stride=2)
+    whole = open_sequence(tum_folder())
+    assert len(sequence) == 2
+    assert [frame.index for frame in sequence] == [0, 1]
+    assert torch.equal(sequence[1].image, whole[2].image)
+    assert torch.equal(sequence[1].T_cw_groundtruth, whole[2].T_cw_groundtruth)
+    assert sequence.frame_rate == pytest.approx(5.0)
+
+
+def test_negative_index_counts_from_the_end(tum_folder: Folder) -> None:
+    sequence = open_sequence(tum_folder())
+    assert sequence[-1].index == 4
+    with pytest.raises(IndexError, match="frame 5 of 5"):
+        sequence[5]
+
+
+def test_describe_names_what_would_be_read(tum_folder: Folder) -> None:
+    described = open_sequence(tum_folder()).describe()
+    assert described["frames"] == "5"
+    assert described["size"] == "64x48"
+    assert "60 61 31.5 23.5" in described["camera"]
+    assert described["ground truth"] == "7 poses, 0.30 m, for 4 of 5 frames"
+
+
+def test_missing_image_names_list_and_line(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    (folder / "rgb" / "1.png").unlink()
+    sequence = open_sequence(folder)
+    with pytest.raises(FrameError, match=r"rgb\.txt:4: .*1\.png cannot be read: No such file"):
+        sequence[1]
+    assert sequence[2].index == 2  # the others are still there
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".pgm"])
+def test_truncated_image_names_list_and_line(tum_folder: Folder, suffix: str) -> None:
+    folder = tum_folder(suffix)
+    image = folder / "rgb" / f"3{suffix}"
+    data = image.read_bytes()
+    sequence = open_sequence(folder)
+    for length in (0, 20, len(data) // 2, len(data) - 12):
+        image.write_bytes(data[:length])
+        with pytest.raises(FrameError, match=r"rgb\.txt:6: .*3\.\w+ is (truncated|not an image)"):
+            sequence[3]
+
+
+def test_file_that_is_no_image(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    (folder / "rgb" / "0.png").write_text("<html>404</html>")
+    sequence = open_sequence(folder)  # the size comes from the next image
+    assert sequence.size == (64, 48)
+    with pytest.raises(FrameError, match=r"rgb\.txt:3: .*not an image"):
+        sequence[0]
+
+
+def test_image_of_another_size(tum_folder: Folder, write_picture: Callable) -> None:
+    folder = tum_folder()
+    write_picture(folder / "rgb" / "4.png", size=(32, 48))
+    with pytest.raises(FrameError, match=r"rgb\.txt:7: .*4\.png is 32x48, the others are 64x48"):
+        open_sequence(folder)[4]
+
+
+def test_no_readable_image_at_all(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    for image in (folder / "rgb").iterdir():
+        image.unlink()
+    with pytest.raises(SequenceError, match="none of the first 5 images can be read"):
+        open_sequence(folder)
+
+
+def test_empty_list(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    (folder / "rgb.txt").write_text("# timestamp filename\n\n")
+    with pytest.raises(SequenceError, match=r"rgb\.txt: no images are listed"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1000.1 rgb/2.png", "repeats the one before"),
+        ("1000.05 rgb/2.png", "is earlier than the one before"),
+        ("nan rgb/2.png", "expected `timestamp file`"),
+        ("rgb/2.png", "expected `timestamp file`"),
+        ("1000.2", "expected `timestamp file`"),
+    ],
+)
+def test_bad_line_of_the_list(tum_folder: Folder, line: str, message: str) -> None:
+    folder = tum_folder()
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    lines[4] = line
+    (folder / "rgb.txt").write_text("\n".join(lines))
+    with pytest.raises(SequenceError, match=rf"rgb\.txt:5: .*{message}"):
+        open_sequence(folder)
+
+
+def test_paths_with_spaces(tum_folder: Folder, write_picture: Callable) -> None:
+    folder = tum_folder()
+    image = write_picture(folder / "my images" / "a b.png", 7)
+    (folder / "rgb.txt").write_text("1.0 my images/a b.png\n")
+    assert torch.equal(open_sequence(folder)[0].image[0, 0], torch.from_numpy(image).float() / 255)
+
+
+def test_without_calibration_asks_for_the_camera(tum_folder: Folder) -> None:
+    folder = tum_folder(calibration=None)
+    with pytest.raises(CalibrationError, match="--camera fx,fy,cx,cy"):
+        open_sequence(folder)
+    assert open_sequence(folder, camera="70,70,32,24").camera.params.tolist() == [70.0, 70.0, 32.0, 24.0]
+
+
+def test_other_name_of_the_calibration(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    (folder / "calibration.txt").rename(folder / "calib.txt")
+    assert float(open_sequence(folder).camera.fy) == 61.0
+
+
+def test_camera_of_another_size(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    camera = open_sequence(folder).camera
+    other = type(camera).pinhole(60, 61, 31.5, 23.5, size=(128, 96))
+    assert open_sequence(folder, camera=camera).camera is camera
+    with pytest.raises(CalibrationError, match="128x96, these are 64x48"):
+        open_sequence(folder, camera=other)
+
+
+def test_bad_groundtruth_names_file_and_line(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    with (folder / "groundtruth.txt").open("a") as file:
+        file.write("1002 0 0 0 0 0 0 nan\n")
+    with pytest.raises(TrajectoryError, match=r"groundtruth\.txt:9: `nan` is not a finite number"):
+        open_sequence(folder)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "frames", "size", "model", "poses"),
+    [
+        ("redkitchen", 1000, (640, 480), "pinhole", 1000),
+        ("kitti07", 160, (1226, 370), "pinhole", 160),
+        ("machine_hall", 320, (752, 480), "radial_tangential", 3430),
+        ("fr2_desk_20", 20, (640, 480), "radial_tangential", 1166),
+        ("shelf_bin", 50, (640, 480), "pinhole", 50),
+        ("standstill", 40, (752, 480), "radial_tangential", None),
+    ],
+)
+def test_real_sequences(
+    data_dir: Path, name: str, frames: int, size: tuple[int, int], model: str, poses: int | None
+) -> None:
+    sequence = open_sequence(data_dir / name)
+    assert (len(sequence), sequence.size, sequence.camera.model) == (frames, size, model)
+    assert (None if sequence.groundtruth is None else len(sequence.groundtruth)) == poses
+    for index in (0, frames // 2, frames - 1):
+        frame = sequence[index]
+        assert frame.image.shape == (1, 1, size[1], size[0])
+        assert (frame.T_cw_groundtruth is not None) == (poses is not None)
