@@ -23,9 +23,19 @@ from torchslam.geometry.lie import (
     transform,
     vee,
 )
+from torchslam.geometry.triangulation import (
+    MultiViewTriangulation,
+    Triangulation,
+    correct_matches,
+    triangulate,
+    triangulate_many,
+)
 
 __all__ = [
     "Camera",
+    "MultiViewTriangulation",
+    "Triangulation",
+    "correct_matches",
     "matrix_from_quaternion",
     "quaternion_from_matrix",
     "rigid",
@@ -44,6 +54,8 @@ __all__ = [
     "so3_left_jacobian",
     "so3_log",
     "transform",
+    "triangulate",
+    "triangulate_many",
     "umeyama",
     "vee",
 ]

@@ -1,0 +1,230 @@
+"""Points from their pixels in two or many views, with parallax angle, depths and reprojection errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_inverse, skew, transform
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points seen in two views. Invalid rows are finite.
+
+    points_w: (..., N, 3)
+    angles:   (..., N) parallax between the two rays at the point, radians
+    depths_1, depths_2: (..., N) z in each camera
+    errors_1, errors_2: (..., N) reprojection error in pixels; infinite where the point does not project
+    mask:     (..., N) the input mask, where the rays intersect in front of both cameras
+    """
+
+    points_w: Tensor
+    angles: Tensor
+    depths_1: Tensor
+    depths_2: Tensor
+    errors_1: Tensor
+    errors_2: Tensor
+    mask: Tensor
+
+
+@dataclass(frozen=True)
+class MultiViewTriangulation:
+    """Points seen in up to V views. Invalid rows are finite.
+
+    points_w: (..., N, 3)
+    angles:   (..., N) largest parallax between two of the rays, radians
+    depths:   (..., N, V) z in each camera
+    errors:   (..., N, V) reprojection error in pixels; infinite where the point does not project
+    mask:     (..., N) seen in two views or more, and in front of all cameras that see it
+    """
+
+    points_w: Tensor
+    angles: Tensor
+    depths: Tensor
+    errors: Tensor
+    mask: Tensor
+
+
+def triangulate(
+    T_1w: Tensor,
+    T_2w: Tensor,
+    pixels_1: Tensor,
+    pixels_2: Tensor,
+    camera_1: Camera,
+    camera_2: Camera,
+    mask: Tensor | None = None,
+) -> Triangulation:
+    """Triangulates matches of two views, with the least squared error in undistorted coordinates.
+
+    T_1w, T_2w: (..., 4, 4); pixels_1, pixels_2: (..., N, 2); mask: (..., N). Rows outside the mask may hold
+    anything. Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject
+    by `angles`, `depths` and `errors`.
+    Source: Lindstrom, "Triangulation made easy", 2010 (two iterations, exact to far below the noise).
+    """
+    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
+    mask = finite if mask is None else mask & finite
+    x_1 = camera_1.normalize(torch.where(mask[..., None], pixels_1, 0.0))
+    x_2 = camera_2.normalize(torch.where(mask[..., None], pixels_2, 0.0))
+    T_21 = T_2w @ se3_inverse(T_1w)
+    R_21, t_21 = T_21[..., :3, :3], T_21[..., :3, 3]
+    x_1, x_2 = correct_matches(skew(t_21) @ R_21, x_1, x_2)
+
+    ray_1, ray_2 = _homogeneous(x_1) @ R_21.mT, _homogeneous(x_2)
+    t = t_21[..., None, :].expand_as(ray_1)
+    normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
+    normal_squared = (normal * normal).sum(-1)
+    # depth_2 ray_2 = depth_1 ray_1 + t, each depth after a cross product with the other ray
+    tiny = torch.finfo(x_1.dtype).eps ** 2
+    intersects = normal_squared > tiny
+    depth_1 = -(torch.linalg.cross(t, ray_2, dim=-1) * normal).sum(-1) / torch.where(
+        intersects, normal_squared, 1.0
+    )
+    depth_1 = torch.where(intersects & (depth_1 != 0), depth_1, 1.0)
+    points_1 = depth_1[..., None] * _homogeneous(x_1)
+    points_2 = transform(T_21, points_1)
+    depth_2 = points_2[..., 2]
+
+    mask = mask & intersects & (depth_1 > 0) & (depth_2 > 0)
+    angles = _angle(depth_1[..., None] * ray_1, points_2)
+    errors_1 = _reprojection_error(camera_1, points_1, pixels_1, mask)
+    errors_2 = _reprojection_error(camera_2, points_2, pixels_2, mask)
+    points_w = transform(se3_inverse(T_1w), points_1)
+    return Triangulation(points_w, angles, depth_1, depth_2, errors_1, errors_2, mask)
+
+
+def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
+    """Moves matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
+
+    E: (..., 3, 3); x_1, x_2: (..., N, 2) undistorted image coordinates. Returns both corrected.
+    Source: Lindstrom, "Triangulation made easy", 2010.
+    """
+    E_22 = E[..., :2, :2]
+    line_2 = _homogeneous(x_1) @ E.mT  # E x_1
+    n_2 = line_2[..., :2]
+    n_1 = (_homogeneous(x_2) @ E)[..., :2]
+    constraint = (_homogeneous(x_2) * line_2).sum(-1)
+    b = 0.5 * ((n_1 * n_1).sum(-1) + (n_2 * n_2).sum(-1))
+    a = ((n_2 @ E_22) * n_1).sum(-1)
+    regular = b > torch.finfo(b.dtype).tiny
+    discriminant = b * b - a * constraint
+    root = torch.where(regular & (discriminant > 0), discriminant, 1.0).sqrt()
+    step = torch.where(regular, constraint / torch.where(regular, b + root, 1.0), 0.0)[..., None]
+    moved_1, moved_2 = n_1 - step * (n_2 @ E_22), n_2 - step * (n_1 @ E_22.mT)
+    length = ((moved_1 * moved_1).sum(-1) + (moved_2 * moved_2).sum(-1))[..., None]
+    regular = regular[..., None] & (length > torch.finfo(b.dtype).tiny)
+    step = torch.where(regular, step * 2 * root[..., None] / torch.where(regular, length, 1.0), 0.0)
+    return x_1 - step * moved_1, x_2 - step * moved_2
+
+
+def triangulate_many(
+    T_cw: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    mask: Tensor | None = None,
+    iterations: int = 3,
+) -> MultiViewTriangulation:
+    """Triangulates points from V views: linear on the rays, then Gauss-Newton on the reprojection error.
+
+    T_cw: (..., V, 4, 4); pixels: (..., N, V, 2); mask: (..., N, V) which views see the point. Entries outside
+    the mask may hold anything. Differentiable with respect to poses, pixels and camera parameters. No threshold
+    is applied: reject by `angles`, `depths` and `errors`.
+    """
+    seen = torch.isfinite(pixels).all(-1)
+    seen = seen if mask is None else seen & mask
+    pixels = torch.where(seen[..., None], pixels, 0.0)
+    rays_c = camera.unproject(pixels.flatten(-3, -2)).unflatten(-2, pixels.shape[-3:-1])
+    R_cw, t_cw = T_cw[..., None, :, :3, :3], T_cw[..., None, :, :3, 3]
+    rays_w = (R_cw.mT @ rays_c[..., None]).squeeze(-1)
+    centres_w = -(R_cw.mT @ t_cw[..., None]).squeeze(-1)
+
+    eye = torch.eye(3, dtype=pixels.dtype, device=pixels.device)
+    across = (eye - rays_w[..., :, None] * rays_w[..., None, :]) * seen[..., None, None]
+    points_w = _solve_3x3(across.sum(-3), (across @ centres_w[..., None]).sum(-3).squeeze(-1))
+    for _ in range(iterations):
+        points_w = _refine_points(points_w, T_cw, pixels, camera, seen)
+
+    points_c = (R_cw @ points_w[..., None, :, None]).squeeze(-1) + t_cw
+    depths = points_c[..., 2]
+    counted = seen.sum(-1) >= 2
+    mask = counted & ((depths > 0) | ~seen).all(-1)
+    flat = points_c.flatten(-3, -2)
+    errors = _reprojection_error(camera, flat, pixels.flatten(-3, -2), seen.flatten(-2)).unflatten(
+        -1, seen.shape[-2:]
+    )
+    return MultiViewTriangulation(points_w, _largest_angle(points_w, centres_w, seen), depths, errors, mask)
+
+
+def _refine_points(points_w: Tensor, T_cw: Tensor, pixels: Tensor, camera: Camera, seen: Tensor) -> Tensor:
+    """One Gauss-Newton step on the reprojection errors, kept for each point only if it helps."""
+
+    def residuals(points_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        points_c = (R_cw @ points_w[..., None, :, None]).squeeze(-1) + t_cw
+        projected, valid, J, _ = camera.project_with_jacobians(points_c.flatten(-3, -2))
+        projected, J, valid = (
+            x.unflatten(index, shape) for x, index in ((projected, -2), (J, -3), (valid, -1))
+        )
+        used = seen & valid
+        residual = torch.where(used[..., None], projected - pixels, 0.0)
+        return residual, torch.where(used[..., None, None], J @ R_cw, 0.0), (used == seen).all(-1)
+
+    shape = seen.shape[-2:]
+    R_cw, t_cw = T_cw[..., None, :, :3, :3], T_cw[..., None, :, :3, 3]
+    residual, J, valid = residuals(points_w)
+    H, g = (J.mT @ J).sum(-3), (J.mT @ residual[..., None]).sum(-3).squeeze(-1)
+    moved = points_w - _solve_3x3(H, g)
+    with torch.no_grad():
+        after, _, still_valid = residuals(moved)
+        # The tolerance, far below a pixel, lets exact data take the step too, which gives it the right gradient.
+        before = (residual * residual).sum((-2, -1)) + 1e-6
+        better = still_valid & ((after * after).sum((-2, -1)) <= before)
+        better = better & valid & torch.isfinite(moved).all(-1)
+    return torch.where(better[..., None], moved, points_w)
+
+
+def _solve_3x3(A: Tensor, b: Tensor) -> Tensor:
+    """A^-1 b by the adjugate; zero where A is singular. (..., 3, 3), (..., 3) -> (..., 3)."""
+    columns = A.unbind(-1)
+    rows = torch.stack([torch.linalg.cross(columns[i - 2], columns[i - 1], dim=-1) for i in range(3)], dim=-2)
+    determinant = (rows[..., 0, :] * columns[0]).sum(-1)
+    scale = A.detach().abs().amax((-2, -1))
+    regular = determinant.abs() > scale**3 * torch.finfo(A.dtype).eps ** 2
+    x = (rows @ b[..., None]).squeeze(-1) / torch.where(regular, determinant, 1.0)[..., None]
+    return torch.where(regular[..., None], x, 0.0)
+
+
+def _homogeneous(x: Tensor) -> Tensor:
+    return torch.cat((x, torch.ones_like(x[..., :1])), dim=-1)
+
+
+def _length(v: Tensor) -> Tensor:
+    """Euclidean norm with gradient zero, not NaN, at zero."""
+    squared = (v * v).sum(-1)
+    zero = squared == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, squared).sqrt())
+
+
+def _angle(u: Tensor, v: Tensor) -> Tensor:
+    """Angle between vectors, accurate for small angles, radians."""
+    dot = (u * v).sum(-1)
+    sine = _length(torch.linalg.cross(u, v, dim=-1))
+    return torch.atan2(sine, torch.where((sine == 0) & (dot == 0), 1.0, dot))
+
+
+def _largest_angle(points_w: Tensor, centres_w: Tensor, seen: Tensor) -> Tensor:
+    """The largest angle at each point between two of the cameras that see it."""
+    rays = points_w[..., None, :] - centres_w
+    pairs = seen[..., :, None] & seen[..., None, :]
+    first, second = torch.broadcast_tensors(rays[..., :, None, :], rays[..., None, :, :])
+    return torch.where(pairs, _angle(first, second), 0.0).amax((-2, -1))
+
+
+def _reprojection_error(camera: Camera, points_c: Tensor, pixels: Tensor, mask: Tensor) -> Tensor:
+    """Distance in pixels between projections and measurements; infinite outside the mask or where invalid."""
+    projected, valid = camera.project(points_c)
+    used = mask & valid
+    error = _length(torch.where(used[..., None], projected - pixels, 0.0))
+    return torch.where(used, error, torch.inf)
