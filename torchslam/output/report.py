@@ -17,12 +17,12 @@ def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:
     """The figures of a run.
 
     frames counts all that the run met, unreadable ones included; posed those with a pose in the trajectory; lost
-    those that tracking gave up on; initialised_at is the index of the frame that made the first map, or None.
+    those that tracking gave up on; initialised_at is the index of the frame that started the map, or None.
     Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
     truth, the figures of the evaluation are added.
     """
     totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
-    start = next((result for result in run.results if result.state is State.TRACKING), None)
+    start = None if run.failure else _start(run.results)
     figures: dict[str, Any] = {
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
@@ -91,8 +91,19 @@ def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def _start(results: Sequence[StepResult]) -> StepResult | None:
+    """The frame that started the map that the run ended with: a map given up before does not count."""
+    states = [State.INITIALIZING, *(result.state for result in results)]
+    starts = [
+        result
+        for result, before in zip(results, states, strict=False)
+        if result.state is State.TRACKING and before is State.INITIALIZING
+    ]
+    return starts[-1] if starts else None
+
+
 def _posed_share(run: Run, start: StepResult | None) -> float:
-    """Posed frames among those from the first map on."""
+    """Posed frames among those from the start of the map on."""
     if start is None:
         return 0.0
     since = sum(result.index >= start.index for result in run.results)
