@@ -9,8 +9,8 @@ import numpy as np
 
 FINEST = 0.02
 """Metres: about the smallest shape drawn."""
-COVERAGE = 0.12
-"""The part of a surface that the shapes of one size cover."""
+COVERAGE = 0.25
+"""The part of a surface that the largest shapes cover."""
 KINDS = ("polygon", "bar", "ellipse", "letter")
 FRACTION_BITS = 4
 
@@ -23,18 +23,19 @@ def surface(rng: np.random.Generator, size: tuple[float, float], texel: float, m
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
     image = _noise(rng, rows, columns, texel)
-    extent = min(size) / 3
+    extent = largest = min(size) / 3
     while extent > FINEST:
-        # Shapes of one size leave room, so that the larger ones below them stay visible.
-        count = int(COVERAGE * size[0] * size[1] / (0.3 * extent**2)) + 1
+        # The small ones leave more room, so that what is below them stays visible.
+        coverage = COVERAGE * (extent / largest) ** 0.5
+        count = int(coverage * size[0] * size[1] / (0.3 * extent**2)) + 1
         _draw_shapes(rng, image, count, extent / texel)
-        extent /= 1.8
+        extent /= 1.7
     return cv2.GaussianBlur(image, (0, 0), 0.7)
 
 
 def _noise(rng: np.random.Generator, rows: int, columns: int, texel: float) -> np.ndarray:
     """Noise of several octaves around a tone of the surface's own, (rows, columns) uint8."""
-    total = np.full((rows, columns), rng.uniform(70, 190), np.float32)
+    total = np.full((rows, columns), rng.uniform(105, 165), np.float32)
     for wavelength, amplitude in ((0.9, 30.0), (0.2, 15.0), (0.05, 10.0), (0.015, 8.0)):
         cells = (max(2, int(rows * texel / wavelength)), max(2, int(columns * texel / wavelength)))
         coarse = rng.uniform(-amplitude, amplitude, cells).astype(np.float32)
