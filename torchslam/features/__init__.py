@@ -1,8 +1,47 @@
 """Image features: extractors (image -> Features) and matching."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import nn
+
+from torchslam.errors import ConfigError
 from torchslam.features.bits import hamming, pack_bits, unpack_bits
+from torchslam.features.learned import ALIKED, XFeat
 from torchslam.features.matching import match, match_projected
 from torchslam.features.opencv_orb import OpenCVORB
 from torchslam.features.orb import ORB
 
-__all__ = ["ORB", "OpenCVORB", "hamming", "match", "match_projected", "pack_bits", "unpack_bits"]
+__all__ = [
+    "ALIKED",
+    "EXTRACTORS",
+    "ORB",
+    "OpenCVORB",
+    "XFeat",
+    "extractor",
+    "hamming",
+    "match",
+    "match_projected",
+    "pack_bits",
+    "unpack_bits",
+]
+
+EXTRACTORS = ("orb", "opencv-orb", "xfeat", "aliked")
+
+
+def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None = None) -> nn.Module:
+    """The extractor of that name: a module from images (B, 1, H, W) to Features.
+
+    weights: file for "xfeat" and "aliked", unused by the others. Raises ConfigError for an unknown name, missing or
+    unreadable weights.
+    """
+    if name == "orb":
+        return ORB(num_keypoints)
+    if name == "opencv-orb":
+        return OpenCVORB(num_keypoints)
+    if name not in EXTRACTORS:
+        raise ConfigError(f"unknown features {name!r}; there are {', '.join(EXTRACTORS)}")
+    if weights is None:
+        raise ConfigError(f"features {name!r} need a file of weights")
+    return XFeat(weights, num_keypoints) if name == "xfeat" else ALIKED(weights, num_keypoints)

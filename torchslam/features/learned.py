@@ -1,0 +1,151 @@
+"""Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
+
+The networks are kornia's. Descriptors are floats of unit length, scales are 1 and angles 0: neither network has them.
+Keypoints, scores and descriptors carry gradients to the weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import kornia
+import torch
+import torch.nn.functional as F
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from torchslam.errors import ConfigError
+from torchslam.features.corners import soft_peak
+from torchslam.features.orb import check_images
+from torchslam.types import Features
+
+
+class XFeat(nn.Module):
+    """XFeat: 64 floats per keypoint (Potje et al., CVPR 2024).
+
+    weights:       safetensors file of the network
+    num_keypoints: keypoints per image, at most; rows beyond what the image offers are masked
+    threshold:     of the keypoint heat map, 0 to 1
+    Raises ConfigError if the file cannot be read or holds another network.
+    """
+
+    def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
+        super().__init__()
+        self.num_keypoints = num_keypoints
+        self.threshold = threshold
+        model = kornia.feature.XFeat()
+        # The file may leave out the fine matcher, which only dense matching needs.
+        _load(model, _read(weights), weights, optional="net.fine_matcher.")
+        self.network = model.net.eval()
+
+    def forward(self, images: Tensor) -> Features:
+        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
+        """
+        check_images(images)
+        height, width = images.shape[-2:]
+        # The network halves its input five times.
+        inner = (max(32, height // 32 * 32), max(32, width // 32 * 32))
+        resized = F.interpolate(images.float(), inner, mode="bilinear", align_corners=False)
+        coarse, logits, reliability = self.network(resized)
+        # 64 places of a cell of 8x8 pixels, row by row, and one for "no keypoint here".
+        heat = F.pixel_shuffle(logits.softmax(1)[:, :64], 8)
+        scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
+        peaks = kornia.geometry.subpix.nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
+        ranked = torch.where(peaks, scores, 0).flatten(1)
+        best = ranked.detach().topk(min(self.num_keypoints, ranked.shape[1]))
+        mask = best.values > 0
+        x, y = best.indices % inner[1], best.indices // inner[1]
+
+        windows = F.pad(heat[:, 0], (2, 2, 2, 2)).unfold(1, 5, 1).unfold(2, 5, 1)
+        image = torch.arange(len(images), device=images.device)[:, None].expand_as(x)
+        offsets, _ = soft_peak(windows[image, y, x].flatten(0, 1))
+        positions = torch.stack([x, y], dim=-1) + offsets.view(*x.shape, 2)
+        # Pixels from 0 to W - 1 span the coarse map from edge to edge: so the network was trained.
+        grid = 2 * positions / positions.new_tensor([inner[1] - 1, inner[0] - 1]) - 1
+        sampled = F.grid_sample(
+            F.normalize(coarse, dim=1),
+            grid[:, None],
+            mode="bicubic",
+            padding_mode="zeros",
+            align_corners=False,
+        )
+        descriptors = F.normalize(sampled[:, :, 0].mT, dim=-1)
+        ratio = positions.new_tensor([width / inner[1], height / inner[0]])
+        keypoints = (positions + 0.5) * ratio - 0.5
+        return _features(keypoints, ranked.gather(1, best.indices), descriptors, mask, self.num_keypoints)
+
+
+class ALIKED(nn.Module):
+    """ALIKED: 64 (t16) or 128 (n16, n32) floats per keypoint (Zhao et al., IEEE TIM 2023).
+
+    weights:       safetensors file of the network; which variant it is, its shapes tell
+    num_keypoints: keypoints per image, at most; rows beyond what the image offers are masked
+    Raises ConfigError if the file cannot be read or holds another network.
+    """
+
+    def __init__(self, weights: str | Path, num_keypoints: int = 1000) -> None:
+        super().__init__()
+        self.num_keypoints = num_keypoints
+        state = _read(weights)
+        variants = {(8, 16): "aliked-t16", (16, 16): "aliked-n16", (16, 32): "aliked-n32"}
+        shape = tuple(len(state.get(name, ())) for name in ("block1.conv1.weight", "desc_head.agg_weights"))
+        if shape not in variants:
+            raise ConfigError(f"{weights}: not the weights of an ALIKED network")
+        # Without a threshold the network gives its strongest maxima.
+        self.network = kornia.feature.ALIKED(variants[shape], num_keypoints, detection_threshold=0)
+        _load(self.network, state, weights, optional="dkd.")  # the detector's grid of pixels is no weight
+        self.network.eval()
+
+    def forward(self, images: Tensor) -> Features:
+        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
+        """
+        check_images(images)
+        found = self.network(images.float())
+        rows = [
+            _features(
+                one.keypoints[None],
+                one.keypoint_scores[None],
+                one.descriptors[None],
+                torch.ones_like(one.keypoint_scores[None], dtype=torch.bool),
+                self.num_keypoints,
+            )
+            for one in found
+        ]
+        return Features(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(Features)))
+
+
+def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int) -> Features:
+    """Features padded to `count` rows, zero where masked, with scale 1 and angle 0."""
+    missing = count - mask.shape[1]
+    mask = F.pad(mask, (0, missing))
+    scores = F.pad(scores, (0, missing)) * mask
+    keypoints, descriptors = (
+        F.pad(t, (0, 0, 0, missing)) * mask[..., None] for t in (keypoints, descriptors)
+    )
+    return Features(keypoints, scores, torch.ones_like(scores), torch.zeros_like(scores), descriptors, mask)
+
+
+def _read(weights: str | Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file."""
+    try:
+        return load_file(str(weights))
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"{weights}: cannot read the weights ({error})") from error
+
+
+def _load(network: nn.Module, state: dict[str, Tensor], weights: str | Path, optional: str) -> None:
+    """Fill the network; every tensor must be there but those whose name starts with `optional`."""
+    try:
+        missing, unexpected = network.load_state_dict(state, strict=False)
+    except RuntimeError as error:  # shapes differ
+        raise ConfigError(f"{weights}: the weights of another network") from error
+    missing = [name for name in missing if not name.startswith(optional)]
+    if missing or unexpected:
+        wrong = f"{len(missing)} tensors are missing, {len(unexpected)} unknown"
+        raise ConfigError(f"{weights}: the weights of another network ({wrong})")
