@@ -1,0 +1,98 @@
+"""Levenberg-Marquardt for many independent least-squares problems at once.
+
+The loop knows nothing of poses or points: a `LeastSquares` problem evaluates a local quadratic model, proposes a damped
+step, and chooses per element between the old model and the new one. Every element has its own damping, accepts or
+rejects its own steps and stops on its own, so a batch gives what the elements alone would give. Under autograd the loop
+can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1963; Madsen, Nielsen and Tingleff,
+"Methods for non-linear least squares problems", 2004.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+_INITIAL_DAMPING = 1e-4
+_DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
+_DAMPING_RANGE = (1e-10, 1e8)
+# Below this share of the cost, the decrease that a step promises says that the optimum is close.
+_NEAR = 1e-2
+
+
+class Model(Protocol):
+    """A local quadratic model of a cost; `cost` is (B,)."""
+
+    @property
+    def cost(self) -> Tensor: ...
+
+
+M = TypeVar("M", bound=Model)
+X = TypeVar("X")
+
+
+class LeastSquares(Protocol[X, M]):
+    """What the loop asks of a problem with estimate X and local models M."""
+
+    solvable: Tensor
+    """(B,) bool, which elements to minimise; the others stay at their start."""
+
+    def evaluate(self, estimate: X, near: Tensor) -> M:
+        """The cost and its quadratic model at an estimate. near: (B,) bool, the optimum is close."""
+        ...
+
+    def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
+        """The estimate that minimises the damped model, and the decrease (B,) of the cost that the model predicts.
+
+        damping: (B,), relative to the diagonal of the Hessian. Elements that cannot be solved stay where they are.
+        """
+        ...
+
+    def select(self, accept: Tensor, new: M, old: M) -> M:
+        """Per element, `new` where `accept` (B,) and `old` elsewhere."""
+        ...
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How a minimisation went, per element.
+
+    iterations: (B,) int64 steps tried
+    converged:  (B,) bool, the last step promised less than the tolerance
+    initial_cost, cost: (B,) half the sum of robustified squared residuals, before and after
+    """
+
+    iterations: Tensor
+    converged: Tensor
+    initial_cost: Tensor
+    cost: Tensor
+
+
+def minimize(
+    problem: LeastSquares[X, M], start: X, iterations: int, tolerance: float
+) -> tuple[M, Convergence]:
+    """Minimise from `start`; returns the model at the last accepted estimate.
+
+    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost (or by
+    less than rounding shows), and rests from then on.
+    """
+    active = problem.solvable
+    model = problem.evaluate(start, torch.zeros_like(active))
+    initial_cost = model.cost.detach()
+    tolerance = max(tolerance, torch.finfo(initial_cost.dtype).eps)
+    damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
+    steps = torch.zeros_like(active, dtype=torch.int64)
+    for _ in range(iterations):
+        estimate, decrease = problem.step(model, damping)
+        share = decrease.detach() / model.cost.detach()
+        trial = problem.evaluate(estimate, share < _NEAR)
+        accept = active & (trial.cost <= model.cost)
+        steps = steps + active
+        active = active & (share > tolerance)
+        model = problem.select(accept, trial, model)
+        damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
+        if not active.any():
+            break
+    return model, Convergence(steps, ~active, initial_cost, model.cost.detach())

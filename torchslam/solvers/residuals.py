@@ -1,0 +1,192 @@
+"""Reprojection errors of points in the camera frame: cost, first and second derivatives, per observation.
+
+Everything that the camera model and the robust kernel contribute to a refinement is here, in terms of the point in the
+camera frame (and, where it is free, of the camera's parameters). Poses and world points enter through the chain rule,
+in `pose` and in `bundle`.
+
+An observation of a point that cannot be projected (behind the camera, beyond the distortion's range) costs as much as an
+error of the image's diagonal and pulls nowhere: no step gains by pushing a point behind the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.solvers.robust import Kernel, robustify
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Pixels that points were seen at, and how errors are weighed.
+
+    pixels:  (..., N, 2)
+    weights: (..., N) inverse variance, px^-2; zero where the observation does not count
+    camera:  parameters (P,) or (..., P)
+    scale:   scalar, or with the batch dimensions and a last one of size 1 or N
+    """
+
+    pixels: Tensor
+    weights: Tensor
+    camera: Camera
+    kernel: Kernel
+    scale: Tensor
+
+    def tensors(self) -> list[Tensor]:
+        """All that gradients may flow to: pixels, weights, camera parameters, scale."""
+        return [self.pixels, self.weights, self.camera.params, self.scale]
+
+    def replaced(self, tensors: Sequence[Tensor]) -> Observations:
+        """The same observations with other tensors, in the order of `tensors`."""
+        pixels, weights, params, scale = tensors
+        return Observations(pixels, weights, self.camera.with_params(params), self.kernel, scale)
+
+
+class Linearization(NamedTuple):
+    """Reprojection errors and their first derivatives.
+
+    cost:         (..., N) the share in the objective, half of rho
+    residual:     (..., N, 2) projected minus observed, px
+    weight:       (..., N) weights * rho', zero where the point cannot be projected
+    bend:         (..., N) 2 * weights^2 * rho''; weight * I + bend * r r^T is the Hessian of the cost in the residual
+    J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
+    """
+
+    cost: Tensor
+    residual: Tensor
+    weight: Tensor
+    bend: Tensor
+    J: Tensor
+
+    @property
+    def force(self) -> Tensor:
+        """(..., N, 2) the gradient of the cost with respect to the residual."""
+        return self.weight[..., None] * self.residual
+
+
+def usable(pixels: Tensor, points_w: Tensor, weights: Tensor) -> Tensor:
+    """Whether all inputs of an observation are finite and its weight is not negative. -> (..., N)."""
+    finite = torch.isfinite(pixels).all(-1) & torch.isfinite(points_w).all(-1)
+    return finite & torch.isfinite(weights) & (weights >= 0)
+
+
+def linearize(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
+    """Errors and Jacobians of finite points_c (..., N, 3)."""
+    camera, weights = observations.camera, observations.weights
+    pixels, valid, J = _project(camera, points_c, free_camera)
+    residual = pixels - observations.pixels
+    diagonal = float(camera.width**2 + camera.height**2)
+    squared = weights * torch.where(valid, residual.square().sum(-1), diagonal)
+    rho, slope, curvature = robustify(squared, observations.kernel, observations.scale)
+    counted = torch.where(valid, weights, 0.0)
+    return Linearization(
+        0.5 * rho,
+        residual,
+        counted * slope,
+        2 * counted * counted * curvature,
+        J,
+    )
+
+
+def _project(camera: Camera, points_c: Tensor, free_camera: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels, validity and Jacobian with respect to points_c and, where it is free, the camera."""
+    if camera.model == "pinhole" and not free_camera:
+        return _project_pinhole(camera, points_c)
+    pixels, valid, J_points, J_camera = camera.project_with_jacobians(points_c)
+    return pixels, valid, torch.cat((J_points, J_camera), dim=-1) if free_camera else J_points
+
+
+def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels, validity and d pixels / d points_c without distortion: a third of the general path's operations."""
+    depth = points_c[..., 2:]
+    valid = depth > torch.finfo(depth.dtype).eps
+    focal, centre = camera.params[..., None, :2], camera.params[..., None, 2:4]
+    normalized = points_c[..., :2] / torch.where(valid, depth, 1.0)
+    stretch = focal / torch.where(valid, depth, 1.0)
+    J_points = torch.cat((torch.diag_embed(stretch), (-stretch * normalized)[..., None]), dim=-1)
+    return normalized * focal + centre, valid[..., 0], J_points
+
+
+def pull(linearization: Linearization, J: Tensor, near: Tensor | None) -> Tensor:
+    """The Hessian of the cost with respect to the residual, times J: (weight * I + bend * r r^T) J.
+
+    J: (..., N, 2, D) d residual / d anything. Across the residual of an outlier the Hessian is positive, along it
+    negative. `near`, broadcastable to (..., N), says where the negative part counts as flat, which keeps the
+    Gauss-Newton matrix positive semi-definite and converges several times faster close to the optimum; elsewhere bend
+    counts as zero (iteratively reweighted least squares), which descends from afar. None: the exact Hessian.
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
+    """
+    residual, weight, bend = linearization.residual, linearization.weight, linearization.bend
+    if near is not None:
+        squared = residual.square().sum(-1)
+        flat = -weight / torch.where(squared > 0, squared, 1.0)
+        bend = torch.maximum(bend, flat) * near
+    along = (residual[..., None, :] @ J) * (bend[..., None] * residual)[..., None]
+    return weight[..., None, None] * J + along
+
+
+class Curvature(NamedTuple):
+    """The exact second-order expansion of the cost in (points_c, camera.params).
+
+    gradient: (..., N, D); hessian: (..., N, D, D) with D = 3, or 3 + P where the camera is free.
+    """
+
+    gradient: Tensor
+    hessian: Tensor
+
+
+def curvature(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Curvature:
+    """Exact gradient and Hessian of the cost per observation, with the bend of kernel and projection.
+
+    The projection's own second derivative is that of J^T force with the force fixed: autograd of the analytic Jacobian.
+    """
+    lin = linearize(observations, points_c, free_camera)
+    force = lin.force[..., None]
+    hessian = lin.J.mT @ pull(lin, lin.J, near=None)
+    hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
+    return Curvature((lin.J.mT @ force).squeeze(-1), hessian)
+
+
+def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_camera: bool) -> Tensor:
+    """sum_k force_k * Hessian of pixel_k in (points_c, camera.params). (..., N, 2, 1) force -> (..., N, D, D)."""
+    dims = 3 + (camera.params.shape[-1] if free_camera else 0)
+    with torch.enable_grad():
+        # One copy of every observation per row of the Hessian, each with its own camera where that is free.
+        points = points_c.detach().expand(dims, *points_c.shape).clone().requires_grad_()
+        if free_camera:
+            params = camera.params.detach()[..., None, :]
+            params = params.expand(*points.shape[:-1], -1).clone().requires_grad_()
+            J = _project(camera.with_params(params), points[..., None, :], free_camera)[2].squeeze(-3)
+            variables = [points, params]
+        else:
+            J = _project(camera, points, free_camera)[2]
+            variables = [points]
+        gradient = (J.mT @ force).squeeze(-1)
+        rows = torch.autograd.grad(gradient.movedim(-1, 0).diagonal().sum(), variables)
+    return torch.cat(rows, dim=-1).movedim(0, -2)
+
+
+def variance_factor(observations: Observations, linearization: Linearization, num_parameters: int) -> Tensor:
+    """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate. -> (...).
+
+    From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, where
+    psi = rho' r; for least squares this is the variance of unit weight. One where there is no redundancy.
+    Source: Huber, "Robust statistics", 1981, section 7.6.
+    """
+    weights = observations.weights
+    counted = (linearization.weight > 0) & (weights > 0)
+    variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
+    squared = linearization.residual.square().sum(-1)
+    weight = 2 * (linearization.weight * variance).sum(-1)
+    psi_squared = (linearization.weight.square() * squared * variance).sum(-1)
+    psi_slope = weight + (linearization.bend * squared * variance).sum(-1)
+    components = 2 * counted.sum(-1)
+    redundant = (components > num_parameters) & (psi_slope > 0)
+    spare = torch.where(redundant, components - num_parameters, 1)
+    factor = psi_squared * weight * components / (spare * psi_slope.square())
+    return torch.where(redundant, factor, 1.0)

@@ -1,0 +1,44 @@
+"""The left-perturbation tangent of SE(3) as the solvers use it: xi = (v, omega), translation first."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.lie import rigid, skew
+
+
+def retract(T: Tensor, xi: Tensor) -> Tensor:
+    """T moved along xi: [C(omega), v; 0, 1] @ T with Cayley's map C. (..., 4, 4), (..., 6) -> (..., 4, 4).
+
+    C agrees with the exponential to second order, is a rotation to rounding for any omega, and is rational: no
+    trigonometry, no special case at zero, a fraction of the operations.
+    """
+    half = skew(0.5 * xi[..., 3:])
+    twice = 2 / (1 + 0.25 * xi[..., 3:].square().sum(-1))
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    return rigid(eye + twice[..., None, None] * (half + half @ half), xi[..., :3]) @ T
+
+
+def pull_back(T: Tensor, grad_T: Tensor) -> Tensor:
+    """The gradient with respect to xi, at zero, of a loss with gradient `grad_T` at T moved along xi.
+
+    (..., 4, 4) twice -> (..., 6). The last row of `grad_T` has no effect.
+    """
+    columns, grads = T[..., :3, :], grad_T[..., :3, :]
+    rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
+    return torch.cat((grads[..., 3], rotation), dim=-1)
+
+
+def move(points_c: Tensor, xi: Tensor) -> Tensor:
+    """The velocity of points in the camera frame when the pose moves along xi: v + omega x p.
+
+    (..., 3), (..., 6) -> (..., 3).
+    """
+    return xi[..., :3] + torch.linalg.cross(xi[..., 3:].expand_as(points_c), points_c)
+
+
+def point_jacobian(points_c: Tensor) -> Tensor:
+    """d p / d xi at zero: [I, -p^]. (..., 3) -> (..., 3, 6)."""
+    eye = torch.eye(3, dtype=points_c.dtype, device=points_c.device)
+    return torch.cat((eye.expand(*points_c.shape, 3), -skew(points_c)), dim=-1)
