@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --constraint constraints.txt
 
 # Stamps: an environment is made again only when what it is made from has changed.
 INSTALLED := $(VENV)/.torchslam-installed
@@ -48,20 +48,24 @@ distclean: clean  ## remove the environment too
 	rm -rf .venv *.egg-info
 
 $(BIN)/python:
-	$(PYTHON) -m venv $(VENV)
+	@echo 'making the environment $(VENV)'
+	@$(PYTHON) -m venv $(VENV)
 
 # torch comes first, alone: the build named in constraints.txt then satisfies everything that depends on it.
 # pip learned --group in 25.1.
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --upgrade 'pip>=25.1'
-	$(PIP) torch
-	$(PIP) --editable .
+	@echo 'installing torch, torchslam and what they need into $(VENV): some minutes, once'
+	@$(PIP) --upgrade 'pip>=25.1'
+	@$(PIP) torch
+	@$(PIP) --editable .
 	@touch $@
 
 $(INSTALLED_DEV): $(INSTALLED)
-	$(PIP) --group test --group lint
+	@echo 'installing the tools for tests and lint into $(VENV): a minute, once'
+	@$(PIP) --group test --group lint
 	@touch $@
 
 $(INSTALLED_BENCHMARKS): $(INSTALLED)
-	$(PIP) --group benchmarks
+	@echo 'installing the peers for the benchmarks into $(VENV): a minute, once'
+	@$(PIP) --group benchmarks
 	@touch $@
