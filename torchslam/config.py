@@ -20,8 +20,6 @@ from torchslam.errors import ConfigError
 class FeaturesConfig:
     kind: str = "orb"  # orb | opencv-orb | simulated | xfeat | aliked
     num_keypoints: int = 1000
-    scale_factor: float = 1.2  # between pyramid levels
-    num_levels: int = 8
     weights: str = ""  # file with the weights of a learned front end
 
 
@@ -88,7 +86,8 @@ class KeyframesConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    neighbours: int = 5  # earlier keyframes that new points are triangulated against
+    partners: str = "covisible"  # new points are triangulated against: covisible | last (keyframes)
+    neighbours: int = 5  # how many of them
     min_parallax_deg: float = 1.0
     max_error_chi_square: float = 5.991
     epipolar_px: float = 2.0
@@ -126,6 +125,7 @@ CHOICES = {
     "scale": ("unit", "groundtruth"),
     "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
     "initialization.criterion": ("uncertainty", "parallax"),
+    "mapping.partners": ("covisible", "last"),
 }
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
-from torchslam.features import match, match_projected
+from torchslam.features import hamming, match, match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.map import Map
 from torchslam.types import View
@@ -28,6 +28,13 @@ class Projected:
 def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
     """The threshold for this kind of descriptor: bits, or 1 - cosine."""
     return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
+
+
+def descriptor_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
+    """(n1, n2) float32 distances of all pairs: Hamming for bits, 1 - cosine for floats."""
+    if descriptors_1.dtype == torch.uint8:
+        return hamming(descriptors_1[None], descriptors_2[None])[0].float()
+    return 1.0 - descriptors_1.float() @ descriptors_2.float().mT
 
 
 def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
@@ -64,7 +71,7 @@ def project_points(
 
 
 def match_near(
-    slam_map: Map, projected: Projected, view: View, radius_px: float, settings: MatchingConfig, ratio: float
+    slam_map: Map, projected: Projected, view: View, radius_px: float, settings: MatchingConfig, ratio: float | None
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) point ids and keypoints that match within a radius around the projection, one to one.
 

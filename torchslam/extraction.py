@@ -18,13 +18,7 @@ Extractor = Callable[[Frame], Features]
 def image_extractor(config: Config) -> Extractor:
     """The front end that reads images."""
     settings = config.features
-    module = extractor(
-        settings.kind,
-        num_keypoints=settings.num_keypoints,
-        scale_factor=settings.scale_factor,
-        num_levels=settings.num_levels,
-        weights=settings.weights or None,
-    )
+    module = extractor(settings.kind, settings.num_keypoints, settings.weights or None)
     return lambda frame: module(frame.image)
 
 

@@ -49,7 +49,8 @@ class Mapper:
             if settings.cull:
                 self.cull_recent_points(keyframe)
             neighbours = self.map.covisible(keyframe, 2 * settings.neighbours)
-            for neighbour in neighbours[: settings.neighbours].tolist():
+            partners = neighbours if settings.partners == "covisible" else torch.arange(keyframe).flip(0)
+            for neighbour in partners[: settings.neighbours].tolist():
                 triangulate_against(self.map, keyframe, neighbour, self.camera, self.config)
             self.map.refresh(torch.tensor([keyframe]))
             if settings.fuse:
@@ -86,7 +87,7 @@ class Mapper:
         projected = project_points(
             self.map, new, T_cw, self.camera, tracking.max_view_angle_deg, view.max_scale
         )
-        ids, keypoints = match_near(self.map, projected, view, 3.0, self.config.matching, ratio=1.0)
+        ids, keypoints = match_near(self.map, projected, view, 3.0, self.config.matching, ratio=None)
         pixels, valid = self.camera.project(transform(T_cw, self.map.positions_w[ids]))
         errors = ((pixels - view.keypoints[keypoints]) ** 2).sum(-1)
         agrees = valid & (errors < tracking.chi_square * view.scales[keypoints] ** 2)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config, MatchingConfig
-from torchslam.correspondences import max_distance
-from torchslam.features import descriptor_distances
+from torchslam.correspondences import descriptor_distances, max_distance
 from torchslam.geometry import Camera, se3_inverse, skew, transform, triangulate
 from torchslam.map import NO_POINT, Map
 from torchslam.types import View
@@ -71,9 +70,7 @@ def match_along_epipolar_lines(
     rays_2 = camera.unproject(view_2.keypoints[rows_2])
     sine = (planes.float() @ rays_2.float().mT).abs()
     allowed = sine < (epipolar_px / camera.focal * view_2.scales[rows_2]).float()
-    distances = descriptor_distances(view_1.descriptors[rows_1][None], view_2.descriptors[rows_2][None])[
-        0
-    ].float()
+    distances = descriptor_distances(view_1.descriptors[rows_1], view_2.descriptors[rows_2])
     distances = distances.masked_fill(~allowed, torch.inf)
     nearest_2 = distances.min(1)
     nearest_1 = distances.argmin(0)

@@ -34,7 +34,7 @@ class SLAM:
         self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
     ) -> None:
         self.config = config or Config()
-        self.camera = camera.to(dtype=torch.float64)
+        self.camera = camera.to(torch.float64)
         if extractor is None and self.config.features.kind != "simulated":
             extractor = image_extractor(self.config)
         self.extractor = extractor  # None: `run` makes simulated features from the true poses of the sequence
