@@ -86,6 +86,22 @@ def read_calibration(path: str | Path) -> Calibration:
     return Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
 
 
+def fit_camera(camera: Camera | Calibration, size: tuple[int, int], where: str) -> Camera:
+    """The camera for images of `size`. Raises CalibrationError at `where` for one that is for another size."""
+    if isinstance(camera, Calibration):
+        return camera.camera(size)
+    if camera.size != size:
+        raise CalibrationError(
+            f"{where}: the camera is for images of {size_text(camera.size)}, these are {size_text(size)}"
+        )
+    return camera
+
+
+def size_text(size: tuple[int, int]) -> str:
+    """`640x480`."""
+    return f"{size[0]}x{size[1]}"
+
+
 def _first_line(path: Path) -> tuple[int, str]:
     for number, line in numbered_lines(path, CalibrationError):
         return number, line

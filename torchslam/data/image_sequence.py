@@ -10,11 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
+from torchslam.data.calibration import Calibration, fit_camera, size_text
 from torchslam.data.image_file import read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.data.text_file import check_later
-from torchslam.errors import CalibrationError, FrameError, SequenceError
+from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
 
@@ -51,11 +51,7 @@ class ImageSequence(Sequence):
         first images can be read; CalibrationError for a camera of another image size."""
         _check_order(name, entries)
         size = _find_size(entries)
-        if isinstance(camera, Calibration):
-            camera = camera.camera(size)
-        elif camera.size != size:
-            sizes = f"{_text(camera.size)}, these are {_text(size)}"
-            raise CalibrationError(f"{name}: the camera is for images of {sizes}")
+        camera = fit_camera(camera, size, name)
         timestamps = torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64)
         super().__init__(name, kind, camera, timestamps, groundtruth)
         self._entries = entries
@@ -66,7 +62,7 @@ class ImageSequence(Sequence):
         size = (image.shape[-1], image.shape[-2])
         if size != self.size:
             raise FrameError(
-                f"{entry.where}: {entry.path} is {_text(size)}, the others are {_text(self.size)}"
+                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
             )
         return image
 
@@ -92,7 +88,3 @@ def _find_size(entries: Listed[ImageEntry]) -> tuple[int, int]:
         else:
             return image.shape[-1], image.shape[-2]
     raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
-
-
-def _text(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"

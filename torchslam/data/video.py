@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
+from torchslam.data.calibration import Calibration, fit_camera
 from torchslam.data.folder import DEFAULT_RATE
 from torchslam.data.image_file import grey_to_tensor
 from torchslam.data.sequence import Sequence
@@ -37,10 +37,7 @@ class VideoSequence(Sequence):
         if first is None:
             raise SequenceError(f"{path}: cannot be read as a video")
         size = (first.shape[1], first.shape[0])
-        if isinstance(camera, Calibration):
-            camera = camera.camera(size)
-        elif camera.size != size:
-            raise CalibrationError(f"{path}: the camera is for images of {camera.size}, these are {size}")
+        camera = fit_camera(camera, size, str(path))
         rate = rate or self._capture.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE
         super().__init__(path.stem, "video", camera, torch.arange(count, dtype=torch.float64) / rate)
 

@@ -1,0 +1,115 @@
+"""EuRoC folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchslam.data import open_sequence
+from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
+
+SENSOR = """\
+%YAML:1.0
+# Default camera sensor yaml file
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, 0.1,
+         1.0, 0.0, 0.0, 0.2,
+        0.0, 0.0, 1.0, 0.3,
+         0.0, 0.0, 0.0, 1.0]
+
+# Camera specific definitions.
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [58.6, 57.2, 31.2, 23.3] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, write_picture: Callable) -> Path:
+    folder = tmp_path / "MH_01_easy"
+    cam0, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
+    times = [1403636579763555584 + 50_000_000 * index for index in range(3)]
+    for index, time in enumerate(times):
+        write_picture(cam0 / "data" / f"{time}.png", index)
+    (cam0 / "data.csv").write_text(
+        "#timestamp [ns],filename\n" + "".join(f"{time},{time}.png\r\n" for time in times)
+    )
+    (cam0 / "sensor.yaml").write_text(SENSOR)
+    truth.mkdir()
+    rows = [f"{time + 1000},{index},0,0,1,0,0,0,9,9,9,9,9,9,9,9,9\n" for index, time in enumerate(times)]
+    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + "".join(rows))
+    return folder
+
+
+def test_reads_frames_camera_and_poses(folder: Path) -> None:
+    for path in (folder, folder / "mav0"):
+        sequence = open_sequence(path)
+        assert (len(sequence), sequence.name, sequence.kind) == (3, "MH_01_easy", "EuRoC folder")
+    assert sequence.camera.model == "radial_tangential"
+    expected = [58.6, 57.2, 31.2, 23.3, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0]
+    assert sequence.camera.params.tolist() == expected
+    assert sequence[1].timestamp == pytest.approx(1403636579.813555584, abs=1e-6)
+
+
+def test_poses_are_those_of_the_camera(folder: Path) -> None:
+    groundtruth = open_sequence(folder).groundtruth
+    assert groundtruth is not None
+    expected = torch.tensor(
+        [[0, -1, 0, 1.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], dtype=torch.float64
+    )
+    torch.testing.assert_close(groundtruth.T_wc[1], expected)
+
+
+def test_groundtruth_is_optional(folder: Path) -> None:
+    (folder / "mav0" / "state_groundtruth_estimate0" / "data.csv").unlink()
+    assert open_sequence(folder).groundtruth is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[58.6, 57.2, 31.2, 23.3]", "[58.6, 57.2]", r"expected `intrinsics: \[4 numbers\]`, got 2"),
+        ("58.6", "-58.6", "focal lengths must be positive"),
+        ("58.6", "nan", r"intrinsics: `nan`"),
+        ("radial-tangential", "polynomial", "distortion_model must be one of radial-tangential, equidistant"),
+        ("  data: [0.0, -1.0,", "  data: [-1.0,", r"T_BS: expected `data: \[16 numbers\]`, got 15"),
+    ],
+)
+def test_bad_calibration(folder: Path, old: str, new: str, message: str) -> None:
+    assert old in SENSOR
+    (folder / "mav0" / "cam0" / "sensor.yaml").write_text(SENSOR.replace(old, new))
+    with pytest.raises(CalibrationError, match=rf"sensor\.yaml: {message}"):
+        open_sequence(folder)
+
+
+def test_equidistant_is_fisheye(folder: Path) -> None:
+    (folder / "mav0" / "cam0" / "sensor.yaml").write_text(SENSOR.replace("radial-tangential", "equidistant"))
+    assert open_sequence(folder).camera.model == "fisheye"
+
+
+def test_bad_lists(folder: Path) -> None:
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    lines = truth.read_text().splitlines()
+    truth.write_text("\n".join([*lines, lines[-1]]))
+    with pytest.raises(TrajectoryError, match=r"data\.csv:5: timestamp .* repeats"):
+        open_sequence(folder)
+    truth.write_text("1403636579763555584,1,2,3\n")
+    with pytest.raises(TrajectoryError, match=r"data\.csv:1: expected nanoseconds, position and quaternion"):
+        open_sequence(folder)
+    truth.unlink()
+    images = folder / "mav0" / "cam0" / "data.csv"
+    images.write_text("#timestamp [ns],filename\n1403636579.76,x.png\n")
+    with pytest.raises(SequenceError, match=r"data\.csv:2: expected `nanoseconds,file`"):
+        open_sequence(folder)

@@ -1,0 +1,116 @@
+"""Plain image folders and video files, and what is neither."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torchslam.data import open_sequence
+from torchslam.errors import CalibrationError, FrameError, SequenceError
+
+CAMERA = "60,60,32,24"
+
+
+def test_folder_in_natural_order(tmp_path: Path, write_picture: Callable) -> None:
+    for index in (10, 9, 1, 100):
+        write_picture(tmp_path / f"img_{index}.png", index)
+    (tmp_path / "notes.txt").write_text("not an image")
+    sequence = open_sequence(tmp_path, CAMERA, fps=10)
+    names = [Path(sequence.image_name(index)).name for index in range(4)]
+    assert names == ["img_1.png", "img_9.png", "img_10.png", "img_100.png"]
+    assert sequence.timestamps.tolist() == [0.0, 0.1, 0.2, 0.3]
+    assert sequence.groundtruth is None
+
+
+def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
+    write_picture(tmp_path / "0.png")
+    with pytest.raises(CalibrationError, match="--camera fx,fy,cx,cy"):
+        open_sequence(tmp_path)
+    (tmp_path / "calibration.txt").write_text("60 60 32 24")
+    assert float(open_sequence(tmp_path).camera.fx) == 60.0
+    assert float(open_sequence(tmp_path, CAMERA.replace("60", "61")).camera.fx) == 61.0
+    (tmp_path / "mine.txt").write_text("62 62 32 24")
+    assert float(open_sequence(tmp_path, tmp_path / "mine.txt").camera.fx) == 62.0
+    assert float(open_sequence(tmp_path, str(tmp_path / "mine.txt")).camera.fx) == 62.0
+
+
+def test_folder_without_images(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="no images"):
+        open_sequence(tmp_path, CAMERA)
+
+
+def test_bad_image_of_a_folder_is_named(tmp_path: Path, write_picture: Callable) -> None:
+    write_picture(tmp_path / "0.png")
+    (tmp_path / "1.png").write_bytes((tmp_path / "0.png").read_bytes()[:-20])
+    with pytest.raises(FrameError, match=r"1\.png is truncated"):
+        open_sequence(tmp_path, CAMERA)[1]
+
+
+def test_wrong_paths(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="does not exist"):
+        open_sequence(tmp_path / "nothing")
+    (tmp_path / "notes.txt").write_text("text")
+    with pytest.raises(SequenceError, match="neither a folder nor a video"):
+        open_sequence(tmp_path / "notes.txt")
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Eight frames at 25 Hz, each of its own brightness."""
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    assert writer.isOpened()
+    for index in range(8):
+        writer.write(np.full((48, 64, 3), 30 * index, np.uint8))
+    writer.release()
+    return path
+
+
+def test_video_in_order_and_back(video: Path) -> None:
+    sequence = open_sequence(video, CAMERA)
+    assert (len(sequence), sequence.size, sequence.name) == (8, (64, 48), "clip")
+    assert sequence.frame_rate == pytest.approx(25.0)
+    for index in (0, 1, 4, 7, 2, 2, 0):
+        frame = sequence[index]
+        assert frame.name.endswith(f"clip.avi#{index}")
+        assert float(frame.image.mean()) == pytest.approx(30 * index / 255, abs=0.01)
+    assert torch.equal(open_sequence(video, CAMERA, stride=3)[1].image, sequence[3].image)
+    assert open_sequence(video, CAMERA, fps=50).frame_rate == pytest.approx(50.0)
+
+
+def test_video_needs_a_fitting_camera(video: Path) -> None:
+    with pytest.raises(CalibrationError, match="--camera"):
+        open_sequence(video)
+    camera = open_sequence(video, CAMERA).camera
+    other = type(camera).pinhole(60, 60, 32, 24, size=(640, 480))
+    with pytest.raises(CalibrationError, match="640x480, these are 64x48"):
+        open_sequence(video, other)
+
+
+def test_unreadable_video(tmp_path: Path, video: Path) -> None:
+    fake = tmp_path / "fake.mp4"
+    fake.write_bytes(b"this is not a video" * 100)
+    with pytest.raises(SequenceError, match=r"fake\.mp4: cannot be read as a video"):
+        open_sequence(fake, CAMERA)
+    empty = tmp_path / "empty.avi"
+    empty.write_bytes(b"")
+    with pytest.raises(SequenceError, match=r"empty\.avi: cannot be read as a video"):
+        open_sequence(empty, CAMERA)
+
+
+def test_damaged_end_of_a_video(tmp_path: Path, video: Path) -> None:
+    data = bytearray(video.read_bytes())
+    start = data.rfind(b"\xff\xd8")
+    end = data.rfind(b"\xff\xd9")
+    data[start:end] = bytes(end - start)
+    damaged = tmp_path / "damaged.avi"
+    damaged.write_bytes(data)
+    sequence = open_sequence(damaged, CAMERA)
+    with pytest.raises(FrameError, match=r"damaged\.avi#7: cannot be decoded"):
+        sequence[7]
+    assert float(sequence[6].image.mean()) == pytest.approx(180 / 255, abs=0.01)
