@@ -1,5 +1,6 @@
 """Multi-view geometry as pure, batched, differentiable functions over tensors."""
 
+from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import (
@@ -23,6 +24,7 @@ from torchslam.geometry.lie import (
     transform,
     vee,
 )
+from torchslam.geometry.p3p import p3p
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -32,11 +34,14 @@ from torchslam.geometry.triangulation import (
 )
 
 __all__ = [
+    "AbsolutePose",
     "Camera",
     "MultiViewTriangulation",
     "Triangulation",
     "correct_matches",
+    "estimate_absolute_pose",
     "matrix_from_quaternion",
+    "p3p",
     "quaternion_from_matrix",
     "rigid",
     "se3_adjoint",

@@ -143,29 +143,39 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
-    def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pixels as from `project`, with analytic derivatives.
+    def project_with_point_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels as from `project`, with the analytic derivative with respect to the points.
 
-        Returns pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and
-        d pixels / d params (..., N, 2, P). Derivatives of invalid points are zero.
+        Returns pixels (..., N, 2), valid (..., N) and d pixels / d points_c (..., N, 2, 3), zero where invalid.
         """
         normalized, valid = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
         distorted = self._distortion.distort(normalized, coefficients)
+        inverse_depth = torch.where(valid, 1 / points_c[..., 2].masked_fill(~valid, 1.0), 0.0)
+        scale = focal * inverse_depth[..., None]
+        if self.model == "pinhole":
+            J_normalized = torch.diag_embed(scale)
+            J_depth = -scale * normalized
+        else:
+            J_normalized = self._distortion.slope(normalized, coefficients) * scale[..., None]
+            J_depth = -(
+                J_normalized[..., 0] * normalized[..., :1] + J_normalized[..., 1] * normalized[..., 1:]
+            )
+        return self._to_pixels(distorted, valid), valid, torch.cat((J_normalized, J_depth[..., None]), dim=-1)
 
-        inverse_depth = torch.where(valid, 1 / torch.where(valid, points_c[..., 2], 1.0), 0.0)[
-            ..., None, None
-        ]
-        J_normalized, J_coefficients = self._distortion.jacobians(normalized, coefficients)
-        J_normalized = J_normalized * (focal[..., None] * inverse_depth)
-        J_depth = -(J_normalized @ normalized[..., None])
-        J_points = torch.cat((J_normalized, J_depth), dim=-1)
+    def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pixels as from `project`, with the analytic derivatives with respect to points and parameters.
 
-        J_intrinsics = torch.cat(
-            (torch.diag_embed(distorted), torch.diag_embed(torch.ones_like(distorted))), dim=-1
-        )
-        J_params = torch.cat((J_intrinsics, focal[..., None] * J_coefficients), dim=-1)
-        pixels = self._to_pixels(distorted, valid)
+        Returns pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and
+        d pixels / d params (..., N, 2, P). Derivatives of invalid points are zero.
+        """
+        pixels, valid, J_points = self.project_with_point_jacobians(points_c)
+        normalized, _ = self._normalize_points(points_c)
+        coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2, None]
+        distorted = self._distortion.distort(normalized, coefficients)
+        J_centre = torch.eye(2, dtype=pixels.dtype, device=pixels.device).expand(*pixels.shape, 2)
+        J_coefficients = focal * self._distortion.coefficient_slope(normalized, coefficients)
+        J_params = torch.cat((torch.diag_embed(distorted), J_centre, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
     def normalize(self, pixels: Tensor) -> Tensor:
@@ -203,7 +213,7 @@ class Camera:
         scale = (params[..., 0] * params[..., 1]).abs().sqrt()[..., None].expand(normalized.shape[:-1])
         if self.model == "pinhole":
             return scale
-        J, _ = self._distortion.jacobians(normalized.detach(), params[..., None, 4:])
+        J = self._distortion.slope(normalized.detach(), params[..., None, 4:])
         return scale * torch.linalg.det(J).abs().sqrt()
 
     def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:

@@ -20,15 +20,20 @@ _NEWTON_STEPS = 12
 
 @dataclass(frozen=True)
 class Distortion:
-    """One model: `distort(xy, k)`, `jacobians(xy, k)` = (d/d xy, d/d k), `undistort(xy, k, limit)`,
-    `limit(k)`.
+    """One model, as functions of undistorted coordinates xy and coefficients k.
 
-    `limit` is in terms of `coordinate(r)`, of the undistorted radius r.
+    distort:           (xy, k) -> distorted coordinates (..., N, 2)
+    slope:             (xy, k) -> d distorted / d xy (..., N, 2, 2)
+    coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K)
+    undistort:         (distorted, k, limit) -> xy
+    limit:             (k) -> up to which `coordinate` the map is monotone (...)
+    coordinate:        undistorted radius -> what the limit limits
     """
 
     num_params: int
     distort: Callable[[Tensor, Tensor], Tensor]
-    jacobians: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    slope: Callable[[Tensor, Tensor], Tensor]
+    coefficient_slope: Callable[[Tensor, Tensor], Tensor]
     undistort: Callable[[Tensor, Tensor, Tensor], Tensor]
     limit: Callable[[Tensor], Tensor]
     coordinate: Callable[[Tensor], Tensor]
@@ -48,11 +53,6 @@ def first_positive_root(coefficients: Tensor) -> Tensor:
     real = inverse.imag.abs() <= 1e-6 * inverse.abs()
     largest = torch.where(real, inverse.real, 0.0).amax(-1)
     return torch.where(largest > 1e-12, 1 / largest.clamp_min(1e-12), torch.inf)
-
-
-def _powers(u: Tensor, count: int) -> Tensor:
-    """u, u^2, ..., u^count along a new last dimension."""
-    return torch.stack([u**k for k in range(1, count + 1)], dim=-1)
 
 
 def _converged(step: Tensor) -> bool:
@@ -76,9 +76,12 @@ def _identity(xy: Tensor, k: Tensor) -> Tensor:
     return xy
 
 
-def _identity_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
-    return eye.expand(*xy.shape, 2), xy.new_zeros(*xy.shape, 0)
+def _identity_slope(xy: Tensor, k: Tensor) -> Tensor:
+    return torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2)
+
+
+def _identity_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
+    return xy.new_zeros(*xy.shape, 0)
 
 
 def _identity_undistort(xy: Tensor, k: Tensor, limit: Tensor) -> Tensor:
@@ -119,14 +122,15 @@ def _radial_tangential_slope(xy: Tensor, k: Tensor) -> Tensor:
     return torch.stack((xx, cross, cross, yy), dim=-1).unflatten(-1, (2, 2))
 
 
-def _radial_tangential_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d k. (..., 2, 5)."""
     x, y = xy.unbind(-1)
     xx, yy, xy2 = x * x, y * y, 2 * x * y
     r2 = xx + yy
     r4 = r2 * r2
     r6 = r4 * r2
     rows = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
-    return _radial_tangential_slope(xy, k), torch.stack(rows, dim=-1).unflatten(-1, (2, 5))
+    return torch.stack(rows, dim=-1).unflatten(-1, (2, 5))
 
 
 def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
@@ -180,17 +184,25 @@ def _fisheye(xy: Tensor, k: Tensor) -> Tensor:
     return xy * torch.where(zero, 1.0, factor)[..., None]
 
 
-def _fisheye_jacobians(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+def _fisheye_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d xy: one factor along the radius, one across. (..., 2, 2)."""
     radius, zero = _safe_radius(xy)
     angle = torch.atan(radius)
-    factor = torch.where(zero, 1.0, _bent(angle, k) / radius)
-    growth = torch.where(zero, 1.0, _bent_slope(angle, k) / (1 + radius * radius))  # d bent / d radius
-    direction = torch.where(zero[..., None], 0.0, xy / radius[..., None])
-    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    across = torch.where(zero, 1.0, _bent(angle, k) / radius)
+    along = torch.where(zero, 1.0, _bent_slope(angle, k) / (1 + radius * radius))
+    direction = xy / radius[..., None]
     outer = direction[..., :, None] * direction[..., None, :]
-    J_xy = factor[..., None, None] * eye + (growth - factor)[..., None, None] * outer
-    J_k = direction[..., None] * (angle[..., None] * _powers(angle * angle, 4))[..., None, :]
-    return J_xy, J_k
+    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    return across[..., None, None] * eye + (along - across)[..., None, None] * outer
+
+
+def _fisheye_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d k. (..., 2, 4)."""
+    radius, _ = _safe_radius(xy)
+    angle = torch.atan(radius)
+    u = angle * angle
+    powers = angle[..., None] * torch.stack((u, u * u, u * u * u, u * u * u * u), dim=-1)
+    return (xy / radius[..., None])[..., None] * powers[..., None, :]
 
 
 def _fisheye_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
@@ -219,14 +231,25 @@ def _fisheye_limit(k: Tensor) -> Tensor:
 
 
 MODELS = {
-    "pinhole": Distortion(0, _identity, _identity_jacobians, _identity_undistort, _no_limit, torch.abs),
+    "pinhole": Distortion(
+        0, _identity, _identity_slope, _identity_coefficient_slope, _identity_undistort, _no_limit, torch.abs
+    ),
     "radial_tangential": Distortion(
         5,
         _radial_tangential,
-        _radial_tangential_jacobians,
+        _radial_tangential_slope,
+        _radial_tangential_coefficient_slope,
         _radial_tangential_undistort,
         _radial_tangential_limit,
         torch.abs,
     ),
-    "fisheye": Distortion(4, _fisheye, _fisheye_jacobians, _fisheye_undistort, _fisheye_limit, torch.atan),
+    "fisheye": Distortion(
+        4,
+        _fisheye,
+        _fisheye_slope,
+        _fisheye_coefficient_slope,
+        _fisheye_undistort,
+        _fisheye_limit,
+        torch.atan,
+    ),
 }

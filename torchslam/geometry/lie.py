@@ -14,32 +14,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Series in the squared angle: sum over k of (-1)^k x^k / (2k + n)!, exact to 1e-16 for x below 1.
-_SERIES_TERMS = 9
-_SERIES_LIMIT = 1.0
+# Below this squared angle the coefficients come from their series, (-1)^k / (2k + n)! for n = 1, 2, 3, 4.
+_SERIES_LIMIT = 0.25
+_SERIES = tuple(tuple((-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3, 4)) for k in range(7))
 
 
-def _series(angle_squared: Tensor, n: int) -> Tensor:
-    """sum_k (-x)^k / (2k + n)!, by Horner."""
-    result = torch.full_like(
-        angle_squared, (-1.0) ** (_SERIES_TERMS - 1) / math.factorial(2 * (_SERIES_TERMS - 1) + n)
-    )
-    for k in reversed(range(_SERIES_TERMS - 1)):
-        result = result * angle_squared + (-1.0) ** k / math.factorial(2 * k + n)
-    return result
-
-
-def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 as smooth functions of a^2."""
-    small = angle_squared < _SERIES_LIMIT
-    near = torch.where(small, angle_squared, 0.0)
-    far = torch.where(small, 1.0, angle_squared)
+def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3, (cos a - 1 + a^2/2)/a^4 as smooth functions of a^2."""
+    x = angle_squared[..., None]
+    small = x < _SERIES_LIMIT
+    near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
+    coefficients = torch.tensor(_SERIES, dtype=x.dtype, device=x.device)
+    series = coefficients[6] * near + coefficients[5]
+    for k in range(4, -1, -1):
+        series = series * near + coefficients[k]
     angle = far.sqrt()
-    sine, cosine = angle.sin(), angle.cos()
-    a = torch.where(small, _series(near, 1), sine / angle)
-    b = torch.where(small, _series(near, 2), (1 - cosine) / far)
-    c = torch.where(small, _series(near, 3), (angle - sine) / (far * angle))
-    return a, b, c
+    half_sine = (0.5 * angle).sin()
+    a, b = angle.sin() / angle, 2 * half_sine * half_sine / far
+    closed = torch.cat((a, b, (1 - a) / far, (0.5 - b) / far), dim=-1)
+    a, b, c, d = torch.where(small, series, closed).unbind(-1)
+    return a, b, c, d
 
 
 def skew(v: Tensor) -> Tensor:
@@ -73,24 +67,21 @@ def transform(T: Tensor, points: Tensor) -> Tensor:
 
 def so3_exp(omega: Tensor) -> Tensor:
     """Rotation matrices of rotation vectors. (..., 3) radians -> (..., 3, 3)."""
-    a, b, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    a, b, _, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + a * W + b * (W @ W)
 
 
 def so3_left_jacobian(omega: Tensor) -> Tensor:
     """J with exp(omega + d) = exp(J d) exp(omega) to first order. (..., 3) -> (..., 3, 3)."""
-    _, b, c = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    _, b, c, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + b * W + c * (W @ W)
 
 
 def _so3_left_jacobian_inverse(omega: Tensor) -> Tensor:
     """Inverse of the left Jacobian, for angles below 2 pi. (..., 3) -> (..., 3, 3)."""
-    x = (omega * omega).sum(-1)[..., None, None]
-    _, b, c = _rodrigues(x)
-    small = x < _SERIES_LIMIT
-    d = torch.where(small, _series(torch.where(small, x, 0.0), 4), (0.5 - b) / torch.where(small, 1.0, x))
+    _, b, c, d = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     factor = (c - 2 * d) / (2 * b)  # (1 - (a/2) cot(a/2)) / a^2 without cancellation
     return torch.eye(3, dtype=omega.dtype, device=omega.device) - 0.5 * W + factor * (W @ W)
@@ -142,7 +133,7 @@ def so3_log(R: Tensor) -> Tensor:
 def se3_exp(xi: Tensor) -> Tensor:
     """Rigid transforms of tangent vectors [rho, omega]. (..., 6) -> (..., 4, 4)."""
     rho, omega = xi.split(3, dim=-1)
-    a, b, c = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    a, b, c, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     W2 = W @ W
     eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
@@ -191,7 +182,7 @@ def _sim3_translation_matrix(omega: Tensor, sigma: Tensor) -> Tensor:
     """
     s = torch.tensor(_NODES, dtype=omega.dtype, device=omega.device)
     weight = torch.tensor(_WEIGHTS, dtype=omega.dtype, device=omega.device) * (s * sigma[..., None]).exp()
-    a, b, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
+    a, b, _, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
     identity, linear, quadratic = weight.sum(-1), (weight * s * a).sum(-1), (weight * s * s * b).sum(-1)
     W = skew(omega)
     eye = torch.eye(3, dtype=omega.dtype, device=omega.device)

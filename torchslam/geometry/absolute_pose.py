@@ -1,0 +1,235 @@
+"""The pose of a camera from points and their pixels, some of them wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.implicit import implicit_step, needs_gradient
+from torchslam.geometry.least_squares import State, minimize, retract_pose
+from torchslam.geometry.lie import rigid, se3_exp, transform
+from torchslam.geometry.p3p import p3p
+from torchslam.geometry.ransac import (
+    gather_rows,
+    is_significant,
+    sample_minimal,
+    search,
+    truncated_score,
+    valid_first,
+)
+
+_FIRST_ROUND = 48  # samples
+_CANDIDATES = 4  # hypotheses of each round that are optimised
+_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 3, 8
+_FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
+
+
+@dataclass(frozen=True)
+class AbsolutePose:
+    """Poses of B cameras.
+
+    T_cw:    (B, 4, 4) world to camera; the identity where nothing was found
+    inliers: (B, N) points within the threshold of their pixel, in front of the camera
+    success: (B,) the inliers are no accident, and not all on one line
+    score:   (B,) sum over the points of 1 - min((error / threshold)^2, 1)
+    """
+
+    T_cw: Tensor
+    inliers: Tensor
+    success: Tensor
+    score: Tensor
+
+
+def estimate_absolute_pose(
+    points_w: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    threshold: float = 2.0,
+    mask: Tensor | None = None,
+    seed: int = 0,
+    confidence: float = 0.9999,
+    max_samples: int = 3000,
+) -> AbsolutePose:
+    """Poses of B cameras by RANSAC over P3P, with local optimisation and a least-squares refinement.
+
+    points_w: (B, N, 3); pixels: (B, N, 2); mask: (B, N), rows outside it, or with NaN, are ignored; threshold:
+    reprojection error of an inlier in pixels. The same arguments and seed give the same result. Too few points,
+    points on a line, or pure noise give `success` False for that camera.
+
+    Where an input requires a gradient, T_cw carries that of the final least squares with respect to points, pixels
+    and camera parameters, with the set of rows it uses fixed (implicit function theorem, exact Hessian).
+    Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003; for P3P see `p3p`.
+    """
+    if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
+        shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
+        raise ValueError(f"points_w and pixels must be (B, N, 3) and (B, N, 2), not {shapes}")
+    finite = torch.isfinite(points_w).all(-1) & torch.isfinite(pixels).all(-1)
+    mask = finite if mask is None else mask & finite
+    points_w = torch.where(mask[..., None], points_w, 0.0)
+    pixels = torch.where(mask[..., None], pixels, 0.0)
+    with torch.no_grad():
+        generator = torch.Generator().manual_seed(seed)
+        problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
+        (R, t), _ = search(
+            lambda rows, count: problem.select(rows).propose(count, generator),
+            mask.sum(-1),
+            3,
+            confidence,
+            _FIRST_ROUND,
+            max_samples,
+        )
+        R, t, used = problem.refine(R, t)
+        squared = problem.squared_errors(R, t)
+        inliers = (squared < 1) & mask
+        success = _is_success(inliers, mask, problem.points, camera, threshold)
+        score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+        t = t - (R @ problem.centre[..., None]).squeeze(-1)
+        T_cw = torch.where(success[:, None, None], rigid(R, t), torch.eye(4, dtype=R.dtype, device=R.device))
+    if needs_gradient(points_w, pixels, camera.params):
+        T_cw = _with_gradient(T_cw, points_w, pixels, camera, used & success[:, None])
+    return AbsolutePose(T_cw, inliers & success[:, None], success, score)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The data of the search. Points are relative to their mean, so that float32 is enough for scores.
+
+    points, pixels, mask, rays: (B, N, ...); camera; threshold in pixels; centre: (B, 3) mean of the points
+    homogeneous: (B, 4, N), normalized: (B, 2, 1, N), scale: (B, 1, N) thresholds per unit of them; float32
+    """
+
+    points: Tensor
+    pixels: Tensor
+    camera: Camera
+    threshold: float
+    mask: Tensor
+    centre: Tensor
+    rays: Tensor
+    homogeneous: Tensor
+    normalized: Tensor
+    scale: Tensor
+
+    @staticmethod
+    def of(points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor) -> _Problem:
+        weights = mask[..., None].to(points_w.dtype)
+        centre = (points_w * weights).sum(1) / weights.sum(1).clamp_min(1.0)
+        points = points_w - centre[:, None]
+        params = camera.params.detach()
+        camera = camera.with_params(params.expand(len(points), -1))
+        normalized = camera.normalize(pixels)
+        ones = torch.ones_like(normalized[..., :1])
+        rays = torch.cat((normalized, ones), dim=-1)
+        rays = rays / rays.norm(dim=-1, keepdim=True)
+        return _Problem(
+            points,
+            pixels,
+            camera,
+            threshold,
+            mask,
+            centre,
+            rays,
+            torch.cat((points, ones), dim=-1).mT.float(),
+            normalized.mT[:, :, None].float(),
+            (camera.pixel_scale(normalized) / threshold)[:, None].float(),
+        )
+
+    def select(self, rows: Tensor) -> _Problem:
+        """Some of the problems."""
+        if len(rows) == len(self.points):
+            return self
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
+        return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
+
+    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor]:
+        """The best pose from `count` minimal samples, locally optimised, and its score."""
+        sample = sample_minimal(self.mask, 3, count, generator)
+        R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
+        R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
+        first = valid_first(valid)
+        P = torch.cat((R, t[..., None]), dim=-1).flatten(2)
+        P, valid = gather_rows(P, first).unflatten(-1, (3, 4)), valid.gather(1, first)
+        score = torch.where(valid, self.score(P), -1.0)
+        best = score.topk(min(_CANDIDATES, score.shape[1]), dim=1).indices
+        P = gather_rows(P.flatten(2), best).unflatten(-1, (3, 4))
+        state, cost = minimize((P[..., :3], P[..., 3]), self.evaluate, retract_pose, _LOCAL_ITERATIONS)
+        cost, best = cost.nan_to_num(torch.inf).min(dim=1)
+        R, t = (gather_rows(x.flatten(2), best[:, None]).squeeze(1).unflatten(-1, x.shape[2:]) for x in state)
+        return (R, t), self.mask.sum(-1) - cost
+
+    def score(self, P: Tensor) -> Tensor:
+        """Truncated scores of many poses, in float32. (B, M, 3, 4) -> (B, M)."""
+        M = P.shape[1]
+        x, y, z = (P.transpose(1, 2).flatten(1, 2).float() @ self.homogeneous).unflatten(1, (3, M)).unbind(1)
+        dx = torch.addcmul(x, self.normalized[:, 0], z, value=-1)
+        dy = torch.addcmul(y, self.normalized[:, 1], z, value=-1)
+        # Behind the camera the denominator vanishes and the error becomes huge.
+        scale = self.scale / z.clamp_min_(1e-6)
+        squared = dx.square_().addcmul_(dy, dy).mul_(scale.square_())
+        return truncated_score(squared, self.mask.float())
+
+    def evaluate(self, R: Tensor, t: Tensor, width: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Normal equations and truncated cost of (B, K) poses, in thresholds."""
+        residual, J, valid = self.residuals(R, t)
+        squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf)
+        used = (squared < width * width) & self.mask[:, None]
+        cost = torch.where(self.mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
+        rows = (
+            torch.cat((J, residual[..., None]), dim=-1).masked_fill(~used[..., None, None], 0.0).flatten(2, 3)
+        )
+        return rows.mT @ rows, cost
+
+    def residuals(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Reprojection errors in thresholds (B, K, N, 2), Jacobians (B, K, N, 2, 6), validity (B, K, N)."""
+        K = t.shape[1]
+        points_c = (self.points[:, None] @ R.mT + t[:, :, None]).flatten(1, 2)
+        projected, valid, J = self.camera.project_with_point_jacobians(points_c)
+        J = J / self.threshold
+        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
+        residual = (projected.unflatten(1, (K, -1)) - self.pixels[:, None]) / self.threshold
+        J = torch.cat((J, J_rotation), dim=-1).unflatten(1, (K, -1))
+        return residual, J, valid.unflatten(1, (K, -1))
+
+    def squared_errors(self, R: Tensor, t: Tensor) -> Tensor:
+        """Squared errors in thresholds of one pose per problem; infinite behind the camera. (B, N)."""
+        residual, _, valid = self.residuals(R[:, None], t[:, None])
+        return (residual * residual).sum(-1).masked_fill(~valid, torch.inf)[:, 0]
+
+    def refine(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The minimum of the truncated squared error, and the rows (B, N) that it uses."""
+
+        def evaluate(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+            return self.evaluate(R, t, _FINAL_WIDTH)
+
+        state, _ = minimize((R[:, None], t[:, None]), evaluate, retract_pose, _FINAL_ITERATIONS)
+        R, t = state[0][:, 0], state[1][:, 0]
+        return R, t, (self.squared_errors(R, t) < _FINAL_WIDTH**2) & self.mask
+
+
+def _is_success(inliers: Tensor, mask: Tensor, points: Tensor, camera: Camera, threshold: float) -> Tensor:
+    """Whether the inliers are no accident, and fix the pose: four or more, not on one line. (B,)."""
+    chance = torch.full_like(
+        mask[:, 0], math.pi * threshold**2 / (camera.width * camera.height), dtype=torch.float64
+    )
+    significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
+    weights = inliers[..., None].to(points.dtype)
+    mean = (weights * points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
+    centred = weights * (points - mean)
+    spread = torch.linalg.eigvalsh(centred.mT @ centred)
+    return significant & (spread[:, 1] > 1e-6 * spread[:, 2])
+
+
+def _with_gradient(T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera, used: Tensor) -> Tensor:
+    """The same poses, with the gradient of the minimiser of the squared error over the rows in use."""
+
+    def objective(xi: Tensor) -> Tensor:
+        projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))
+        squared = (projected - pixels).square().sum(-1)
+        return torch.where(used & valid, squared, 0.0).sum(-1)
+
+    return se3_exp(implicit_step(objective, T_cw[:, 0, :1].expand(-1, 6))) @ T_cw

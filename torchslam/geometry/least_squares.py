@@ -1,0 +1,63 @@
+"""A small batched Levenberg-Marquardt, for the local optimisation inside the robust estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+State = tuple[Tensor, ...]
+
+
+def minimize(
+    state: State,
+    evaluate: Callable[..., tuple[Tensor, Tensor]],
+    retract: Callable[[State, Tensor], State],
+    iterations: int,
+    tolerance: float = 1e-10,
+) -> tuple[State, Tensor]:
+    """Minimises many small problems at once, each with its own damping.
+
+    state:    tensors with leading dimensions (...)
+    evaluate: state -> (A, cost): A (..., D + 1, D + 1) is [J r]^T W [J r], and cost (...) what must not grow
+    retract:  state, step (..., D) -> state
+    Stops early once no problem moves by more than `tolerance`. Returns the state and its cost; problems that
+    become singular or NaN keep their last good state.
+    """
+    A, cost = evaluate(*state)
+    damping = torch.full_like(cost, 1e-4)
+    for _ in range(iterations):
+        H, g = A[..., :-1, :-1], A[..., :-1, -1:]
+        diagonal = H.diagonal(dim1=-2, dim2=-1) * damping[..., None]
+        step = -torch.linalg.solve_ex(H + torch.diag_embed(diagonal), g)[0].squeeze(-1)
+        moved = retract(state, step)
+        A_moved, cost_moved = evaluate(*moved)
+        better = cost_moved < cost
+        state = tuple(_select(better, new, old) for new, old in zip(moved, state, strict=True))
+        A, cost = _select(better, A_moved, A), _select(better, cost_moved, cost)
+        damping = torch.where(better, damping * 0.1, damping * 10).clamp(1e-9, 1e6)
+        if not bool((step.abs().amax(-1) > tolerance).any()):
+            break
+    return state, cost
+
+
+def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(condition.reshape(condition.shape + (1,) * (new.dim() - condition.dim())), new, old)
+
+
+def small_rotation(omega: Tensor) -> Tensor:
+    """Cayley's rotation, equal to exp(omega) to second order, and cheaper. (..., 3) -> (..., 3, 3)."""
+    half = 0.5 * omega
+    x, y, z = half.unbind(-1)
+    zero = torch.zeros_like(x)
+    W = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    factor = (2 / (1 + (half * half).sum(-1)))[..., None, None]
+    return torch.eye(3, dtype=omega.dtype, device=omega.device) + factor * (W + W @ W)
+
+
+def retract_pose(state: State, step: Tensor) -> State:
+    """Moves (R, t) by [rho, omega] from the left. (..., 3, 3), (..., 3), (..., 6)."""
+    R, t = state
+    moved = small_rotation(step[..., 3:]) @ torch.cat((R, t[..., None]), dim=-1)
+    return moved[..., :3], moved[..., 3] + step[..., :3]

@@ -1,0 +1,113 @@
+"""What the robust estimators share: seeded batched sampling, scores, the search over rounds, significance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.least_squares import State
+
+
+def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
+    """Random minimal samples without repeated rows, from the rows inside the mask.
+
+    mask: (B, N). Returns (B, count, size) int64 row numbers. Problems with fewer than `size` rows get repeated
+    ones. Random permutations are cut into disjoint samples, which also spreads the samples over all rows. The
+    random numbers come from the CPU, so that every device draws the same ones.
+    """
+    B, N = mask.shape
+    available = mask.sum(-1)
+    per_permutation = (available // size).clamp_min(1)
+    permutations = math.ceil(count / max(1, int(per_permutation.min()))) if B else 1
+    # Many permutations of few rows are cheap; of many rows few are needed.
+    keys = torch.rand(B, permutations, N, generator=generator).to(mask.device)
+    order = torch.where(mask[:, None], keys, 2.0).argsort(-1).flatten(1)
+    sample = torch.arange(count, device=mask.device)
+    start = sample // per_permutation[:, None] * N + sample % per_permutation[:, None] * size
+    position = (
+        start[..., None] + torch.arange(size, device=mask.device) % available.clamp_min(1)[:, None, None]
+    )
+    return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
+
+
+def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: float) -> Tensor:
+    """How many samples contain, with the given confidence, one without outliers. (B,), (B,) -> (B,)."""
+    ratio = (inliers / available.clamp_min(1)).clamp(1e-6, 1 - 1e-6)
+    return math.log(1 - confidence) / torch.log1p(-(ratio**size).clamp_max(1 - 1e-6))
+
+
+def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
+    """Rows of a batch. (B, N, D), (B, ...) int64 -> (B, ..., D)."""
+    flat = indices.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
+    return values.gather(1, flat).unflatten(1, indices.shape[1:])
+
+
+def truncated_score(squared: Tensor, weights: Tensor) -> Tensor:
+    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC); `squared` is overwritten.
+
+    squared: (B, M, N) squared residuals in units of the threshold, NaN counted as outliers; weights: (B, N) one
+    for rows in use, else zero. Returns (B, M); higher is better. Source: Torr and Zisserman, "MLESAC", 2000.
+    """
+    gain = squared.neg_().add_(1.0).clamp_min_(0.0).nan_to_num_(0.0)
+    return (gain @ weights[..., None]).squeeze(-1)
+
+
+def search(
+    propose: Callable[[Tensor, int], tuple[State, Tensor]],
+    available: Tensor,
+    size: int,
+    confidence: float,
+    first_round: int,
+    max_samples: int,
+) -> tuple[State, Tensor]:
+    """The best model of each problem over rounds of samples, until its inliers call for no more of them.
+
+    propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...) and scores
+    (R,), as from `truncated_score`; available: (B,) rows in use per problem; size: of a minimal sample.
+    Every round draws twice as many samples as the one before.
+    """
+    rows = torch.arange(len(available), device=available.device)
+    models, best = propose(rows, first_round)
+    drawn, count = first_round, first_round
+    while drawn < max_samples:
+        # The score is below the number of inliers, which errs towards more samples: noise spoils some of them.
+        rows = (samples_needed(best, available, size, confidence) > drawn).nonzero().squeeze(-1)
+        if len(rows) == 0:
+            break
+        count = min(2 * count, max_samples - drawn)
+        new, score = propose(rows, count)
+        better = score > best[rows]
+        rows = rows[better]
+        models = tuple(old.index_copy(0, rows, x[better]) for old, x in zip(models, new, strict=True))
+        best = best.index_copy(0, rows, score[better])
+        drawn += count
+    return models, best
+
+
+def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor, solutions: int) -> Tensor:
+    """Whether so many inliers are no accident among wrong matches: fewer than 0.001 false alarms expected.
+
+    inliers, available: (B,) counts; chance: (B,) probability that a wrong row fits a model; solutions: models per
+    minimal sample of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
+    matches between two images", 2004, eq. for the number of false alarms.
+    """
+    n, k = available.double(), inliers.double()
+
+    def log_choose(n: Tensor, k: Tensor) -> Tensor:
+        return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp_min(0.0) + 1)
+
+    samples = torch.full_like(k, float(size))
+    log_alarms = (
+        log_choose(n, k) + log_choose(k, samples) + (k - size) * torch.log(chance.double().clamp(1e-12, 1))
+    )
+    log_alarms = log_alarms + torch.log(solutions * (n - size).clamp_min(1.0))
+    return (k > size) & (log_alarms < math.log(1e-3))
+
+
+def valid_first(valid: Tensor) -> Tensor:
+    """Row numbers with the valid rows first, cut to the largest count in the batch. (B, M) -> (B, M')."""
+    count = max(1, int(valid.sum(-1).max()))
+    return valid.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, :count]
