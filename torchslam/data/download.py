@@ -116,11 +116,11 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
     except urllib.error.HTTPError as error:
         if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
-        # There is nothing behind what we have: it is whole, or it is not this file.
+        # There is nothing behind what we have: it is whole, or it was another file.
         whole = re.fullmatch(r"bytes \*/(\d+)", error.headers.get("Content-Range", ""))
         if whole is None or int(whole[1]) != start:
             part.unlink()
-            raise
+            return _transfer(url, part, progress)
         return start
     with response:
         resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT

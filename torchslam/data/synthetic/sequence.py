@@ -74,7 +74,7 @@ class SyntheticSequence(Sequence):
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5)
-        image = _renderer(self.name, options.seed).render(self._poses_cw[index])
+        image = _renderer(SCENES[self.name][0], options.seed).render(self._poses_cw[index])
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
         image *= 1.0 + options.exposure * np.sin(0.1 * index)
@@ -110,8 +110,7 @@ def open_synthetic(name: str) -> SyntheticSequence:
 
 
 @lru_cache(maxsize=2)
-def _renderer(scene: str, seed: int) -> Renderer:
+def _renderer(scene: Callable[[int], list[Rectangle]], seed: int) -> Renderer:
     """Textures take seconds to make, so that the last scenes are kept."""
-    rectangles, _ = SCENES[scene]
     K = np.array(((FOCAL, 0, (SIZE[0] - 1) / 2), (0, FOCAL, (SIZE[1] - 1) / 2), (0, 0, 1)))
-    return Renderer(rectangles(seed), K, SIZE)
+    return Renderer(scene(seed), K, SIZE)

@@ -1,0 +1,205 @@
+"""Downloads from a server on this machine: whole, broken off and resumed, damaged and hostile archives."""
+
+from __future__ import annotations
+
+import io
+import re
+import stat
+import threading
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from torchslam.data import open_sequence
+from torchslam.data.download import download, unpack
+from torchslam.errors import DownloadError
+
+
+@dataclass
+class Server:
+    """What the server offers, how it misbehaves and what it was asked for.
+
+    cut: bytes after which a transfer breaks off; the number of transfers it does so for
+    """
+
+    url: str = ""
+    files: dict[str, bytes] = field(default_factory=dict)
+    cut: int | None = None
+    cuts_left: int = 0
+    ranges: bool = True
+    requests: list[str | None] = field(default_factory=list)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    state = Server()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            state.requests.append(self.headers.get("Range"))
+            body = state.files.get(self.path)
+            if body is None:
+                self.send_error(404)
+                return
+            start = 0
+            if state.ranges and (asked := re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))):
+                start = int(asked[1])
+            if start >= len(body):
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(body)}")
+                self.end_headers()
+                return
+            self.send_response(206 if start else 200)
+            if start:
+                self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
+            self.send_header("Content-Length", str(len(body) - start))
+            self.end_headers()
+            end = len(body)
+            if state.cut is not None and state.cuts_left > 0:
+                state.cuts_left -= 1
+                end = min(end, start + state.cut)
+            self.wfile.write(body[start:end])
+
+        def log_message(self, *args: object) -> None:
+            """Keep the test's output clean."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as httpd:
+        thread = threading.Thread(target=httpd.serve_forever, args=(0.01,))
+        thread.start()
+        state.url = f"http://127.0.0.1:{httpd.server_port}"
+        yield state
+        httpd.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def archive(tmp_path: Path, write_picture) -> bytes:
+    """A zip in the layout of ETH3D's monocular archives."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        listing = poses = ""
+        for index in range(3):
+            write_picture(tmp_path / "picture.png", index)
+            file.writestr(f"plant_1/rgb/{index}.png", (tmp_path / "picture.png").read_bytes())
+            listing += f"{index / 27:.6f} rgb/{index}.png\n"
+            poses += f"{index / 27:.6f} 0 0 {index} 0 0 0 1\n"
+        file.writestr("plant_1/rgb.txt", listing)
+        file.writestr("plant_1/groundtruth.txt", poses)
+        file.writestr("plant_1/calibration.txt", "60 60 31.5 23.5\n")
+    return buffer.getvalue()
+
+
+def _entries(**entries: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for name, content in entries.items():
+            file.writestr(name, content)
+    return buffer.getvalue()
+
+
+def test_download_unpack_open(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    folder = download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+    assert folder == tmp_path / "data" / "plant_1"
+    sequence = open_sequence(folder)
+    assert (len(sequence), sequence.size) == (3, (64, 48))
+    assert sequence[2].T_cw_groundtruth is not None
+    assert [path.name for path in folder.parent.iterdir()] == ["plant_1"]  # nothing left over
+    assert download("eth3d/plant_1", tmp_path / "data", server.url, progress=False) == folder
+    assert server.requests == [None]  # not fetched again
+
+
+def test_broken_transfer_goes_on_in_the_same_call(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    server.cut, server.cuts_left = 1000, 2
+    folder = download("eth3d/plant_1", tmp_path, server.url, progress=False)
+    assert server.requests == [None, "bytes=1000-", "bytes=2000-"]
+    assert len(open_sequence(folder)) == 3
+
+
+def test_broken_transfer_goes_on_in_the_next_call(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    server.cut, server.cuts_left = 500, 5
+    with pytest.raises(DownloadError, match=rf"broke off after 2500 of {len(archive)} bytes; run the same"):
+        download("eth3d/plant_1", tmp_path, server.url, progress=False)
+    assert (tmp_path / "plant_1_mono.zip.part").stat().st_size == 2500
+    assert not (tmp_path / "plant_1").exists()
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+    assert server.requests[-1] == "bytes=2500-"
+
+
+def test_server_without_ranges_starts_again(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    server.ranges = False
+    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive[:700])
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+
+
+def test_transfer_that_was_complete_already(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive)
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+
+
+def test_leftovers_longer_than_the_file_are_thrown_away(
+    server: Server, archive: bytes, tmp_path: Path
+) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive + b"more")
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+
+
+def test_unknown_names(server: Server, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match="404"):
+        download("eth3d/nothing", tmp_path, server.url, progress=False)
+    for name in ("plant_1", "tum/desk", "eth3d/../up", "eth3d/"):
+        with pytest.raises(DownloadError, match="unknown sequence"):
+            download(name, tmp_path, server.url, progress=False)
+
+
+def test_no_server(tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match="run the same command again"):
+        download("eth3d/plant_1", tmp_path, "http://127.0.0.1:9", progress=False)
+
+
+def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path: Path) -> None:
+    damaged = bytearray(archive)
+    damaged[200] ^= 0xFF
+    for content in (bytes(damaged), b"<html>sorry</html>"):
+        server.files["/plant_1_mono.zip"] = content
+        with pytest.raises(DownloadError, match=r"plant_1_mono\.zip: cannot be unpacked"):
+            download("eth3d/plant_1", tmp_path, server.url, progress=False)
+        assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == []
+        (tmp_path / "plant_1_mono.zip").unlink()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../evil.txt", "a/../../evil.txt", "/etc/evil.txt", "..\\evil.txt", "C:\\evil.txt", "C:/evil.txt"],
+)
+def test_paths_that_climb_out(tmp_path: Path, name: str) -> None:
+    archive = tmp_path / "hostile.zip"
+    archive.write_bytes(_entries(**{"good.txt": b"good", name: b"evil"}))
+    with pytest.raises(DownloadError, match=r"hostile\.zip: entry `.*evil\.txt` climbs out"):
+        unpack(archive, tmp_path / "target")
+    assert [path.name for path in tmp_path.iterdir()] == ["hostile.zip"]
+
+
+def test_links(tmp_path: Path) -> None:
+    entry = zipfile.ZipInfo("link")
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(tmp_path / "hostile.zip", "w") as file:
+        file.writestr(entry, "/etc/passwd")
+    with pytest.raises(DownloadError, match="entry `link` is a link"):
+        unpack(tmp_path / "hostile.zip", tmp_path / "target")
+    assert not (tmp_path / "target").exists()
+
+
+def test_files_at_the_top_of_an_archive(tmp_path: Path) -> None:
+    (tmp_path / "flat.zip").write_bytes(_entries(**{"rgb.txt": b"0 a", "rgb/a.png": b"x"}))
+    unpack(tmp_path / "flat.zip", tmp_path / "target")
+    assert (tmp_path / "target" / "rgb" / "a.png").read_bytes() == b"x"
