@@ -85,7 +85,7 @@ def evaluate(
                  has a clock of its own, "nearest" charges the estimate with the motion in between (0.03 mm and
                  0.008 degrees a frame on TUM fr2_desk with its 300 Hz); at equal times both are the same.
     tolerance:   seconds to the nearest true pose beyond which an estimated one is left out
-    delta:       poses over which relative motion is compared
+    delta:       poses over which relative motion is compared, fewer where there are fewer
 
     Raises TrajectoryError where fewer than three poses can be compared.
     """
@@ -105,7 +105,8 @@ def evaluate(
     aligned = Trajectory(times, _aligned(T_we, s, R, t))
     errors = (aligned.positions_w[valid] - reference[:, :3, 3]).norm(dim=-1)
     T_ew, T_gw = se3_inverse(matched), se3_inverse(reference)
-    rpe_translation, rpe_rotation = rpe(T_ew, T_gw, delta=min(delta, compared - 1))
+    delta = min(delta, compared - 1)
+    rpe_translation, rpe_rotation = rpe(T_ew, T_gw, delta)
     S = torch.eye(4, dtype=torch.float64, device=device)
     S[:3, :3], S[:3, 3] = s * R, t
     return Evaluation(

@@ -1,0 +1,247 @@
+"""Evaluation: known values, evo as the oracle, gradients, and estimates that cannot be compared."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.data import open_sequence
+from torchslam.data.association import interpolate_poses
+from torchslam.errors import TrajectoryError
+from torchslam.evaluation import ate, evaluate, rpe
+from torchslam.geometry.lie import quaternion_from_matrix, rigid, se3_exp, se3_inverse, so3_exp
+from torchslam.types import Trajectory
+
+
+def _poses(generator: torch.Generator, count: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """(count, 4, 4) a random walk."""
+    steps = 0.2 * torch.randn(count, 6, generator=generator, dtype=torch.float64)
+    return se3_exp(steps.cumsum(0)).to(dtype)
+
+
+def _times(count: int, rate: float = 10.0) -> Tensor:
+    return torch.arange(count, dtype=torch.float64) / rate
+
+
+def _moved(T_wc: Tensor, scale: float) -> Tensor:
+    """The same path in another world: scaled, turned and shifted."""
+    R = so3_exp(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+    t = torch.tensor([5.0, -3.0, 1.0], dtype=torch.float64)
+    return rigid(R @ T_wc[:, :3, :3], scale * T_wc[:, :3, 3] @ R.T + t)
+
+
+def test_a_similar_path_has_no_error(generator: torch.Generator) -> None:
+    T_wc = _poses(generator, 40)
+    groundtruth = Trajectory(_times(40), T_wc)
+    evaluation = evaluate(Trajectory(_times(40), _moved(T_wc, 0.25)), groundtruth)
+    assert evaluation.ate_m < 1e-12
+    assert evaluation.rpe_translation_m < 1e-12
+    assert evaluation.rpe_rotation_deg < 1e-6
+    assert evaluation.scale == pytest.approx(4.0)
+    assert evaluation.ate_se3_m > 0.1
+    assert (evaluation.posed, evaluation.compared) == (40, 40)
+    torch.testing.assert_close(evaluation.aligned.T_wc, T_wc)
+    length = T_wc[:, :3, 3].diff(dim=0).norm(dim=-1).sum()
+    assert evaluation.path_length_m == pytest.approx(float(length))
+    S = evaluation.S_groundtruth_estimate
+    torch.testing.assert_close(S[:3, :3] @ S[:3, :3].T, 16 * torch.eye(3, dtype=torch.float64))
+
+
+def test_known_errors() -> None:
+    # A square of side 2 with its corners moved out and in by 0.1: the best similarity is the identity.
+    square = torch.tensor([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], dtype=torch.float64)
+    signs = torch.tensor([1.0, -1, 1, -1], dtype=torch.float64)[:, None]
+    identity = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    moved = square + 0.1 * signs * square / square.norm(dim=-1, keepdim=True)
+    evaluation = evaluate(
+        Trajectory(_times(4), rigid(identity, moved)), Trajectory(_times(4), rigid(identity, square))
+    )
+    assert evaluation.ate_m == pytest.approx(0.1, rel=1e-2)
+    assert evaluation.ate_se3_m == pytest.approx(0.1)
+    torch.testing.assert_close(evaluation.errors_m.square().mean().sqrt().item(), evaluation.ate_m)
+
+    # A camera that turns 2 degrees too far at each step.
+    angles = torch.arange(10, dtype=torch.float64)[:, None] * torch.tensor([0, 0, math.radians(2.0)])
+    still = torch.zeros(10, 3, dtype=torch.float64)
+    still[:, 0] = torch.arange(10)
+    turning = se3_inverse(rigid(so3_exp(angles), still))
+    straight = se3_inverse(rigid(torch.eye(3, dtype=torch.float64).expand(10, 3, 3), still))
+    for delta in (1, 3):
+        _, rotation = rpe(turning, straight, delta=delta)
+        assert math.degrees(float(rotation)) == pytest.approx(2.0 * delta)
+
+
+def test_groundtruth_at_another_rate_is_interpolated() -> None:
+    def path(times: Tensor) -> Tensor:
+        return se3_exp(times[:, None] * torch.tensor([0.5, 0.2, 0, 0, 0.3, 0], dtype=torch.float64))
+
+    times, truth_times = _times(50, rate=10.0) + 0.013, _times(600, rate=97.0)
+    estimate, groundtruth = Trajectory(times, path(times)), Trajectory(truth_times, path(truth_times))
+    assert evaluate(estimate, groundtruth).ate_m < 1e-6
+    assert evaluate(estimate, groundtruth, association="nearest").ate_m > 1e-4
+
+
+def test_poses_without_truth_are_left_out(generator: torch.Generator) -> None:
+    T_wc = _poses(generator, 30)
+    groundtruth = Trajectory(_times(20), T_wc[:20])
+    evaluation = evaluate(Trajectory(_times(30), T_wc), groundtruth)
+    assert (evaluation.posed, evaluation.compared) == (30, 20)
+    assert len(evaluation.aligned) == 30
+    assert len(evaluation.matched) == len(evaluation.groundtruth) == len(evaluation.errors_m) == 20
+
+
+def test_too_few_poses_in_common(generator: torch.Generator) -> None:
+    T_wc = _poses(generator, 10)
+    groundtruth = Trajectory(_times(10), T_wc)
+    with pytest.raises(TrajectoryError, match=r"0 of 10 .* the estimate goes from 100.000 to 100.900 s"):
+        evaluate(Trajectory(_times(10) + 100, T_wc), groundtruth)
+    with pytest.raises(TrajectoryError, match="2 of 2 estimated poses"):
+        evaluate(Trajectory(_times(2), T_wc[:2]), groundtruth)
+    with pytest.raises(TrajectoryError, match="0 of 0 estimated poses"):
+        evaluate(Trajectory(_times(0), T_wc[:0]), groundtruth)
+
+
+def test_a_path_that_stands_still_is_finite() -> None:
+    T_wc = torch.eye(4, dtype=torch.float64).expand(5, 4, 4)
+    evaluation = evaluate(Trajectory(_times(5), T_wc), Trajectory(_times(5), T_wc))
+    assert (evaluation.ate_m, evaluation.scale, evaluation.path_length_m) == (0.0, 1.0, 0.0)
+
+
+def test_as_dict_is_plain(generator: torch.Generator) -> None:
+    T_wc = _poses(generator, 10)
+    figures = evaluate(Trajectory(_times(10), T_wc), Trajectory(_times(10), T_wc)).as_dict()
+    assert {"ate_m", "ate_se3_m", "rpe", "scale", "path_length_m"} <= figures.keys()
+    assert isinstance(figures["rpe"], dict)
+    assert all(isinstance(value, int | float | dict) for value in figures.values())
+
+
+def test_errors_are_differentiable(generator: torch.Generator) -> None:
+    T_cw, truth = _poses(generator, 8), _poses(generator, 8)
+    mask = torch.tensor([True] * 6 + [False, True])
+    xi = torch.zeros(8, 6, dtype=torch.float64, requires_grad=True)
+    for with_scale in (True, False):
+        assert torch.autograd.gradcheck(
+            lambda xi, s=with_scale: ate(se3_exp(xi) @ T_cw, truth, mask, s), xi, atol=1e-6
+        )
+        assert torch.autograd.gradcheck(
+            lambda xi, s=with_scale: rpe(se3_exp(xi) @ T_cw, truth, 2, mask, s), xi, atol=1e-6
+        )
+
+
+def test_gradient_on_exact_data_is_zero(generator: torch.Generator, dtype: torch.dtype) -> None:
+    truth = _poses(generator, 8, dtype)
+    T_cw = truth.clone().requires_grad_()
+    (ate(T_cw, truth) + sum(rpe(T_cw, truth))).backward()
+    assert T_cw.grad is not None
+    assert T_cw.grad.isfinite().all()
+
+
+def test_masked_rows_do_not_matter(generator: torch.Generator) -> None:
+    T_cw, truth = _poses(generator, 9), _poses(generator, 9)
+    mask = torch.ones(9, dtype=torch.bool)
+    mask[-2:] = False
+    broken = T_cw.clone()
+    broken[-2:] = torch.nan
+    torch.testing.assert_close(ate(broken, truth, mask), ate(T_cw[:7], truth[:7]))
+    torch.testing.assert_close(rpe(broken, truth, 1, mask), rpe(T_cw[:7], truth[:7], 1))
+
+
+def test_batch_is_a_loop(generator: torch.Generator, device: torch.device, dtype: torch.dtype) -> None:
+    T_cw = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
+    truth = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
+    errors, (translation, rotation) = ate(T_cw, truth), rpe(T_cw, truth)
+    assert errors.shape == translation.shape == rotation.shape == (3,)
+    assert (errors.dtype, errors.device.type) == (dtype, device.type)
+    for row in range(3):
+        torch.testing.assert_close(errors[row], ate(T_cw[row], truth[row]))
+        torch.testing.assert_close(translation[row], rpe(T_cw[row], truth[row])[0])
+
+
+def test_delta_out_of_range(generator: torch.Generator) -> None:
+    T_cw = _poses(generator, 4)
+    for delta in (0, 4):
+        with pytest.raises(ValueError, match="delta must be between 1 and 3"):
+            rpe(T_cw, T_cw, delta=delta)
+
+
+def _evo_figures(estimate: Trajectory, groundtruth: Trajectory, interpolate: bool) -> dict[str, float]:
+    """The same figures from evo."""
+    from evo.core import metrics, sync
+    from evo.core.trajectory import PoseTrajectory3D
+
+    def convert(trajectory: Trajectory) -> PoseTrajectory3D:
+        wxyz = quaternion_from_matrix(trajectory.T_wc[:, :3, :3]).roll(1, dims=-1)
+        return PoseTrajectory3D(trajectory.positions_w.numpy(), wxyz.numpy(), trajectory.timestamps.numpy())
+
+    def rmse(metric: metrics.PE, reference: PoseTrajectory3D, other: PoseTrajectory3D) -> float:
+        metric.process_data((reference, other))
+        return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+    truth, similar = convert(groundtruth), convert(estimate)
+    if interpolate:
+        truth = truth.interpolate(similar.timestamps)
+    truth, similar = sync.associate_trajectories(truth, similar, max_diff=0.02)
+    _, rigidly = sync.associate_trajectories(truth, convert(estimate), max_diff=0.02)
+    similar.align(truth, correct_scale=True)
+    rigidly.align(truth)
+    relation = metrics.PoseRelation
+    return {
+        "ate_m": rmse(metrics.APE(relation.translation_part), truth, similar),
+        "ate_se3_m": rmse(metrics.APE(relation.translation_part), truth, rigidly),
+        "translation_m": rmse(
+            metrics.RPE(relation.translation_part, delta=2, delta_unit=metrics.Unit.frames, all_pairs=True),
+            truth,
+            similar,
+        ),
+        "rotation_deg": rmse(
+            metrics.RPE(relation.rotation_angle_deg, delta=2, delta_unit=metrics.Unit.frames, all_pairs=True),
+            truth,
+            similar,
+        ),
+    }
+
+
+def _noisy(T_wc: Tensor, generator: torch.Generator) -> Tensor:
+    """Poses with some noise, at a third of the scale, in another world."""
+    spread = torch.tensor([0.02] * 3 + [0.01] * 3, dtype=torch.float64)
+    return _moved(T_wc @ se3_exp(spread * torch.randn(len(T_wc), 6, generator=generator).double()), 1 / 3)
+
+
+@pytest.mark.parametrize("association", ["nearest", "interpolate"])
+def test_agrees_with_evo(association: str, generator: torch.Generator) -> None:
+    pytest.importorskip("evo")
+    # Smooth, since evo interpolates position and rotation apart from each other, and a geodesic couples them.
+    steps = 0.02 * torch.randn(400, 6, generator=generator, dtype=torch.float64)
+    truth = Trajectory(_times(400, rate=97.0), se3_exp(steps.cumsum(0)))
+    times = _times(40, rate=10.0) + 0.0123
+    T_wc, _ = interpolate_poses(truth, times, 0.02)
+    estimate = Trajectory(times, _noisy(T_wc, generator))
+    expected = _evo_figures(estimate, truth, association == "interpolate")
+    figures = evaluate(estimate, truth, association=association, delta=2).as_dict()
+    tolerance = 1e-9 if association == "nearest" else 1e-3
+    for name in ("ate_m", "ate_se3_m"):
+        assert figures[name] == pytest.approx(expected[name], rel=tolerance)
+    for name in ("translation_m", "rotation_deg"):
+        assert figures["rpe"][name] == pytest.approx(expected[name], rel=tolerance)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["redkitchen", "kitti07", "machine_hall", "fr2_desk_20", "shelf_bin"])
+def test_agrees_with_evo_on_real_trajectories(name: str, data_dir: Path, generator: torch.Generator) -> None:
+    pytest.importorskip("evo")
+    sequence = open_sequence(data_dir / name)
+    truth = sequence.groundtruth
+    assert truth is not None
+    T_wc, valid = interpolate_poses(truth, sequence.timestamps, 0.02)
+    assert valid.all()
+    estimate = Trajectory(sequence.timestamps, _noisy(T_wc, generator))
+    expected = _evo_figures(estimate, truth, interpolate=False)
+    evaluation = evaluate(estimate, truth, association="nearest", delta=2)
+    assert evaluation.ate_m == pytest.approx(expected["ate_m"], rel=1e-9)
+    assert evaluation.ate_se3_m == pytest.approx(expected["ate_se3_m"], rel=1e-9)
+    assert evaluation.rpe_translation_m == pytest.approx(expected["translation_m"], rel=1e-9)
+    assert evaluation.rpe_rotation_deg == pytest.approx(expected["rotation_deg"], rel=1e-6)
