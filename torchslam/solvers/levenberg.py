@@ -88,7 +88,7 @@ def minimize(
         estimate, decrease = problem.step(model, damping)
         share = decrease.detach() / model.cost.detach()
         trial = problem.evaluate(estimate, share < _NEAR)
-        accept = active & (trial.cost <= model.cost)
+        accept = active & (trial.cost < model.cost)
         steps = steps + active
         active = active & (share > tolerance)
         model = problem.select(accept, trial, model)

@@ -12,12 +12,12 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.solvers.implicit import Backward, attach, check_backward
 from torchslam.solvers.levenberg import Convergence, minimize
+from torchslam.solvers.linear import factorize
 from torchslam.solvers.prior import PosePrior, prior_expansion, prior_hessian
-from torchslam.solvers.linear import solve_definite
 from torchslam.solvers.residuals import (
     Linearization,
     Observations,
-    curvature,
+    exact_expansion,
     linearize,
     pull,
     usable,
@@ -214,15 +214,14 @@ class _PoseProblem:
         information = model.hessian
         if self.prior is not None:  # in absolute units, which the residuals do not calibrate
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
-        inverse, determined = solve_definite(information, self.eye.expand_as(information))
-        return factor * inverse, determined
+        factored = factorize(information)
+        return factor * factored.solve(self.eye.expand_as(information)), factored.definite
 
     def adjoint(self, T_cw: Tensor, grad_T_cw: Tensor, success: Tensor) -> Tensor:
         """g(T_cw, inputs) . lambda with H lambda = the loss's gradient in xi, for `implicit.attach`."""
         with torch.no_grad():
             grad_xi = torch.where(success[:, None], pull_back(T_cw, grad_T_cw), 0.0)
-            direction, _ = solve_definite(self.hessian(T_cw), grad_xi[..., None])
-            direction = direction.squeeze(-1)
+            direction = factorize(self.hessian(T_cw)).solve(grad_xi[..., None]).squeeze(-1)
         points_c = transform(T_cw, self.points_w)
         lin = linearize(self.observations, points_c)
         velocity = lin.J @ move(points_c, direction[:, None])[..., None]
@@ -234,7 +233,7 @@ class _PoseProblem:
     def hessian(self, T_cw: Tensor) -> Tensor:
         """The exact Hessian (B, 6, 6) of the cost in xi."""
         points_c = transform(T_cw, self.points_w)
-        gradient, hessian = curvature(self.observations, points_c)
+        gradient, hessian = exact_expansion(self.observations, points_c)
         G = point_jacobian(points_c)
         result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
         # The bend of the rotation itself: half of gradient . (omega x (omega x p)).

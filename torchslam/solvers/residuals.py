@@ -130,8 +130,8 @@ def pull(linearization: Linearization, J: Tensor, near: Tensor | None) -> Tensor
     return weight[..., None, None] * J + along
 
 
-class Curvature(NamedTuple):
-    """The exact second-order expansion of the cost in (points_c, camera.params).
+class Expansion(NamedTuple):
+    """The second-order expansion of the cost in points_c and, where it is free, camera.params.
 
     gradient: (..., N, D); hessian: (..., N, D, D) with D = 3, or 3 + P where the camera is free.
     """
@@ -140,7 +140,12 @@ class Curvature(NamedTuple):
     hessian: Tensor
 
 
-def curvature(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Curvature:
+def gauss_newton_expansion(lin: Linearization, near: Tensor) -> Expansion:
+    """Gradient, and Hessian without the bend of the projection; `near` as in `pull`."""
+    return Expansion((lin.J.mT @ lin.force[..., None]).squeeze(-1), lin.J.mT @ pull(lin, lin.J, near))
+
+
+def exact_expansion(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Expansion:
     """Exact gradient and Hessian of the cost per observation, with the bend of kernel and projection.
 
     The projection's own second derivative is that of J^T force with the force fixed: autograd of the analytic Jacobian.
@@ -149,7 +154,7 @@ def curvature(observations: Observations, points_c: Tensor, free_camera: bool = 
     force = lin.force[..., None]
     hessian = lin.J.mT @ pull(lin, lin.J, near=None)
     hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
-    return Curvature((lin.J.mT @ force).squeeze(-1), hessian)
+    return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
 
 
 def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_camera: bool) -> Tensor:

@@ -1,0 +1,187 @@
+"""Bundle adjustment: poses, points and, where wanted, the camera; sparse, robust, differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.solvers.bundle_model import Bundle, Estimate, Inputs, build_layout
+from torchslam.solvers.implicit import Backward, attach, check_backward
+from torchslam.solvers.levenberg import Convergence, minimize
+from torchslam.solvers.residuals import usable
+from torchslam.solvers.robust import Kernel
+from torchslam.solvers.schur import Marginals
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Who saw what where: O observations of P points by F frames.
+
+    T_cw:         (F, 4, 4) start, world to camera
+    points_w:     (P, 3) start
+    frame_index:  (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
+    pixels:       (O, 2)
+    camera:       one for all frames, params (K,)
+    weights:      (O,) inverse variances in px^-2, one if None
+    fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are and so fix the gauge: two frames, or one
+                  and a point, or more
+    fixed_points: rows of points_w, or a (P,) bool mask, likewise
+    """
+
+    T_cw: Tensor
+    points_w: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    pixels: Tensor
+    camera: Camera
+    weights: Tensor | None = None
+    fixed_frames: Tensor | Sequence[int] = (0, 1)
+    fixed_points: Tensor | Sequence[int] | None = None
+
+
+@dataclass(frozen=True)
+class BundleSolution:
+    """The minimum of a bundle adjustment.
+
+    T_cw:       (F, 4, 4); points_w: (P, 3); camera
+    cost:       () half the sum of robustified squared whitened residuals, detached
+    success:    () bool, all that moves is determined. If not, the estimate is still the best that was found, but it
+                has no gradient.
+    convergence: of the one element
+    """
+
+    T_cw: Tensor
+    points_w: Tensor
+    camera: Camera
+    cost: Tensor
+    success: Tensor
+    convergence: Convergence
+    _marginals: Callable[[], Marginals] = field(repr=False)
+
+    @cached_property
+    def _covariance(self) -> Marginals:
+        return self._marginals()
+
+    def covariance(
+        self, frames: Tensor | Sequence[int] | None = None, points: Tensor | Sequence[int] | None = None
+    ) -> Marginals:
+        """Marginal covariances, detached, of the frames and points asked for (all if None) and of the camera.
+
+        Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), camera (K, K), zero for
+        what did not move. Calibrated by the residuals, so the weights need to be right only up to a factor. Computed
+        on the first call.
+        """
+        marginals = self._covariance
+        rows = [
+            slice(None) if r is None else torch.as_tensor(r, device=self.T_cw.device)
+            for r in (frames, points)
+        ]
+        return Marginals(marginals.frames[rows[0]], marginals.points[rows[1]], marginals.camera)
+
+
+def bundle_adjust(
+    problem: BundleProblem,
+    kernel: Kernel = "huber",
+    scale: Tensor | float = 1.0,
+    free_camera: bool = False,
+    backward: Backward = "implicit",
+    iterations: int = 20,
+    tolerance: float = 1e-8,
+) -> BundleSolution:
+    """Minimise robust reprojection errors over poses, points and, if `free_camera`, the camera's parameters.
+
+    scale:    of the kernel, in units of the whitened residual: a number or a scalar tensor
+    backward: how gradients reach pixels, weights, camera.params (unless free), scale, fixed poses and fixed points, see
+              `implicit.Backward`. The gradient ends at the start values of what moves.
+    tolerance: stop where a step promises to lower the cost by less than this share of it
+
+    Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
+    positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
+    is not counts as fixed. Raises ValueError for shapes and indices that do not fit and for unknown names.
+    """
+    check_backward(backward)
+    counted, inputs = _sanitized(problem, scale)
+    free_frames = ~_as_mask(problem.fixed_frames, len(problem.T_cw), problem.T_cw.device)
+    free_points = ~_as_mask(problem.fixed_points, len(problem.points_w), problem.T_cw.device)
+    layout = build_layout(problem.frame_index, problem.point_index, counted, free_frames, free_points)
+
+    def build(tensors: Sequence[Tensor]) -> Bundle:
+        return Bundle(layout, Inputs(*tensors), problem.camera, kernel, free_camera)
+
+    with torch.set_grad_enabled(torch.is_grad_enabled() and backward == "unroll"):
+        bundle = build(inputs)
+        model, convergence = minimize(bundle, bundle.start, iterations, tolerance)
+    with torch.no_grad():
+        success = bundle.solvable[0] & model.equations.factorized().reduced.definite
+    minimum = Estimate(*(tensor.detach() for tensor in model.estimate))
+    solution = model.estimate
+
+    if backward == "implicit" and torch.is_grad_enabled():
+
+        def adjoint(gradient: Sequence[Tensor], tensors: Sequence[Tensor]) -> Tensor:
+            return build(tensors).adjoint(minimum, Estimate(*gradient))
+
+        solution = Estimate(*attach(minimum, inputs, adjoint))
+    elif backward == "truncated":
+        bundle = build(inputs)
+        model = bundle.evaluate(bundle.at_minimum(minimum), ~bundle.solvable)
+        solution, _ = bundle.step(model, torch.zeros_like(model.cost))
+
+    return BundleSolution(
+        solution.T_cw,
+        solution.points_w[layout.point_rank],
+        problem.camera.with_params(solution.params),
+        convergence.cost[0],
+        success,
+        convergence,
+        lambda: bundle.marginals(minimum),
+    )
+
+
+def _sanitized(problem: BundleProblem, scale: Tensor | float) -> tuple[Tensor, Inputs]:
+    """Which observations count, and the problem's tensors with zero, or the identity, for what is not finite."""
+    T_cw, points_w, pixels, like = problem.T_cw, problem.points_w, problem.pixels, problem.T_cw
+    if T_cw.shape[1:] != (4, 4) or points_w.shape[1:] != (3,) or pixels.shape[1:] != (2,):
+        raise ValueError(
+            "T_cw, points_w and pixels must be (F, 4, 4), (P, 3) and (O, 2), not "
+            f"{tuple(T_cw.shape)}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
+        )
+    for name, index, size in (
+        ("frame_index", problem.frame_index, len(T_cw)),
+        ("point_index", problem.point_index, len(points_w)),
+    ):
+        if index.shape != pixels.shape[:1]:
+            raise ValueError(
+                f"{name} must have one row per observation, {len(pixels)}, not {tuple(index.shape)}"
+            )
+        if len(index) and not 0 <= int(index.min()) <= int(index.max()) < size:
+            raise ValueError(f"{name} must lie in 0 ... {size - 1}")
+    weights = torch.ones_like(pixels[:, 0]) if problem.weights is None else problem.weights
+    finite_frames = torch.isfinite(T_cw).flatten(1).all(-1)
+    counted = usable(pixels, points_w[problem.point_index], weights) & finite_frames[problem.frame_index]
+    eye = torch.eye(4, dtype=like.dtype, device=like.device)
+    return counted, Inputs(
+        torch.where(finite_frames[:, None, None], T_cw, eye),
+        torch.where(torch.isfinite(points_w), points_w, 0.0),
+        torch.where(counted[:, None], pixels, 0.0),
+        torch.where(counted, weights, 0.0),
+        problem.camera.params,
+        torch.as_tensor(scale, dtype=like.dtype, device=like.device),
+    )
+
+
+def _as_mask(rows: Tensor | Sequence[int] | None, count: int, device: torch.device) -> Tensor:
+    """A bool mask (count,) of rows given as one, or as indices."""
+    rows = torch.as_tensor(() if rows is None else rows, device=device)
+    if rows.dtype == torch.bool:
+        if rows.shape != (count,):
+            raise ValueError(f"a mask of fixed rows must have shape ({count},), not {tuple(rows.shape)}")
+        return rows
+    mask = torch.zeros(count, dtype=torch.bool, device=device)
+    mask[rows.long()] = True
+    return mask

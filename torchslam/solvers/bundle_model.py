@@ -1,0 +1,219 @@
+"""The least-squares problem behind `bundle_adjust`: its layout, its local models, its adjoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.solvers.assembly import assemble
+from torchslam.solvers.residuals import (
+    Linearization,
+    Observations,
+    exact_expansion,
+    gauss_newton_expansion,
+    linearize,
+    variance_factor,
+)
+from torchslam.solvers.robust import Kernel
+from torchslam.solvers.schur import Marginals, NormalEquations, Structure, Tangent, build_structure
+from torchslam.solvers.tangent import move, pull_back, retract
+
+_MIN_POINTS_PER_FRAME = 3
+_MIN_FRAMES_PER_POINT = 2
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The discrete part of a bundle adjustment: what moves, what counts, and in which order it is processed.
+
+    observations: (O',) rows of the problem's observations that count, ordered as `Structure` asks
+    frame_index:  (O',) rows of T_cw; point_index: (O',) positions in point_order
+    point_order:  (P,) rows of points_w, ordered as `Structure` asks; point_rank: (P,) its inverse
+    free_frames:  (F',) rows of T_cw that move; free_points: (P,) bool, in point_order
+    """
+
+    observations: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    point_order: Tensor
+    point_rank: Tensor
+    free_frames: Tensor
+    free_points: Tensor
+    structure: Structure
+
+
+def build_layout(
+    frame_index: Tensor, point_index: Tensor, counted: Tensor, free_frames: Tensor, free_points: Tensor
+) -> Layout:
+    """Order the observations and decide what moves.
+
+    counted: (O,) bool, observations that count; free_frames (F,) and free_points (P,) bool: what may move. Of these,
+    points seen less than twice and frames that see less than three points do not move and are not observed.
+    """
+    num_frames, num_points = len(free_frames), len(free_points)
+    seen = torch.bincount(point_index[counted], minlength=num_points) >= _MIN_FRAMES_PER_POINT
+    counted = counted & (seen | ~free_points)[point_index]
+    seeing = torch.bincount(frame_index[counted], minlength=num_frames) >= _MIN_POINTS_PER_FRAME
+    counted = counted & (seeing | ~free_frames)[frame_index]
+    free_frames, free_points = free_frames & seeing, free_points & seen
+
+    count = int(free_frames.sum())
+    slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
+    rows = counted.nonzero().squeeze(-1)
+    rows = rows[torch.argsort(slots[frame_index[rows]], stable=True)]
+    first = torch.full((num_points,), count, device=rows.device)
+    first = first.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amin")
+    point_order = torch.argsort(first, stable=True)
+    point_rank = torch.argsort(point_order)
+    points = point_rank[point_index[rows]]
+    structure = build_structure(slots[frame_index[rows]], points, count, num_points)
+    return Layout(
+        rows,
+        frame_index[rows],
+        points,
+        point_order,
+        point_rank,
+        free_frames.nonzero().squeeze(-1),
+        free_points[point_order],
+        structure,
+    )
+
+
+class Estimate(NamedTuple):
+    """(F, 4, 4) poses, (P, 3) points in the layout's order, (K,) camera parameters."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    params: Tensor
+
+
+class Inputs(NamedTuple):
+    """All that gradients may flow to, in the order of the problem."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    pixels: Tensor
+    weights: Tensor
+    params: Tensor
+    scale: Tensor
+
+
+@dataclass(frozen=True)
+class BundleModel:
+    """The local model of the cost (1,) at an estimate."""
+
+    estimate: Estimate
+    cost: Tensor
+    equations: NormalEquations
+
+
+class Bundle:
+    """A bundle adjustment for `levenberg.minimize` (a batch of one), and what follows from its minimum."""
+
+    def __init__(
+        self, layout: Layout, inputs: Inputs, camera: Camera, kernel: Kernel, free_camera: bool
+    ) -> None:
+        self.layout, self.free_camera = layout, free_camera
+        self.observations = Observations(
+            inputs.pixels.index_select(0, layout.observations),
+            inputs.weights.index_select(0, layout.observations),
+            camera.with_params(inputs.params),
+            kernel,
+            inputs.scale,
+        )
+        self.start = Estimate(inputs.T_cw, inputs.points_w.index_select(0, layout.point_order), inputs.params)
+        self.solvable = torch.tensor([len(layout.observations) > 0], device=inputs.pixels.device)
+
+    def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
+        lin, points_c, R_cw = self._linearize(estimate)
+        expansion = gauss_newton_expansion(lin, near)
+        layout = self.layout
+        equations = assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=False)
+        return BundleModel(estimate, lin.cost.sum()[None], equations)
+
+    def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
+        equations, estimate = model.equations, model.estimate
+        factorized = equations.factorized(damping)
+        step = factorized.solve(equations.gradient)
+        decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
+        frames = self.layout.free_frames
+        moved = retract(estimate.T_cw.index_select(0, frames), -step.frames)
+        params = estimate.params - step.camera if self.free_camera else estimate.params
+        return (
+            Estimate(estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params),
+            decrease[None],
+        )
+
+    def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
+        return new if bool(accept) else old
+
+    def marginals(self, estimate: Estimate) -> Marginals:
+        """Covariances (F, 6, 6), (P, 3, 3), (K, K) in the order of the problem, zero for what does not move."""
+        lin, _, _ = self._linearize(estimate)
+        model = self.evaluate(estimate, torch.zeros_like(self.solvable))
+        layout, structure = self.layout, self.layout.structure
+        num_parameters = (
+            6 * structure.num_frames + 3 * int(layout.free_points.sum()) + len(model.equations.camera)
+        )
+        factor = variance_factor(self.observations, lin, num_parameters)
+        free, points, camera = model.equations.factorized().marginals()
+        frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
+        return Marginals(factor * frames, factor * points[layout.point_rank], factor * camera)
+
+    def adjoint(self, minimum: Estimate, gradient: Estimate) -> Tensor:
+        """g(minimum, inputs) . lambda with H lambda = gradient of the loss in the unknowns, for `implicit.attach`."""
+        layout = self.layout
+        with torch.no_grad():
+            direction = self._exact_equations(minimum).factorized().solve(self._tangent(minimum, gradient))
+        at = self.at_minimum(minimum)
+        lin, points_c, R_cw = self._linearize(at)
+        motion = direction.frames.new_zeros(len(at.T_cw), 6).index_copy(
+            0, layout.free_frames, direction.frames
+        )
+        velocity = move(points_c, motion[layout.frame_index])
+        velocity = velocity + (R_cw @ direction.points[layout.point_index][..., None]).squeeze(-1)
+        velocity = torch.cat((velocity, direction.camera.expand(len(velocity), -1)), dim=-1)
+        return (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
+
+    def _linearize(self, estimate: Estimate) -> tuple[Linearization, Tensor, Tensor]:
+        """Errors, points in the camera frame (O', 3) and rotations (O', 3, 3) of the observing frames."""
+        T_cw = estimate.T_cw.index_select(0, self.layout.frame_index)
+        points_w = estimate.points_w.index_select(0, self.layout.point_index)
+        R_cw = T_cw[:, :3, :3]
+        points_c = (R_cw @ points_w[..., None]).squeeze(-1) + T_cw[:, :3, 3]
+        return linearize(self._observations(estimate), points_c, self.free_camera), points_c, R_cw
+
+    def _observations(self, estimate: Estimate) -> Observations:
+        if not self.free_camera:
+            return self.observations
+        pixels, weights, _, scale = self.observations.tensors()
+        return self.observations.replaced((pixels, weights, estimate.params, scale))
+
+    def _exact_equations(self, estimate: Estimate) -> NormalEquations:
+        _, points_c, R_cw = self._linearize(estimate)
+        expansion = exact_expansion(self._observations(estimate), points_c, self.free_camera)
+        layout = self.layout
+        return assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
+
+    def _tangent(self, estimate: Estimate, gradient: Estimate) -> Tangent:
+        """The gradient of a loss in the unknowns, from its gradient in poses, points and parameters."""
+        frames = self.layout.free_frames
+        return Tangent(
+            pull_back(estimate.T_cw[frames], gradient.T_cw[frames]),
+            gradient.points_w,
+            gradient.params if self.free_camera else gradient.params[:0],
+        )
+
+    def at_minimum(self, minimum: Estimate) -> Estimate:
+        """The minimum where things move, the inputs, with their graph, where they are fixed."""
+        frames = torch.zeros(len(minimum.T_cw), dtype=torch.bool, device=minimum.T_cw.device)
+        frames[self.layout.free_frames] = True
+        return Estimate(
+            torch.where(frames[:, None, None], minimum.T_cw, self.start.T_cw),
+            torch.where(self.layout.free_points[:, None], minimum.points_w, self.start.points_w),
+            minimum.params if self.free_camera else self.start.params,
+        )
