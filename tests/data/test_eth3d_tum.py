@@ -111,6 +111,15 @@ def test_image_of_another_size(tum_folder: Folder, write_picture: Callable) -> N
         open_sequence(folder)[4]
 
 
+def test_first_image_is_the_odd_one(tum_folder: Folder, write_picture: Callable) -> None:
+    folder = tum_folder()
+    write_picture(folder / "rgb" / "0.png", size=(32, 48))
+    sequence = open_sequence(folder)
+    assert sequence.size == (64, 48)
+    with pytest.raises(FrameError, match=r"rgb\.txt:3: .*0\.png is 32x48, the others are 64x48"):
+        sequence[0]
+
+
 def test_no_readable_image_at_all(tum_folder: Folder) -> None:
     folder = tum_folder()
     for image in (folder / "rgb").iterdir():
@@ -145,10 +154,10 @@ def test_bad_line_of_the_list(tum_folder: Folder, line: str, message: str) -> No
         open_sequence(folder)
 
 
-def test_paths_with_spaces(tum_folder: Folder, write_picture: Callable) -> None:
+def test_names_with_spaces_and_hashes(tum_folder: Folder, write_picture: Callable) -> None:
     folder = tum_folder()
-    image = write_picture(folder / "my images" / "a b.png", 7)
-    (folder / "rgb.txt").write_text("1.0 my images/a b.png\n")
+    image = write_picture(folder / "my images" / "a b#1.png", 7)
+    (folder / "rgb.txt").write_text("1.0 my images/a b#1.png # a comment\n")
     assert torch.equal(open_sequence(folder)[0].image[0, 0], torch.from_numpy(image).float() / 255)
 
 

@@ -15,7 +15,7 @@ def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
     timestamps (N,) and reference (M,), M >= 1, sorted, in seconds -> indices (N,) into `reference` and
     distances (N,) seconds. Of two that are equally near the earlier one is taken.
     """
-    right = torch.searchsorted(reference, timestamps).clamp(max=len(reference) - 1)
+    right = _next(timestamps, reference)
     left = (right - 1).clamp(min=0)
     to_left, to_right = (timestamps - reference[left]).abs(), (timestamps - reference[right]).abs()
     return torch.where(to_left <= to_right, left, right), torch.minimum(to_left, to_right)
@@ -29,7 +29,7 @@ def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: flo
     """
     times = trajectory.timestamps
     _, distances = nearest(timestamps, times)
-    right = torch.searchsorted(times, timestamps).clamp(max=len(times) - 1)
+    right = _next(timestamps, times)
     left = (right - 1).clamp(min=0)
     interval = times[right] - times[left]
     fraction = ((timestamps - times[left]) / torch.where(interval > 0, interval, 1.0)).clamp(0, 1)
@@ -37,3 +37,8 @@ def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: flo
     # At a pose's own time and beyond the ends it is taken as it is, without the rounding of log and exp.
     exact = ((fraction >= 1) | (interval == 0))[:, None, None]
     return torch.where(exact, trajectory.T_wc[right], T_wc), distances <= tolerance
+
+
+def _next(timestamps: Tensor, reference: Tensor) -> Tensor:
+    """(N,) the first reference time that is not before each timestamp, the last one where all are."""
+    return torch.searchsorted(reference.contiguous(), timestamps.contiguous()).clamp(max=len(reference) - 1)

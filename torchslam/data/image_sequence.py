@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Sequence as Listed
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
 
 ATTEMPTS = 20
-"""Images tried for the size of a sequence before it is given up."""
+"""Unreadable images after which a sequence is given up."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +79,18 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
 
 
 def _find_size(entries: Listed[ImageEntry]) -> tuple[int, int]:
-    """(width, height) of the first image that can be read."""
-    failures = []
-    for entry in entries[:ATTEMPTS]:
+    """(width, height) that most of the first three readable images have: the first may be the odd one."""
+    sizes: list[tuple[int, int]] = []
+    failures: list[FrameError] = []
+    for entry in entries:
         try:
             image = read_grey(entry.path, entry.where)
         except FrameError as failure:
-            failures.append(str(failure))
+            failures.append(failure)
         else:
-            return image.shape[-1], image.shape[-2]
-    raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
+            sizes.append((image.shape[-1], image.shape[-2]))
+        if len(sizes) == 3 or len(failures) == ATTEMPTS:
+            break
+    if not sizes:
+        raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
+    return Counter(sizes).most_common(1)[0][0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torchslam.errors import TorchslamError
 
 
 def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
-    """The lines of a file that say something, with their numbers from 1; `#` starts a comment.
+    """The lines of a file that say something, with their numbers from 1; `#` after a space starts a comment.
 
     Raises `error` where the file does not exist or is not text.
     """
@@ -19,7 +20,7 @@ def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tu
     except (OSError, UnicodeDecodeError) as cause:
         raise error(f"{path}: cannot be read: {cause}") from cause
     for number, line in enumerate(text.splitlines(), start=1):
-        content = line.split("#", 1)[0].strip()
+        content = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
         if content:
             yield number, content
 
