@@ -12,7 +12,10 @@ FINEST = 0.02
 COVERAGE = 0.25
 """The part of a surface that the largest shapes cover."""
 KINDS = ("polygon", "bar", "ellipse", "letter")
+MIN_CONTRAST = 30
+"""Grey levels between a shape and what is below its centre."""
 FRACTION_BITS = 4
+"""Of the coordinates of polygons, so that their corners lie off the pixel grid."""
 
 
 def surface(rng: np.random.Generator, size: tuple[float, float], texel: float, multiple: int) -> np.ndarray:
@@ -57,23 +60,10 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     jitters = rng.uniform(-0.35, 0.35, (count, 6))
     for i in range(count):
         x, y = centres[i]
-        below = int(image[int(y), int(x)])
-        grey = int(np.clip(below + contrasts[i], 0, 255))
-        if abs(grey - below) < 30:
-            grey = int(np.clip(below - contrasts[i], 0, 255))
+        grey = _standing_out(int(image[int(y), int(x)]), contrasts[i])
         kind, radius = KINDS[kinds[i]], radii[i]
         if kind == "letter":
-            thickness = max(1, round(radius / 4))
-            cv2.putText(
-                image,
-                chr(letters[i]),
-                (int(x - 0.6 * radius), int(y + 0.7 * radius)),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                radius / 14,
-                grey,
-                thickness,
-                cv2.LINE_AA,
-            )
+            _draw_letter(image, chr(letters[i]), (x, y), radius, grey)
         elif kind == "ellipse":
             axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
             cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), grey, -1, cv2.LINE_AA)
@@ -84,10 +74,24 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
             _fill(image, outline, turns[i], (x, y), grey)
 
 
+def _standing_out(below: int, contrast: float) -> int:
+    """A grey level apart from what is below: lighter or darker, the other way where that would be cut off."""
+    grey = int(np.clip(below + contrast, 0, 255))
+    return grey if abs(grey - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
+
+
+def _draw_letter(
+    image: np.ndarray, letter: str, centre: tuple[float, float], radius: float, grey: int
+) -> None:
+    corner = (int(centre[0] - 0.6 * radius), int(centre[1] + 0.7 * radius))
+    thickness = max(1, round(radius / 4))
+    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, grey, thickness, cv2.LINE_AA)
+
+
 def _fill(
     image: np.ndarray, outline: np.ndarray, turn: float, centre: tuple[float, float], grey: int
 ) -> None:
-    """Fill a polygon, turned about its centre, with its corners off the pixel grid."""
+    """Fill a polygon, turned about its centre."""
     cosine, sine = math.cos(turn), math.sin(turn)
     points = outline @ np.array(((cosine, sine), (-sine, cosine))) + centre
     fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
