@@ -52,6 +52,13 @@ def test_damaged_png(tmp_path: Path, write_picture: Callable) -> None:
         read_grey(path, "here")
 
 
+def test_header_that_promises_too_much(tmp_path: Path) -> None:
+    path = tmp_path / "image.pgm"
+    path.write_bytes(b"P5\n3000000 3000000\n255\n" + bytes(100))
+    with pytest.raises(FrameError, match="not an image"):
+        read_grey(path, "here")
+
+
 def test_colour_becomes_grey_in_unit_range(tmp_path: Path, write_picture: Callable) -> None:
     write_picture(tmp_path / "image.png")
     image = read_grey(tmp_path / "image.png", "here")

@@ -25,7 +25,7 @@ def read_grey(path: str | Path, where: str) -> Tensor:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
-    grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    grey = _decode(data)
     if grey is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
     return grey_to_tensor(grey)
@@ -34,6 +34,16 @@ def read_grey(path: str | Path, where: str) -> Tensor:
 def grey_to_tensor(grey: np.ndarray) -> Tensor:
     """(H, W) uint8 -> (1, 1, H, W) float32 in [0, 1]."""
     return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
+
+
+def _decode(data: bytes) -> np.ndarray | None:
+    """(H, W) uint8 grey; None for anything that is not a whole image."""
+    if not data:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # a header that promises more pixels than OpenCV takes
+        return None
 
 
 def _is_truncated(data: bytes) -> bool:

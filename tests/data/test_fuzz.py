@@ -1,0 +1,58 @@
+"""Whatever a file holds, a reader returns something valid or raises its own error."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import hypothesis.strategies as st
+from hypothesis import HealthCheck, given, settings
+
+from torchslam.data import parse_camera, read_trajectory
+from torchslam.data.eth3d_tum import read_image_list
+from torchslam.data.image_file import read_grey
+from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
+
+WORDS = st.one_of(
+    st.floats(width=32).map(str),
+    st.integers(-3, 3).map(str),
+    st.text("ab#,.-e1\t", max_size=4),
+    st.just("fisheye"),
+)
+LINES = st.lists(WORDS, max_size=10).map(" ".join)
+FILES = st.lists(LINES, max_size=5).map("\n".join)
+SAME_FOLDER = settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@given(FILES)
+@SAME_FOLDER
+def test_trajectories(tmp_path: Path, text: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    with contextlib.suppress(TrajectoryError):
+        trajectory = read_trajectory(tmp_path / "t.txt")
+        assert trajectory.T_wc.isfinite().all()
+        assert (trajectory.timestamps.diff() > 0).all()
+
+
+@given(FILES)
+@SAME_FOLDER
+def test_image_lists(tmp_path: Path, text: str) -> None:
+    (tmp_path / "rgb.txt").write_text(text)
+    with contextlib.suppress(SequenceError):
+        assert read_image_list(tmp_path / "rgb.txt")
+
+
+@given(LINES)
+def test_calibrations(text: str) -> None:
+    with contextlib.suppress(CalibrationError):
+        camera = parse_camera(text).camera((64, 48))
+        assert camera.params.isfinite().all()
+        assert (camera.params[:2] > 0).all()
+
+
+@given(st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM"]), st.binary(max_size=200))
+@SAME_FOLDER
+def test_images(tmp_path: Path, start: bytes, rest: bytes) -> None:
+    (tmp_path / "image").write_bytes(start + rest)
+    with contextlib.suppress(FrameError):
+        assert read_grey(tmp_path / "image", "here").shape[:2] == (1, 1)
