@@ -52,7 +52,7 @@ class InitializationConfig:
     max_depth_std: float = (
         0.1  # uncertainty: a point counts when its relative depth is known better than this
     )
-    min_good_share: float = 0.4  # ... and this share of the matches must count
+    min_good_share: float = 0.15  # ... and this share of the matches must count
     min_parallax_deg: float = 3.0  # parallax: a point counts from this angle on
     min_mean_parallax_deg: float = 5.0
     max_reference_age: int = 60  # frames; an older reference is replaced

@@ -58,8 +58,6 @@ def adjust_keyframes(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera,
         fixed_frames=torch.isin(keyframes, fixed),
     )
     solution = bundle_adjust(problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached")
-    if not bool(solution.success):
-        return
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w
     drop_outliers(slam_map, seen, camera)

@@ -77,6 +77,7 @@ def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupte
     has_map = slam.map.num_keyframes > 0
     if has_map and slam.config.bundle.enabled and slam.config.bundle.final:
         adjust_all(slam.map, slam.camera, slam.config.bundle)
+        slam.history.repose(slam.map, slam.camera)
     return Run(
         slam.trajectory(),
         keyframe_trajectory(slam.map),
