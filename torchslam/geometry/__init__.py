@@ -3,6 +3,18 @@
 from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.essential import (
+    decompose_essential,
+    essential_from_pose,
+    five_point,
+    sampson_errors,
+)
+from torchslam.geometry.homography import (
+    decompose_homography,
+    homography_from_matches,
+    rotation_from_matches,
+    transfer_errors,
+)
 from torchslam.geometry.lie import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -25,6 +37,7 @@ from torchslam.geometry.lie import (
     vee,
 )
 from torchslam.geometry.p3p import p3p
+from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -37,13 +50,22 @@ __all__ = [
     "AbsolutePose",
     "Camera",
     "MultiViewTriangulation",
+    "RelativePose",
     "Triangulation",
     "correct_matches",
+    "decompose_essential",
+    "decompose_homography",
+    "essential_from_pose",
     "estimate_absolute_pose",
+    "estimate_relative_pose",
+    "five_point",
+    "homography_from_matches",
     "matrix_from_quaternion",
     "p3p",
     "quaternion_from_matrix",
     "rigid",
+    "rotation_from_matches",
+    "sampson_errors",
     "se3_adjoint",
     "se3_exp",
     "se3_interpolate",
@@ -58,6 +80,7 @@ __all__ = [
     "so3_exp",
     "so3_left_jacobian",
     "so3_log",
+    "transfer_errors",
     "transform",
     "triangulate",
     "triangulate_many",

@@ -111,3 +111,18 @@ def valid_first(valid: Tensor) -> Tensor:
     """Row numbers with the valid rows first, cut to the largest count in the batch. (B, M) -> (B, M')."""
     count = max(1, int(valid.sum(-1).max()))
     return valid.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, :count]
+
+
+def pad_groups(values: Tensor, group: Tensor, groups: int, least: int) -> tuple[Tensor, Tensor]:
+    """Values in ascending order of their group, as rows of a padded tensor with a mask.
+
+    values: (R, D); group: (R,) ascending. Returns (groups, M, D), zero where padded, and (groups, M), with M the
+    size of the largest group, but at least `least`.
+    """
+    counts = torch.bincount(group, minlength=groups)
+    size = max(least, int(counts.max()))
+    start = counts.cumsum(0) - counts
+    slot = group * size + torch.arange(len(group), device=group.device) - start[group]
+    padded = values.new_zeros(groups * size, values.shape[-1]).index_copy(0, slot, values)
+    valid = torch.arange(size, device=group.device) < counts[:, None]
+    return padded.unflatten(0, (groups, size)), valid

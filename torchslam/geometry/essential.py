@@ -1,0 +1,225 @@
+"""Essential matrices: from five matches, into rotation and direction, and their errors.
+
+x_2^T E x_1 = 0 for matches x_1, x_2 in undistorted image coordinates; E = [t]x R for points_2 = R points_1 + t.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.lie import skew
+
+# The unknowns are x, y, z in E = x E_0 + y E_1 + z E_2 + E_3. The monomials by their powers of x, y, z: first those
+# that are eliminated, then x, y and 1 times powers of z (Nister, 2004, table 1).
+_ELIMINATED = ("xxx", "yyy", "xxy", "xyy", "xxz", "xx", "yyz", "yy", "xyz", "xy")
+_KEPT = ("x", "xz", "xzz", "y", "yz", "yzz", "", "z", "zz", "zzz")
+# Columns of x_2 x_1^T to solve for; the other four span the null space. Independent also for small motions.
+_SOLVED, _FREE = (0, 1, 2, 4, 5), (3, 6, 7, 8)
+_GRID = 256  # intervals in which to look for sign changes
+_NEWTON_STEPS = 5
+
+
+def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
+    """Essential matrices of samples of five matches, with the sample that each belongs to.
+
+    x_1, x_2: (S, 5, 2) undistorted image coordinates. Returns E (R, 3, 3) of norm sqrt(2) for the R real solutions
+    of all samples together, up to ten each, and sample (R,) in ascending order. Solutions closer together than
+    1.4 degrees of the last unknown's angle can be missed; degenerate samples may give none or wrong ones. Not
+    differentiable by design: it makes hypotheses.
+    Source: Nister, "An efficient solution to the five-point relative pose problem", 2004.
+    """
+    with torch.no_grad():
+        basis = _null_space(x_1, x_2)
+        B = _elimination(_constraints(basis))
+        z, sample = _real_roots(_determinant(B))
+        # B(z) [x, y, 1]^T = 0: the null vector is the largest cross product of two rows.
+        powers = torch.stack((torch.ones_like(z), z, z * z, z * z * z, z * z * z * z), dim=-1)
+        rows = (B[sample] @ powers[:, None, :, None]).squeeze(-1)
+        rows = rows / rows.norm(dim=-1, keepdim=True)
+        normals = torch.linalg.cross(rows, rows.roll(1, dims=-2), dim=-1)
+        largest = (normals * normals).sum(-1).argmax(-1)
+        x, y, w = normals.gather(1, largest[:, None, None].expand(-1, 1, 3)).squeeze(1).unbind(-1)
+        E = (torch.stack((x, y, z * w, w), dim=-1)[:, None] @ basis[sample]).squeeze(1)
+        E = E * (math.sqrt(2) / E.norm(dim=-1, keepdim=True))
+        good = torch.isfinite(E).all(-1)
+    return E[good].unflatten(-1, (3, 3)), sample[good]
+
+
+def _null_space(x_1: Tensor, x_2: Tensor) -> Tensor:
+    """Four orthonormal solutions of the five epipolar equations. (S, 5, 2) twice -> (S, 4, 9)."""
+    equations = _outer(x_2, x_1)
+    solved = torch.linalg.solve_ex(equations[..., _SOLVED], -equations[..., _FREE])[0].nan_to_num()
+    basis = solved.new_zeros(len(solved), 4, 9)
+    basis[..., _SOLVED] = solved.mT
+    basis[..., range(4), _FREE] = 1.0
+    rows: list[Tensor] = []
+    for i in range(4):  # Gram-Schmidt
+        row = basis[:, i : i + 1]
+        for other in rows:
+            row = row - (row @ other.mT) * other
+        rows.append(row / row.norm(dim=-1, keepdim=True))
+    return torch.cat(rows, dim=1)
+
+
+def _outer(x_2: Tensor, x_1: Tensor) -> Tensor:
+    """The nine coefficients of the epipolar equation. (..., 2) twice -> (..., 9)."""
+    one = torch.ones_like(x_1[..., :1])
+    x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
+    return (x_2[..., :, None] * x_1[..., None, :]).flatten(-2)
+
+
+@lru_cache(maxsize=16)
+def _monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(64, 20) which monomial each product of three unknowns (x, y, z or 1) belongs to."""
+    names = ["".join(sorted(product)).strip() for product in itertools.product("xyz ", repeat=3)]
+    columns = _ELIMINATED + _KEPT
+    return torch.tensor(
+        [[name == column for column in columns] for name in names], dtype=dtype, device=device
+    )
+
+
+def _constraints(basis: Tensor) -> Tensor:
+    """Ten cubic equations: 2 E E^T E = tr(E E^T) E and det E = 0. (S, 4, 9) -> (S, 10, 20)."""
+    S = len(basis)
+    E = basis.unflatten(-1, (3, 3))
+    stacked = E.flatten(1, 2)  # (S, 4 * 3, 3)
+    gram = (stacked @ stacked.mT).unflatten(1, (4, 3)).unflatten(3, (4, 3)).transpose(2, 3)  # E_i E_j^T
+    trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+    cubic = 2 * (gram.reshape(S, 48, 3) @ E.transpose(1, 2).flatten(2)).unflatten(1, (16, 3)).unflatten(
+        3, (4, 3)
+    )
+    cubic = cubic.transpose(2, 3) - trace.reshape(S, 16, 1, 1, 1) * E[:, None]  # (S, ij, k, 3, 3)
+    normals = torch.linalg.cross(E[:, :, None, 1], E[:, None, :, 2].expand(S, 4, 4, 3), dim=-1)
+    determinant = normals.flatten(1, 2) @ E[:, :, 0].mT
+    products = torch.cat((cubic.reshape(S, 64, 9), determinant.reshape(S, 64, 1)), dim=-1)
+    return products.mT @ _monomials(basis.dtype, basis.device)
+
+
+def _elimination(constraints: Tensor) -> Tensor:
+    """Three equations in x, y, 1 with polynomials in z. (S, 10, 20) -> (S, 3, 3, 5), lowest power first."""
+    reduced = torch.linalg.solve_ex(constraints[..., :10], constraints[..., 10:])[0]
+    # rows 4 to 9 are x^2 z, x^2, y^2 z, y^2, xyz, xy; each first minus z times the second cancels
+    x, y, one = reduced[:, 4:, :3], reduced[:, 4:, 3:6], reduced[:, 4:, 6:]
+    zero = torch.zeros_like(x[..., :1])
+    padded = torch.stack(
+        (
+            torch.cat((zero, x, zero, zero), -1),
+            torch.cat((zero, y, zero, zero), -1),
+            torch.cat((zero, one, zero), -1),
+        ),
+        dim=2,
+    )
+    return padded[:, 0::2, :, 1:] - padded[:, 1::2, :, :-1]
+
+
+@lru_cache(maxsize=16)
+def _product_table(degree_a: int, degree_b: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """((a + 1)(b + 1), a + b + 1) which power each product of two coefficients belongs to."""
+    power = torch.arange(degree_a + 1)[:, None] + torch.arange(degree_b + 1)
+    return torch.nn.functional.one_hot(power.flatten()).to(dtype=dtype, device=device)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Products of polynomials. (..., A), (..., B) -> (..., A + B - 1)."""
+    table = _product_table(a.shape[-1] - 1, b.shape[-1] - 1, a.dtype, a.device)
+    return (a[..., :, None] * b[..., None, :]).flatten(-2) @ table
+
+
+def _determinant(B: Tensor) -> Tensor:
+    """The determinant, a polynomial of degree ten. (S, 3, 3, 5) -> (S, 11), lowest power first."""
+    x, y, one = B[:, :, 0, :4], B[:, :, 1, :4], B[:, :, 2]
+    minors = _product(y.roll(-1, 1), one.roll(-2, 1)) - _product(y.roll(-2, 1), one.roll(-1, 1))
+    return _product(minors, x).sum(1)
+
+
+@lru_cache(maxsize=16)
+def _angle_grid(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Angles from -90 to 90 degrees, and (11, angles) sin^k cos^(10 - k) there."""
+    angle = torch.linspace(-math.pi / 2, math.pi / 2, _GRID + 1, dtype=dtype, device=device)
+    k = torch.arange(11, dtype=dtype, device=device)[:, None]
+    return angle, angle.sin() ** k * angle.cos().clamp_min(0.0) ** (10 - k)
+
+
+def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
+    """Real roots of polynomials of degree ten, with the row of each. (S, 11) -> (R,), (R,).
+
+    With z = tan(angle) all of them lie in a bounded interval; sign changes on a grid bracket them, Newton's method
+    with bisection finishes.
+    """
+    angle, table = _angle_grid(polynomial.dtype, polynomial.device)
+    negative = torch.signbit(polynomial @ table)
+    row, cell = (negative[:, 1:] != negative[:, :-1]).nonzero().unbind(-1)
+    # Beyond 45 degrees in terms of 1/z, whose polynomial has the coefficients in reverse.
+    inverse = (cell < _GRID // 4) | (cell >= 3 * _GRID // 4)
+    chosen = polynomial[row]
+    coefficients = torch.where(inverse[:, None], chosen.flip(-1), chosen).unbind(-1)
+
+    def ends(angle: Tensor) -> Tensor:
+        return torch.where(inverse, angle.cos() / angle.sin(), angle.tan())
+
+    low, high = ends(angle[cell]), ends(angle[cell + 1])
+    sign = torch.where(negative[row, cell], -1.0, 1.0)
+    z = 0.5 * (low + high)
+    for _ in range(_NEWTON_STEPS):
+        value, slope = torch.addcmul(coefficients[9], coefficients[10], z), coefficients[10]
+        for k in range(8, -1, -1):
+            slope = torch.addcmul(value, slope, z)
+            value = torch.addcmul(coefficients[k], value, z)
+        same = value * sign > 0
+        low, high = torch.where(same, z, low), torch.where(same, high, z)
+        step = z - value / slope
+        inside = (step - low) * (step - high) <= 0
+        z = torch.where(inside, step, 0.5 * (low + high))
+    return torch.where(inverse, 1 / z, z), row
+
+
+def essential_from_pose(R_21: Tensor, t_21: Tensor) -> Tensor:
+    """E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
+    return skew(t_21) @ R_21
+
+
+def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
+    """The two rotations and the direction, up to sign, of essential matrices of any scale.
+
+    E: (..., 3, 3). Returns R (..., 2, 3, 3) and t (..., 3) of unit length: the poses are (R_i, t) and (R_i, -t).
+    Without a singular value decomposition, so the gradient is right at the equal singular values.
+    Source: Horn, "Recovering baseline and orientation from essential matrix", 1990.
+    """
+    gram = E @ E.mT
+    half_trace = 0.5 * gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+    outer = half_trace[..., None, None] * torch.eye(3, dtype=E.dtype, device=E.device) - gram  # t t^T
+    diagonal = outer.diagonal(dim1=-2, dim2=-1)
+    largest = diagonal.detach().argmax(-1, keepdim=True)
+    pivot = diagonal.gather(-1, largest).clamp_min(torch.finfo(E.dtype).tiny)
+    t = outer.gather(-1, largest[..., None].expand(*outer.shape[:-1], 1)).squeeze(-1) * pivot.rsqrt()
+    cofactors = torch.linalg.cross(E.roll(-1, -2), E.roll(-2, -2), dim=-1)
+    twist = skew(t) @ E
+    R = torch.stack((cofactors - twist, cofactors + twist), dim=-3)
+    size = (t * t).sum(-1).clamp_min(torch.finfo(E.dtype).tiny)
+    return R / size[..., None, None, None], t * size[..., None].rsqrt()
+
+
+def sampson_errors(
+    E: Tensor,
+    x_1: Tensor,
+    x_2: Tensor,
+    variance_1: Tensor | float = 1.0,
+    variance_2: Tensor | float = 1.0,
+) -> Tensor:
+    """Signed Sampson distances to the epipolar constraint, zero at both epipoles.
+
+    E: (..., 3, 3); x_1, x_2: (..., N, 2); variance_1, variance_2: (..., N) of the coordinates in each image, one by
+    default. Returns (..., N): the first-order distance over both images together, in standard deviations.
+    Source: Hartley and Zisserman, "Multiple view geometry", 2004, eq. 11.9.
+    """
+    one = torch.ones_like(x_1[..., :1])
+    x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
+    line_2, line_1 = x_1 @ E.mT, x_2 @ E
+    squared = line_2[..., :2].square().sum(-1) * variance_2 + line_1[..., :2].square().sum(-1) * variance_1
+    regular = squared > torch.finfo(squared.dtype).tiny
+    return torch.where(regular, (x_2 * line_2).sum(-1) * torch.where(regular, squared, 1.0).rsqrt(), 0.0)
