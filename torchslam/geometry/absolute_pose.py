@@ -15,11 +15,12 @@ from torchslam.geometry.least_squares import State, minimize, retract_pose
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.ransac import (
+    SUPPORT_WIDTH,
     gather_rows,
     is_significant,
     sample_minimal,
+    score_projections,
     search,
-    truncated_score,
     valid_first,
 )
 
@@ -75,7 +76,7 @@ def estimate_absolute_pose(
     with torch.no_grad():
         generator = torch.Generator().manual_seed(seed)
         problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
-        (R, t), _ = search(
+        R, t = search(
             lambda rows, count: problem.select(rows).propose(count, generator),
             mask.sum(-1),
             3,
@@ -100,7 +101,7 @@ class _Problem:
     """The data of the search. Points are relative to their mean, so that float32 is enough for scores.
 
     points, pixels, mask, rays: (B, N, ...); camera; threshold in pixels; centre: (B, 3) mean of the points
-    homogeneous: (B, 4, N), normalized: (B, 2, 1, N), scale: (B, 1, N) thresholds per unit of them; float32
+    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N) thresholds per unit of them; float32
     """
 
     points: Tensor
@@ -134,8 +135,8 @@ class _Problem:
             centre,
             rays,
             torch.cat((points, ones), dim=-1).mT.float(),
-            normalized.mT[:, :, None].float(),
-            (camera.pixel_scale(normalized) / threshold)[:, None].float(),
+            normalized.float(),
+            (camera.pixel_scale(normalized) / threshold).float(),
         )
 
     def select(self, rows: Tensor) -> _Problem:
@@ -146,8 +147,8 @@ class _Problem:
         chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
         return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
 
-    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor]:
-        """The best pose from `count` minimal samples, locally optimised, and its score."""
+    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
+        """The best pose from `count` minimal samples, locally optimised, its score and its support."""
         sample = sample_minimal(self.mask, 3, count, generator)
         R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
@@ -160,18 +161,12 @@ class _Problem:
         state, cost = minimize((P[..., :3], P[..., 3]), self.evaluate, retract_pose, _LOCAL_ITERATIONS)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         R, t = (gather_rows(x.flatten(2), best[:, None]).squeeze(1).unflatten(-1, x.shape[2:]) for x in state)
-        return (R, t), self.mask.sum(-1) - cost
+        near = (self.squared_errors(R, t) < SUPPORT_WIDTH**2) & self.mask
+        return (R, t), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Tensor) -> Tensor:
         """Truncated scores of many poses, in float32. (B, M, 3, 4) -> (B, M)."""
-        M = P.shape[1]
-        x, y, z = (P.transpose(1, 2).flatten(1, 2).float() @ self.homogeneous).unflatten(1, (3, M)).unbind(1)
-        dx = torch.addcmul(x, self.normalized[:, 0], z, value=-1)
-        dy = torch.addcmul(y, self.normalized[:, 1], z, value=-1)
-        # Behind the camera the denominator vanishes and the error becomes huge.
-        scale = self.scale / z.clamp_min_(1e-6)
-        squared = dx.square_().addcmul_(dy, dy).mul_(scale.square_())
-        return truncated_score(squared, self.mask.float())
+        return score_projections(P.float(), self.homogeneous, self.normalized, self.scale, self.mask)
 
     def evaluate(self, R: Tensor, t: Tensor, width: float = 1.0) -> tuple[Tensor, Tensor]:
         """Normal equations and truncated cost of (B, K) poses, in thresholds."""

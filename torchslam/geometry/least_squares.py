@@ -15,7 +15,7 @@ def minimize(
     evaluate: Callable[..., tuple[Tensor, Tensor]],
     retract: Callable[[State, Tensor], State],
     iterations: int,
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-8,
 ) -> tuple[State, Tensor]:
     """Minimises many small problems at once, each with its own damping.
 

@@ -10,6 +10,10 @@ from torch import Tensor
 
 from torchslam.geometry.least_squares import State
 
+# Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
+SUPPORT_WIDTH = 2.0
+_SAMPLES_AT_ONCE = 1024
+
 
 def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
     """Random minimal samples without repeated rows, from the rows inside the mask.
@@ -45,46 +49,63 @@ def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
     return values.gather(1, flat).unflatten(1, indices.shape[1:])
 
 
-def truncated_score(squared: Tensor, weights: Tensor) -> Tensor:
+def truncated_score(squared: Tensor, mask: Tensor) -> Tensor:
     """Sum of 1 - min(r^2, 1) over the rows in use (MSAC); `squared` is overwritten.
 
-    squared: (B, M, N) squared residuals in units of the threshold, NaN counted as outliers; weights: (B, N) one
-    for rows in use, else zero. Returns (B, M); higher is better. Source: Torr and Zisserman, "MLESAC", 2000.
+    squared: (B, M, N) squared residuals in units of the threshold, NaN counted as outliers; mask: (B, N). Returns
+    (B, M); higher is better. Source: Torr and Zisserman, "MLESAC", 2000.
     """
     gain = squared.neg_().add_(1.0).clamp_min_(0.0).nan_to_num_(0.0)
-    return (gain @ weights[..., None]).squeeze(-1)
+    return (gain @ mask.to(gain.dtype)[..., None]).squeeze(-1)
+
+
+def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, mask: Tensor) -> Tensor:
+    """Truncated scores of many projections or homographies.
+
+    P: (B, M, 3, D); homogeneous: (B, D, N) what they map; x: (B, N, 2) to where; scale: (B, N) thresholds per unit
+    of x; mask: (B, N). Returns (B, M). A negative depth counts as an outlier.
+    """
+    M = P.shape[1]
+    u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, M)).unbind(1)
+    du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
+    dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
+    # Behind the camera the denominator vanishes and the error becomes huge.
+    factor = (scale[:, None].to(w.dtype) / w.clamp_min_(1e-6)).square_()
+    return truncated_score(du.square_().addcmul_(dv, dv).mul_(factor), mask)
 
 
 def search(
-    propose: Callable[[Tensor, int], tuple[State, Tensor]],
+    propose: Callable[[Tensor, int], tuple[State, Tensor, Tensor]],
     available: Tensor,
     size: int,
     confidence: float,
     first_round: int,
     max_samples: int,
-) -> tuple[State, Tensor]:
-    """The best model of each problem over rounds of samples, until its inliers call for no more of them.
+) -> State:
+    """The best model of each problem over rounds of samples, until its support calls for no more of them.
 
-    propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...) and scores
-    (R,), as from `truncated_score`; available: (B,) rows in use per problem; size: of a minimal sample.
-    Every round draws twice as many samples as the one before.
+    propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores (R,)
+    as from `truncated_score`, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
+    rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before.
     """
     rows = torch.arange(len(available), device=available.device)
-    models, best = propose(rows, first_round)
+    models, best, support = propose(rows, first_round)
     drawn, count = first_round, first_round
     while drawn < max_samples:
-        # The score is below the number of inliers, which errs towards more samples: noise spoils some of them.
-        rows = (samples_needed(best, available, size, confidence) > drawn).nonzero().squeeze(-1)
+        rows = (samples_needed(support, available, size, confidence) > drawn).nonzero().squeeze(-1)
         if len(rows) == 0:
             break
         count = min(2 * count, max_samples - drawn)
-        new, score = propose(rows, count)
-        better = score > best[rows]
-        rows = rows[better]
-        models = tuple(old.index_copy(0, rows, x[better]) for old, x in zip(models, new, strict=True))
-        best = best.index_copy(0, rows, score[better])
         drawn += count
-    return models, best
+        # Few problems at a time: their scores stay in the cache.
+        for part in rows.split(max(1, _SAMPLES_AT_ONCE // count)):
+            new, score, new_support = propose(part, count)
+            better = score > best[part]
+            part = part[better]
+            models = tuple(old.index_copy(0, part, x[better]) for old, x in zip(models, new, strict=True))
+            best = best.index_copy(0, part, score[better])
+            support = support.index_copy(0, part, new_support[better])
+    return models
 
 
 def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor, solutions: int) -> Tensor:

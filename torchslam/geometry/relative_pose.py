@@ -13,25 +13,26 @@ from torchslam.geometry.essential import essential_from_pose, sampson_errors
 from torchslam.geometry.homography import decompose_homography, transfer_errors
 from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, so3_exp
-from torchslam.geometry.ransac import is_significant, search
+from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, search
 from torchslam.geometry.two_view import (
     TwoViews,
-    essential_residuals,
+    best_of,
     fit_essential,
     fit_homography,
     fit_rotation,
-    homography_residuals,
     propose_essential,
     propose_homography,
     propose_rotation,
+    sampson_squared,
     tangent_basis,
+    transfer_squared,
 )
 
 MODELS = ("essential", "homography", "rotation")
 _ESSENTIAL, _HOMOGRAPHY, _ROTATION = range(3)
 
 _FIRST_ROUND = 64  # samples of five; of the cheaper models a fixed number
-_HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 100, 64
+_HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
 _FINAL_ITERATIONS = 10
 _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
 _CLEARLY_OFF = (
@@ -137,7 +138,7 @@ class _Fits:
 
 def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int) -> _Fits:
     generator = torch.Generator().manual_seed(seed)
-    state, _ = search(
+    R, t = search(
         lambda rows, count: propose_essential(views.select(rows), count, generator),
         views.mask.sum(-1),
         5,
@@ -145,18 +146,21 @@ def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int)
         _FIRST_ROUND,
         max_samples,
     )
-    (R, t), _ = fit_essential(views, (state[0][:, None], state[1][:, None]), _FINAL_ITERATIONS, _FINAL_WIDTH)
-    residual, _ = essential_residuals(views, R, t)
-    squared = residual[:, 0].square()
-    # The matches on a plane, or of a pure rotation, are among those that fit the essential matrix.
-    near = replace(views, mask=views.mask & (squared < 4))
-    (H,), _ = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
-    (R_only,), _ = propose_rotation(views, _ROTATION_SAMPLES, generator)
-    H, _ = fit_homography(views, H[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
-    R_only, _ = fit_rotation(views, R_only[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
-    mapped = homography_residuals(views, torch.cat((H, R_only), dim=1)).square().sum(-1)
-    squared = torch.stack((squared, mapped[:, 0], mapped[:, 1])).nan_to_num(torch.inf)
-    return _Fits(R[:, 0], t[:, 0], H[:, 0], R_only[:, 0], squared)
+    (R, t), _ = fit_essential(views, (R[:, None], t[:, None]), _FINAL_ITERATIONS, _FINAL_WIDTH)
+    essential = sampson_squared(views, R, t)
+    # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
+    near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
+    H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
+    R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
+    (H,), _ = best_of(*_as_state(fit_homography(views, H, _FINAL_ITERATIONS, _FINAL_WIDTH)))
+    (R_only,), _ = best_of(*_as_state(fit_rotation(views, R_only, _FINAL_ITERATIONS, _FINAL_WIDTH)))
+    mapped = transfer_squared(views, torch.stack((H, R_only), dim=1))
+    squared = torch.cat((essential, mapped), dim=1).transpose(0, 1).nan_to_num(torch.inf)
+    return _Fits(R[:, 0], t[:, 0], H, R_only, squared)
+
+
+def _as_state(fit: tuple[Tensor, Tensor]) -> tuple[tuple[Tensor], Tensor]:
+    return (fit[0],), fit[1]
 
 
 def _choose(fits: _Fits, mask: Tensor, chance: float) -> Tensor:
@@ -186,8 +190,8 @@ def _pose(views: TwoViews, fits: _Fits, model: Tensor) -> tuple[Tensor, Tensor, 
     share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
     length = t_H.norm(dim=-1, keepdim=True)
     direction = t_H / length.clamp_min(1e-12)
-    residual, _ = essential_residuals(views, R_H, direction)
-    support = torch.where(views.mask[:, None], (1 - residual.square()).clamp_min(0.0), 0.0).sum(-1)
+    squared = sampson_squared(views, R_H, direction)
+    support = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0).sum(-1)
     support = torch.where(share > 0.9, support, -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
     ambiguous = second > first - 0.02 * first.clamp_min(0.0)

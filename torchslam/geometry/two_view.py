@@ -6,8 +6,9 @@ match would have to move in both images together.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,9 +18,17 @@ from torchslam.geometry.essential import decompose_essential, essential_from_pos
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
 from torchslam.geometry.least_squares import State, minimize, small_rotation
 from torchslam.geometry.lie import skew
-from torchslam.geometry.ransac import gather_rows, pad_groups, sample_minimal, truncated_score
+from torchslam.geometry.ransac import (
+    SUPPORT_WIDTH,
+    gather_rows,
+    pad_groups,
+    sample_minimal,
+    score_projections,
+    truncated_score,
+)
 
-_CANDIDATES = 4  # hypotheses of each round that are optimised
+_CANDIDATES = 4  # essential matrices of each round that are optimised
+_FEW_CANDIDATES = 2  # homographies and rotations
 _ITERATIONS = 4  # of their local optimisation
 
 
@@ -27,7 +36,8 @@ _ITERATIONS = 4  # of their local optimisation
 class TwoViews:
     """Matches of B pairs of views.
 
-    x_1, x_2: (B, N, 2) undistorted image coordinates; scale_1, scale_2: (B, N) thresholds per unit of them
+    x_1, x_2: (B, N, 2) undistorted image coordinates
+    scale_1, scale_2: (B, N) thresholds per unit of them
     mask:     (B, N)
     """
 
@@ -51,18 +61,37 @@ class TwoViews:
             return self
         return TwoViews(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
-    @property
+    @cached_property
     def h_1(self) -> Tensor:
         """(B, N, 3) homogeneous x_1."""
         return torch.cat((self.x_1, torch.ones_like(self.x_1[..., :1])), dim=-1)
 
-    @property
+    @cached_property
     def h_2(self) -> Tensor:
         """(B, N, 3) homogeneous x_2."""
         return torch.cat((self.x_2, torch.ones_like(self.x_2[..., :1])), dim=-1)
 
-    @property
-    def transfer_weight(self) -> Tensor:
+    @cached_property
+    def epipolar(self) -> tuple[Tensor, Tensor]:
+        """What the Sampson error is linear in: (B, 9, N) for the constraint, (B, 18, N) for its variance.
+
+        The constraint is E times h_2 h_1^T; its variance (E E^T and E^T E without the last row and column) times
+        h_1 h_1^T and h_2 h_2^T, over the squared scale of the other image.
+        """
+        h_1, h_2 = self.h_1.mT, self.h_2.mT
+        outer_1 = h_1[:, :, None] * (h_1 * self.scale_2.square().reciprocal()[:, None])[:, None]
+        outer_2 = h_2[:, :, None] * (h_2 * self.scale_1.square().reciprocal()[:, None])[:, None]
+        constraint = (h_2[:, :, None] * h_1[:, None]).flatten(1, 2)
+        return constraint, torch.cat((outer_1, outer_2), dim=1).flatten(1, 2)
+
+    @cached_property
+    def epipolar_float(self) -> tuple[Tensor, Tensor]:
+        """The same in float32, for scores."""
+        constraint, variance = self.epipolar
+        return constraint.float(), variance.float()
+
+    @cached_property
+    def transfer_scale(self) -> Tensor:
         """(B, N) thresholds per unit of a difference H(x_1) - x_2, which has the noise of both images.
 
         Two-dimensional errors get a threshold 1.5 times that of one-dimensional ones, which then is as probable.
@@ -87,26 +116,19 @@ def best_of(state: State, cost: Tensor) -> tuple[State, Tensor]:
 # --- essential matrix ---
 
 
-def essential_residuals(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Sampson errors (B, K, N) in thresholds of poses (B, K), and their Jacobians (B, K, N, 5).
-
-    Local parameters: rotation from the left, then the two directions of `tangent_basis`.
-    """
+def sampson_squared(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
+    """Squared Sampson errors in thresholds of poses. (B, K, 3, 3), (B, K, 3) -> (B, K, N)."""
     E = essential_from_pose(R, t)
-    h_1, h_2 = views.h_1[:, None], views.h_2[:, None]
-    line_2, line_1 = h_1 @ E.mT, h_2 @ E
-    constraint = (h_2 * line_2).sum(-1, keepdim=True)
-    # each line's gradient, with the variance of its image in units of the threshold
-    m_2 = line_2[..., :2] * views.scale_2.square().reciprocal()[:, None, :, None]
-    m_1 = line_1[..., :2] * views.scale_1.square().reciprocal()[:, None, :, None]
-    squared = (m_2 * line_2[..., :2]).sum(-1, keepdim=True) + (m_1 * line_1[..., :2]).sum(-1, keepdim=True)
-    inverse = squared.clamp_min(torch.finfo(R.dtype).tiny).rsqrt()
-    residual = constraint * inverse
-    pull = residual * inverse * inverse
-    left = h_2 * inverse - torch.nn.functional.pad(pull * m_2, (0, 1))
-    right = torch.nn.functional.pad(pull * m_1, (0, 1))
-    J_E = left[..., :, None] * h_1[..., None, :] - h_2[..., :, None] * right[..., None, :]
-    return residual.squeeze(-1), J_E.flatten(-2) @ _essential_tangent(R, t)
+    constraint, variance = views.epipolar
+    squared = (E.flatten(-2) @ constraint).square()
+    return squared / (_variance_form(E, E) @ variance).clamp_min(torch.finfo(R.dtype).tiny)
+
+
+def _variance_form(E: Tensor, F: Tensor) -> Tensor:
+    """Coefficients of the variance of the constraint, bilinear in E and F. (..., 3, 3) twice -> (..., 18)."""
+    rows = E[..., :2, :].mT @ F[..., :2, :]
+    columns = E[..., :2] @ F[..., :2].mT
+    return torch.cat((rows, columns), dim=-2).flatten(-2)
 
 
 def tangent_basis(t: Tensor) -> Tensor:
@@ -119,11 +141,11 @@ def tangent_basis(t: Tensor) -> Tensor:
 
 
 def _essential_tangent(R: Tensor, t: Tensor) -> Tensor:
-    """d E / d local parameters. (..., 3, 3), (..., 3) -> (..., 9, 5)."""
+    """E and its derivatives by the rotation from the left and the directions of `tangent_basis`. (..., 6, 3, 3)."""
     generators = skew(torch.eye(3, dtype=t.dtype, device=t.device))
-    rotation = skew(t)[..., None, :, :] @ generators
-    direction = skew(tangent_basis(t))
-    return (torch.cat((rotation, direction), dim=-3) @ R[..., None, :, :]).flatten(-2).mT
+    cross = skew(torch.cat((t[..., None, :], tangent_basis(t)), dim=-2))
+    rotation = cross[..., :1, :, :] @ generators
+    return torch.cat((cross[..., :1, :, :], rotation, cross[..., 1:, :, :]), dim=-3) @ R[..., None, :, :]
 
 
 def _retract_essential(state: State, step: Tensor) -> State:
@@ -134,36 +156,36 @@ def _retract_essential(state: State, step: Tensor) -> State:
 
 def fit_essential(views: TwoViews, state: State, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
     """Optimises (R, t) of (B, K) candidates; also returns their truncated costs (B, K)."""
+    constraint, variance = views.epipolar
 
     def evaluate(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        residual, J = essential_residuals(views, R, t)
-        used, cost = _truncated(residual * residual, views.mask, width)
-        rows = torch.cat((J, residual[..., None]), dim=-1).masked_fill(~used[..., None], 0.0)
-        return rows.mT @ rows, cost
+        K, E = t.shape[1], _essential_tangent(R, t)
+        form = _variance_form(E[:, :, :1], E)
+        value = (E.flatten(1, 2).flatten(2) @ constraint).unflatten(1, (K, 6))
+        spread = (form.flatten(1, 2) @ variance).unflatten(1, (K, 6))
+        inverse = spread[:, :, :1].clamp_min(torch.finfo(R.dtype).tiny).rsqrt()
+        residual = value[:, :, :1] * inverse
+        # d(c / s) = dc / s - c ds / s^2, with ds = (half the derivative of s^2) / s
+        J = torch.addcmul(value[:, :, 1:] * inverse, residual * inverse * inverse, spread[:, :, 1:], value=-1)
+        used, cost = _truncated(residual.squeeze(2).square(), views.mask, width)
+        rows = torch.cat((J, residual), dim=2) * used[:, :, None]
+        return rows @ rows.mT, cost
 
     return minimize(state, evaluate, _retract_essential, iterations)
 
 
 def score_essential(views: TwoViews, E: Tensor) -> Tensor:
-    """Truncated scores of many essential matrices, as two matrix products in float32. (B, M, 3, 3) -> (B, M)."""
-    h_1, h_2 = views.h_1, views.h_2
-    outer_1, outer_2 = (h[..., :, None] * h[..., None, :] for h in (h_1, h_2))
-    matches = (h_2[..., :, None] * h_1[..., None, :]).flatten(2)
-    squares = torch.cat(
-        (
-            outer_1.flatten(2) * views.scale_2.square().reciprocal()[..., None],
-            outer_2.flatten(2) * views.scale_1.square().reciprocal()[..., None],
-        ),
-        dim=-1,
-    )
-    quadratic = torch.cat((E[..., :2, :].mT @ E[..., :2, :], E[..., :2] @ E[..., :2].mT), dim=-2).flatten(-2)
-    constraint = E.flatten(-2).float() @ matches.mT.float()
-    variance = quadratic.float() @ squares.mT.float()
-    return truncated_score(constraint.square_().div_(variance.clamp_min_(1e-20)), views.mask.float())
+    """Truncated scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M)."""
+    constraint, variance = views.epipolar_float
+    squared = (E.flatten(-2).float() @ constraint).square_()
+    spread = (_variance_form(E, E).float() @ variance).clamp_min_(1e-20)
+    return truncated_score(squared.div_(spread), views.mask)
 
 
-def propose_essential(views: TwoViews, count: int, generator: torch.Generator) -> tuple[State, Tensor]:
-    """The best (R, t) of `count` samples of five matches, locally optimised, and its score."""
+def propose_essential(
+    views: TwoViews, count: int, generator: torch.Generator
+) -> tuple[State, Tensor, Tensor]:
+    """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support."""
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)
     x_1, x_2 = gather_rows(views.x_1, sample), gather_rows(views.x_2, sample)
@@ -177,59 +199,62 @@ def propose_essential(views: TwoViews, count: int, generator: torch.Generator) -
         valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
     )
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
-    state, cost = best_of(*fit_essential(views, (R, t), _ITERATIONS))
-    return state, views.mask.sum(-1) - cost
+    (R, t), cost = best_of(*fit_essential(views, (R, t), _ITERATIONS))
+    near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
+    return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
 
 
 # --- homography and pure rotation ---
 
 
-def homography_residuals(views: TwoViews, H: Tensor) -> Tensor:
-    """Transfer errors (B, K, N, 2) in thresholds of homographies (B, K, 3, 3), shared between the two images."""
-    return (
-        transfer_errors(H, views.x_1[:, None], views.x_2[:, None]) * views.transfer_weight[:, None, :, None]
-    )
+def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
+    """Squared transfer errors in thresholds of homographies or rotations. (B, K, 3, 3) -> (B, K, N)."""
+    difference = transfer_errors(H, views.x_1[:, None], views.x_2[:, None])
+    return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
-def _fit_mapped(
-    views: TwoViews, state: State, tangent: Any, retract: Any, iterations: int, width: float
-) -> tuple[State, Tensor]:
-    """Optimises mappings H x_1, whose nine entries depend on local parameters by `tangent(state)` (.., 9, D)."""
-    weight = (views.scale_1.square().reciprocal() + views.scale_2.square().reciprocal()).rsqrt()[
-        :, None, :, None
-    ]
-    h_1 = views.h_1[:, None]
+def _fit_mapping(
+    views: TwoViews,
+    H: Tensor,
+    tangent: Callable[[Tensor], Tensor],
+    retract: Callable[[State, Tensor], State],
+    iterations: int,
+    width: float,
+) -> tuple[Tensor, Tensor]:
+    """Optimises mappings H (B, K, 3, 3) whose derivatives by local parameters are `tangent(H)` (B, K, D, 3, 3)."""
+    scale = views.transfer_scale[:, None, None]
+    h_1, x_2 = views.h_1.mT, views.x_2.mT[:, None, :, None]
 
     def evaluate(H: Tensor) -> tuple[Tensor, Tensor]:
-        mapped = h_1 @ H.mT
-        depth = mapped[..., 2:]
-        front = depth > 1e-9
-        inverse = torch.where(front, 1 / depth, 0.0)
-        position = mapped[..., :2] * inverse
-        residual = torch.where(front, (position - views.x_2[:, None]) * weight, 1e6)
-        used, cost = _truncated(residual.square().sum(-1), views.mask, width)
-        side = h_1 * (weight * inverse)
-        zero = torch.zeros_like(side)
-        J_u = torch.cat((side, zero, -side * position[..., :1]), dim=-1)
-        J_v = torch.cat((zero, side, -side * position[..., 1:]), dim=-1)
-        J = torch.stack((J_u, J_v), dim=-2) @ tangent(H)[..., None, :, :]
+        both = torch.cat((H[:, :, None], tangent(H)), dim=2)
+        x, y, z = (both.transpose(2, 3).flatten(1, 3) @ h_1).unflatten(1, (H.shape[1], 3, -1)).unbind(2)
+        inverse = scale / z[:, :, :1].clamp_min(1e-9)
+        u, v = x[:, :, :1] * inverse / scale, y[:, :, :1] * inverse / scale
+        # derivatives of x / z and y / z; the first row becomes the residual
+        du, dv = torch.addcmul(x, u, z, value=-1) * inverse, torch.addcmul(y, v, z, value=-1) * inverse
+        residual = torch.stack(((u - x_2[:, :, 0]) * scale, (v - x_2[:, :, 1]) * scale), dim=-1)
+        used, cost = _truncated(residual.square().sum(-1).squeeze(2), views.mask, width)
         rows = (
-            torch.cat((J, residual[..., None]), dim=-1).masked_fill(~used[..., None, None], 0.0).flatten(2, 3)
+            torch.cat((torch.stack((du, dv), dim=-1)[:, :, 1:], residual), dim=2) * used[:, :, None, :, None]
         )
-        return rows.mT @ rows, cost
+        rows = rows.flatten(3)
+        return rows @ rows.mT, cost
 
-    return minimize(state, evaluate, retract, iterations)
+    (H,), cost = minimize((H,), evaluate, retract, iterations)
+    return H, cost
 
 
 def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
     """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
-    entries = torch.eye(9, 8, dtype=H.dtype, device=H.device)
+    entries = torch.eye(8, 9, dtype=H.dtype, device=H.device).unflatten(-1, (3, 3))
+
+    def tangent(H: Tensor) -> Tensor:
+        return entries.expand(*H.shape[:2], 8, 3, 3)
 
     def retract(state: State, step: Tensor) -> State:
         return (state[0] + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3)),)
 
-    state, cost = _fit_mapped(views, (H,), lambda H: entries, retract, iterations, width)
-    return state[0], cost
+    return _fit_mapping(views, H, tangent, retract, iterations, width)
 
 
 def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -237,41 +262,34 @@ def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0
     generators = skew(torch.eye(3, dtype=R.dtype, device=R.device))
 
     def tangent(R: Tensor) -> Tensor:
-        return (generators @ R[..., None, :, :]).flatten(-2).mT
+        return generators @ R[:, :, None]
 
     def retract(state: State, step: Tensor) -> State:
         return (small_rotation(step) @ state[0],)
 
-    state, cost = _fit_mapped(views, (R,), tangent, retract, iterations, width)
-    return state[0], cost
+    return _fit_mapping(views, R, tangent, retract, iterations, width)
 
 
 def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
-    """Truncated scores of homographies or rotations. (B, M, 3, 3) -> (B, M)."""
-    squared = homography_residuals(views, H).square().sum(-1)
-    return truncated_score(squared.float(), views.mask.float())
+    """Truncated scores of homographies or rotations, in float32. (B, M, 3, 3) -> (B, M)."""
+    return score_projections(
+        H.float(), views.h_1.mT.float(), views.x_2.float(), views.transfer_scale, views.mask
+    )
 
 
-def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> tuple[State, Tensor]:
-    """The best homography of `count` samples of four matches, locally optimised, and its score."""
+def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
+    """The best homographies (B, K, 3, 3) of `count` samples of four matches."""
     sample = sample_minimal(views.mask, 4, count, generator)
     H = homography_from_matches(gather_rows(views.x_1, sample), gather_rows(views.x_2, sample))
-    best = score_mappings(views, H).topk(_CANDIDATES, dim=1).indices
-    H = gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
-    H, cost = fit_homography(views, H, _ITERATIONS)
-    state, cost = best_of((H,), cost)
-    return state, views.mask.sum(-1) - cost
+    best = score_mappings(views, H).topk(_FEW_CANDIDATES, dim=1).indices
+    return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
 
 
-def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> tuple[State, Tensor]:
-    """The best pure rotation of `count` samples of two matches, locally optimised, and its score."""
+def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
+    """The best pure rotations (B, K, 3, 3) of `count` samples of two matches."""
     sample = sample_minimal(views.mask, 2, count, generator)
     R = rotation_from_matches(gather_rows(views.h_1, sample), gather_rows(views.h_2, sample))
-    R = torch.where(
-        torch.isfinite(R).all((-2, -1))[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device)
-    )
-    best = score_mappings(views, R).topk(_CANDIDATES, dim=1).indices
-    R = gather_rows(R.flatten(2), best).unflatten(-1, (3, 3))
-    R, cost = fit_rotation(views, R, _ITERATIONS)
-    state, cost = best_of((R,), cost)
-    return state, views.mask.sum(-1) - cost
+    regular = torch.isfinite(R).all((-2, -1))[..., None, None]
+    R = torch.where(regular, R, torch.eye(3, dtype=R.dtype, device=R.device))
+    best = score_mappings(views, R).topk(_FEW_CANDIDATES, dim=1).indices
+    return gather_rows(R.flatten(2), best).unflatten(-1, (3, 3))
