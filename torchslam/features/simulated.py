@@ -47,6 +47,8 @@ class SimulatedFeatures:
         self.depth_range = (depth_near * extent, depth_far * extent)
         generator = torch.Generator().manual_seed(seed)
         self.points_w = self._scatter(T_wc, points_per_view, generator)
+        # Where more are visible than a frame may have keypoints, the same ones win in every frame.
+        self.strengths = torch.rand(len(self.points_w), generator=generator)
         self.descriptors = torch.randint(
             0, 256, (len(self.points_w), DESCRIPTOR_BYTES), generator=generator, dtype=torch.uint8
         )
@@ -84,7 +86,8 @@ class SimulatedFeatures:
         pixels, visible = self._visible(T_cw, self.points_w)
         ids = torch.nonzero(visible)[:, 0]
         ids = ids[torch.rand(len(ids), generator=generator) >= self.dropout]
-        ids = ids[torch.randperm(len(ids), generator=generator)[: self.num_keypoints]]
+        strongest = torch.argsort(self.strengths[ids], descending=True)[: self.num_keypoints]
+        ids = ids[strongest[torch.randperm(len(strongest), generator=generator)]]
         keypoints = pixels[ids] + self.noise_px * torch.randn(
             len(ids), 2, generator=generator, dtype=pixels.dtype
         )
