@@ -12,12 +12,14 @@ from torchslam.features.learned import ALIKED, XFeat
 from torchslam.features.matching import match, match_projected
 from torchslam.features.opencv_orb import OpenCVORB
 from torchslam.features.orb import ORB
+from torchslam.features.simulated import SimulatedFeatures
 
 __all__ = [
     "ALIKED",
     "EXTRACTORS",
     "ORB",
     "OpenCVORB",
+    "SimulatedFeatures",
     "XFeat",
     "extractor",
     "hamming",
