@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchslam.geometry.lie import skew
+
 State = tuple[Tensor, ...]
 
 
@@ -15,7 +17,7 @@ def minimize(
     evaluate: Callable[..., tuple[Tensor, Tensor]],
     retract: Callable[[State, Tensor], State],
     iterations: int,
-    tolerance: float = 1e-8,
+    tolerance: float = 1e-7,
 ) -> tuple[State, Tensor]:
     """Minimises many small problems at once, each with its own damping.
 
@@ -26,18 +28,18 @@ def minimize(
     become singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
-    damping = torch.full_like(cost, 1e-4)
+    damping = torch.full_like(cost, 1e-4)[..., None, None]
+    eye = torch.eye(A.shape[-1] - 1, dtype=A.dtype, device=A.device)
     for _ in range(iterations):
-        H, g = A[..., :-1, :-1], A[..., :-1, -1:]
-        diagonal = H.diagonal(dim1=-2, dim2=-1) * damping[..., None]
-        step = -torch.linalg.solve_ex(H + torch.diag_embed(diagonal), g)[0].squeeze(-1)
+        H, g = A[..., :-1, :-1], A[..., :-1, -1]
+        step = -torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0]
         moved = retract(state, step)
         A_moved, cost_moved = evaluate(*moved)
         better = cost_moved < cost
         state = tuple(_select(better, new, old) for new, old in zip(moved, state, strict=True))
-        A, cost = _select(better, A_moved, A), _select(better, cost_moved, cost)
-        damping = torch.where(better, damping * 0.1, damping * 10).clamp(1e-9, 1e6)
-        if not bool((step.abs().amax(-1) > tolerance).any()):
+        A, cost = _select(better, A_moved, A), torch.where(better, cost_moved, cost)
+        damping = torch.where(better[..., None, None], 0.1 * damping, 10 * damping).clamp(1e-9, 1e6)
+        if bool(step.abs().max() < tolerance):
             break
     return state, cost
 
@@ -49,11 +51,9 @@ def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def small_rotation(omega: Tensor) -> Tensor:
     """Cayley's rotation, equal to exp(omega) to second order, and cheaper. (..., 3) -> (..., 3, 3)."""
     half = 0.5 * omega
-    x, y, z = half.unbind(-1)
-    zero = torch.zeros_like(x)
-    W = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
-    factor = (2 / (1 + (half * half).sum(-1)))[..., None, None]
-    return torch.eye(3, dtype=omega.dtype, device=omega.device) + factor * (W + W @ W)
+    W = skew(half)
+    factor = 2 / (1 + (half * half).sum(-1))[..., None, None]
+    return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, W + W @ W)
 
 
 def retract_pose(state: State, step: Tensor) -> State:

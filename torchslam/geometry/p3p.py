@@ -37,13 +37,14 @@ def _frame(corners: Tensor) -> Tensor:
 
 def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Depths along the rays, (..., 4, 3), and which are real and positive, (..., 4)."""
-    first, second = [0, 0, 1], [1, 2, 2]  # the pairs 12, 13, 23
-    difference = points[..., first, :] - points[..., second, :]
+    # of the pairs 12, 23, 31
+    difference = points - points.roll(-1, -2)
     distance = (difference * difference).sum(-1)
     unit = distance.sum(-1, keepdim=True)
-    a12, a13, a23 = (distance / unit).unbind(-1)
-    cosine = (rays[..., first, :] * rays[..., second, :]).sum(-1)
-    b12, b13, b23 = cosine.unbind(-1)
+    distance = distance / unit
+    a12, a23, a13 = distance.unbind(-1)
+    cosine = (rays * rays.roll(-1, -2)).sum(-1)
+    b12, b23, b13 = cosine.unbind(-1)
     zero = torch.zeros_like(a12)
 
     # depths^T D depths = 0 for both
@@ -69,18 +70,16 @@ def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     real = ((discriminant >= 0) & real[..., None]).repeat_interleave(2, dim=-1)
 
     # Their scale follows from the sum of the three equations.
-    def products(depths: Tensor) -> Tensor:
-        return depths[..., first] * depths[..., second] * cosine[..., None, :]
-
-    size = 2 * (depths * depths).sum(-1, keepdim=True) - 2 * products(depths).sum(-1, keepdim=True)
+    products = depths * depths.roll(-1, -1) * cosine[..., None, :]
+    size = 2 * (depths * depths - products).sum(-1, keepdim=True)
     depths = depths * torch.copysign(size.rsqrt(), depths.sum(-1, keepdim=True))
-    depths = _polish(depths, cosine[..., None, :], (distance / unit)[..., None, :])
+    depths = _polish(depths, cosine[..., None, :], distance[..., None, :])
     return depths * unit[..., None].sqrt(), real & (depths > 0).all(-1)
 
 
 def _adjugate(M: Tensor) -> Tensor:
     """Adjugate of symmetric matrices. (..., 3, 3) -> (..., 3, 3)."""
-    return torch.linalg.cross(M[..., [1, 2, 0], :], M[..., [2, 0, 1], :], dim=-1)
+    return torch.linalg.cross(M.roll(-1, -2), M.roll(-2, -2), dim=-1)
 
 
 def _line_pair(D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -142,24 +141,14 @@ def _cubic_root(b: Tensor, c: Tensor, d: Tensor) -> Tensor:
 
 def _polish(depths: Tensor, cosine: Tensor, distance: Tensor) -> Tensor:
     """Two Newton steps on the three distance equations. (..., 4, 3), (..., 1, 3), (..., 1, 3)."""
-    first, second = [0, 0, 1], [1, 2, 2]
     for _ in range(2):
-        a, b = depths[..., first], depths[..., second]
-        residual = a * a + b * b - 2 * cosine * a * b - distance
-        d_a, d_b = 2 * (a - cosine * b), 2 * (b - cosine * a)
-        # J = [[a12 b12 0], [a13 0 b13], [0 a23 b23]], solved by Cramer's rule
-        a12, a13, a23 = d_a.unbind(-1)
-        b12, b13, b23 = d_b.unbind(-1)
-        r12, r13, r23 = residual.unbind(-1)
-        determinant = -(a12 * b13 * a23 + b12 * a13 * b23)
-        inverse = 1 / torch.where(determinant == 0, 1.0, determinant)
-        step = torch.stack(
-            (
-                -a23 * b13 * r12 - b12 * b23 * r13 + b12 * b13 * r23,
-                -a13 * b23 * r12 + a12 * b23 * r13 - a12 * b13 * r23,
-                a13 * a23 * r12 - a12 * a23 * r13 - a13 * b12 * r23,
-            ),
-            dim=-1,
-        )
-        depths = depths - step * inverse[..., None]
+        following = depths.roll(-1, -1)
+        residual = depths * (depths - 2 * cosine * following) + following * following - distance
+        # J = 2 [[a1 b1 0], [0 a2 b2], [b3 0 a3]], solved by Cramer's rule
+        a, b = depths - cosine * following, following - cosine * depths
+        a_1, b_1 = a.roll(-1, -1), b.roll(-1, -1)
+        a_2 = a.roll(-2, -1)
+        determinant = 2 * (a.prod(-1, keepdim=True) + b.prod(-1, keepdim=True))
+        numerator = a_1 * a_2 * residual - b * a_2 * residual.roll(-1, -1) + b * b_1 * residual.roll(-2, -1)
+        depths = depths - numerator / torch.where(determinant == 0, 1.0, determinant)
     return depths

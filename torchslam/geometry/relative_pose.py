@@ -33,7 +33,10 @@ _ESSENTIAL, _HOMOGRAPHY, _ROTATION = range(3)
 
 _FIRST_ROUND = 64  # samples of five; of the cheaper models a fixed number
 _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
-_FINAL_ITERATIONS = 10
+_TRIAL_ITERATIONS, _FINAL_ITERATIONS = (
+    5,
+    12,
+)  # of a homography or rotation that may not be needed; of the result
 _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
 _CLEARLY_OFF = (
     2.0  # thresholds of the transfer error, three standard deviations of noise as large as the threshold
@@ -103,6 +106,8 @@ def estimate_relative_pose(
             2 * threshold * math.hypot(camera_2.width, camera_2.height) / (camera_2.width * camera_2.height)
         )
         model = _choose(fits, mask, chance)
+        if bool((model != _ESSENTIAL).any()):
+            fits = fits.finished(views)
         R, t, normal, ambiguous = _pose(views, fits, model)
         squared = fits.squared[model, torch.arange(len(model), device=model.device)]
         inliers = (squared < 1) & mask
@@ -135,6 +140,17 @@ class _Fits:
     R_only: Tensor
     squared: Tensor
 
+    def with_mappings(self, views: TwoViews) -> _Fits:
+        """The same with the errors of homography and rotation brought up to date."""
+        mapped = transfer_squared(views, torch.stack((self.H, self.R_only), dim=1)).transpose(0, 1)
+        return replace(self, squared=torch.cat((self.squared[:1], mapped)).nan_to_num(torch.inf))
+
+    def finished(self, views: TwoViews) -> _Fits:
+        """The same with homography and rotation at their minimum."""
+        H, _ = fit_homography(views, self.H[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
+        R_only, _ = fit_rotation(views, self.R_only[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
+        return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
+
 
 def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int) -> _Fits:
     generator = torch.Generator().manual_seed(seed)
@@ -152,15 +168,11 @@ def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int)
     near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
     H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
     R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
-    (H,), _ = best_of(*_as_state(fit_homography(views, H, _FINAL_ITERATIONS, _FINAL_WIDTH)))
-    (R_only,), _ = best_of(*_as_state(fit_rotation(views, R_only, _FINAL_ITERATIONS, _FINAL_WIDTH)))
-    mapped = transfer_squared(views, torch.stack((H, R_only), dim=1))
-    squared = torch.cat((essential, mapped), dim=1).transpose(0, 1).nan_to_num(torch.inf)
-    return _Fits(R[:, 0], t[:, 0], H, R_only, squared)
-
-
-def _as_state(fit: tuple[Tensor, Tensor]) -> tuple[tuple[Tensor], Tensor]:
-    return (fit[0],), fit[1]
+    H, H_cost = fit_homography(views, H, _TRIAL_ITERATIONS, _FINAL_WIDTH)
+    R_only, R_cost = fit_rotation(views, R_only, _TRIAL_ITERATIONS, _FINAL_WIDTH)
+    ((H,), _), ((R_only,), _) = best_of((H,), H_cost), best_of((R_only,), R_cost)
+    fits = _Fits(R[:, 0], t[:, 0], H, R_only, essential[:, 0].expand(3, -1, -1))
+    return fits.with_mappings(views)
 
 
 def _choose(fits: _Fits, mask: Tensor, chance: float) -> Tensor:

@@ -101,7 +101,6 @@ class TwoViews:
 
 def _truncated(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:
     """Which rows count, and the truncated cost, of squared residuals (B, K, N) with a mask (B, N)."""
-    squared = squared.nan_to_num(torch.inf)
     cost = torch.where(mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
     return (squared < width * width) & mask[:, None], cost
 
