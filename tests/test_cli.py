@@ -19,7 +19,7 @@ from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.output.map_file import read_map
 
 ROOM = "synthetic:room?frames=24"
-FAST = ["--features", "opencv-orb"]
+FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import torch
 
+from torchslam import __version__
 from torchslam.commands import demo, download, evaluate, info, plot, run
 from torchslam.errors import TorchslamError
 
@@ -49,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="torchslam",
         description="Monocular visual SLAM: images in, the camera's trajectory and a sparse map out.",
     )
+    parser.add_argument("--version", action="version", version=f"torchslam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, module in COMMANDS.items():
         description = (module.__doc__ or "").strip()

@@ -34,18 +34,38 @@ def plot_features(
         figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
         axes = figure.add_subplot()
         axes.imshow(0.25 + 0.75 * grey, cmap="gray", vmin=0.0, vmax=1.0)
-        axes.plot(x[~is_matched], y[~is_matched], "o", ms=3.2, mfc="none", mec="#f2ede2", mew=0.6, alpha=0.85)
+        axes.plot(
+            x[~is_matched],
+            y[~is_matched],
+            "o",
+            ms=3.2,
+            mfc="none",
+            mec="#f2ede2",
+            mew=0.6,
+            alpha=0.85,
+            zorder=1,
+        )
         _draw_tails(axes, keypoints[matched], previous[matched])
         counts = lengths.cpu().numpy()[is_matched]
         dots = axes.scatter(
-            x[is_matched], y[is_matched], 12, counts, cmap="viridis", linewidths=0.3, edgecolors="#10222e"
+            x[is_matched],
+            y[is_matched],
+            12,
+            counts,
+            cmap="viridis",
+            linewidths=0.3,
+            edgecolors="#10222e",
+            zorder=3,
         )
         if is_matched.any():
-            figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.015, label="keyframes that saw the point")
+            figure.colorbar(
+                dots, ax=axes, shrink=0.7, pad=0.015, label="keyframes that saw the point", format="%d"
+            )
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")
         axes.grid(visible=False)
         figures = f"{len(keypoints)} features, {int(is_matched.sum())} of them map points"
         axes.set_title(f"{title}: {figures}" if title else figures)
+        axes.set_title("tails lead back to the keyframe before", loc="right", fontsize=8.5, color=style.MUTED)
     return figure
 
 
@@ -54,4 +74,4 @@ def _draw_tails(axes: Axes, pixels: Tensor, previous: Tensor) -> None:
 
     tails = torch.stack([previous, pixels], dim=1).detach().cpu().double().numpy()
     known = np.isfinite(tails).all(axis=(1, 2))
-    axes.add_collection(LineCollection(list(tails[known]), colors=style.ACCENT, lw=0.9, alpha=0.9))
+    axes.add_collection(LineCollection(list(tails[known]), colors=style.ACCENT, lw=0.9, alpha=0.9, zorder=2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -13,13 +13,13 @@ from torchslam.types import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d import Axes3D
 
 MAX_POINTS = 25_000
-MAX_CAMERAS = 40
+MAX_CAMERAS = 30
+TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def plot_scene(
             "none"
         )  # it would leave half of the picture to the invisible corners of the cubes
         for column, azimuth in enumerate((-62.0, 28.0)):
-            axes = figure.add_axes((0.01 + 0.49 * column, 0.07, 0.49, 0.87), projection="3d")
+            axes = figure.add_axes((0.52 * column, 0.07, 0.48, 0.87), projection="3d", computed_zorder=False)
             _draw_3d(axes, scene, box, azimuth, style.length_label(unit))
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower center", ncols=len(labels))
@@ -87,7 +87,7 @@ def plot_top_view(
         axes.set(xlim=box[0], ylim=box[1], aspect="equal")
         axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
         axes.set_title(_title(title, scene, box))
-        figure.legend(loc="outside lower center", ncols=5)
+        figure.legend(loc="outside lower center", ncols=6)
     return figure
 
 
@@ -123,19 +123,15 @@ def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit:
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     points = _drawn_points(scene.points, box)
-    axes.scatter(
-        *points.T, c=points[:, 2], cmap=_heights(), s=1.8, alpha=0.75, linewidths=0, depthshade=False
-    )
-    if len(scene.groundtruth):
-        axes.plot(
-            *scene.groundtruth.T, color=style.GROUND_TRUTH, lw=1.1, ls=(0, (4, 2)), label="ground truth"
-        )
+    axes.scatter(*points.T, c=points[:, 2], depthshade=False, zorder=1, **_dots(points))
     for index, part in enumerate(np.split(scene.path, scene.gaps)):
-        axes.plot(*part.T, color=style.ESTIMATE, lw=1.7, label="_" * (index > 0) + "estimate")
-    length = 0.045 * float((box[:, 1] - box[:, 0]).max())
+        axes.plot(*part.T, color=style.ESTIMATE, lw=2.4, zorder=3, label="_" * (index > 0) + "estimate")
+    if len(scene.groundtruth):
+        axes.plot(*scene.groundtruth.T, zorder=4, label="ground truth", **TRUTH_LINE)
+    length = 0.04 * float((box[:, 1] - box[:, 0]).max())
     for axis, color in enumerate(style.AXES_RGB):
         tips = scene.cameras + length * scene.rotations[:, :, axis]
-        lines = Line3DCollection(np.stack([scene.cameras, tips], axis=1), colors=color, lw=1.0)
+        lines = Line3DCollection(np.stack([scene.cameras, tips], axis=1), colors=color, lw=1.0, zorder=2)
         lines.set_label(f"camera {'xyz'[axis]}")
         axes.add_collection3d(lines)
     axes.set(xlim=box[0], ylim=box[1], zlim=box[2], proj_type="ortho")
@@ -144,6 +140,7 @@ def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit:
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), scene.labels, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_label_text(f"{name} ({unit})")
+        axis.labelpad = 2.0
         axis.set_major_locator(_few_ticks())
 
 
@@ -166,17 +163,12 @@ def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     from matplotlib.collections import LineCollection
 
     points = _drawn_points(scene.points, box)
-    axes.scatter(points[:, 0], points[:, 1], c=points[:, 2], cmap=_heights(), s=2.0, alpha=0.75, linewidths=0)
-    if len(scene.groundtruth):
-        axes.plot(
-            *scene.groundtruth[:, :2].T,
-            color=style.GROUND_TRUTH,
-            lw=1.1,
-            ls=(0, (4, 2)),
-            label="ground truth",
-        )
+    label = "map point (lighter: higher)"
+    axes.scatter(points[:, 0], points[:, 1], c=points[:, 2], label=label, **_dots(points))
     for index, part in enumerate(np.split(scene.path, scene.gaps)):
-        axes.plot(*part[:, :2].T, color=style.ESTIMATE, lw=1.7, label="_" * (index > 0) + "estimate")
+        axes.plot(*part[:, :2].T, color=style.ESTIMATE, lw=2.4, label="_" * (index > 0) + "estimate")
+    if len(scene.groundtruth):
+        axes.plot(*scene.groundtruth[:, :2].T, label="ground truth", **TRUTH_LINE)
     length = 0.035 * float((box[:, 1] - box[:, 0]).max())
     tips = scene.cameras + length * scene.rotations[:, :, 2]
     lines = LineCollection(
@@ -196,11 +188,17 @@ def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     return points[style.thin(len(points), MAX_POINTS)]
 
 
-def _heights() -> Colormap:
-    """Muted colours from low to high, away from those of the path."""
+def _dots(points: np.ndarray) -> dict[str, Any]:
+    """How points are drawn: larger where there are few, in muted colours away from those of the path."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    return LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])
+    heights = LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])
+    return {
+        "cmap": heights,
+        "s": float(np.clip(8e3 / max(len(points), 1), 1.5, 5.0)),
+        "alpha": 0.75,
+        "linewidths": 0,
+    }
 
 
 def _few_ticks() -> MaxNLocator:

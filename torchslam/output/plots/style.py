@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ESTIMATE = "#1d4e74"
+ESTIMATE = "#3f7aa6"
 GROUND_TRUTH = "#2f2f2f"
 ACCENT = "#c8553d"
 LOST = "#f3d9d2"

@@ -79,7 +79,12 @@ def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
             label="keyframe",
         )
         axes.set(xlabel="time (s)", ylabel="map points in the frame", ylim=(0.0, None))
-        axes.set_title(title or "Tracking")
+        posed = inliers > 0
+        typical = (
+            f": {np.median(inliers[posed]):.0f} points agree with a pose (median)" if posed.any() else ""
+        )
+        axes.set_title((title or "Tracking") + typical)
+        axes.margins(x=0.0)
         figure.legend(loc="outside lower center", ncols=5)
     return figure
 
