@@ -126,7 +126,7 @@ def bundle_adjust(
         def adjoint(gradient: Sequence[Tensor], tensors: Sequence[Tensor]) -> Tensor:
             return build(tensors).adjoint(minimum, Estimate(*gradient))
 
-        solution = Estimate(*attach(minimum, inputs, adjoint))
+        solution = build(inputs).at_minimum(Estimate(*attach(minimum, inputs, adjoint)))
     elif backward == "truncated":
         bundle = build(inputs)
         model = bundle.evaluate(bundle.at_minimum(minimum), ~bundle.solvable)

@@ -46,7 +46,7 @@ class LeastSquares(Protocol[X, M]):
     def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
         """The estimate that minimises the damped model, and the decrease (B,) of the cost that the model predicts.
 
-        damping: (B,), relative to the diagonal of the Hessian. Elements that cannot be solved stay where they are.
+        damping: (B,), relative to the diagonal of the Hessian. The decrease is infinite where there is no solution.
         """
         ...
 
@@ -75,20 +75,21 @@ def minimize(
 ) -> tuple[M, Convergence]:
     """Minimise from `start`; returns the model at the last accepted estimate.
 
-    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost (or by
-    less than rounding shows), and rests from then on.
+    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, and
+    rests from then on.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
     initial_cost = model.cost.detach()
-    tolerance = max(tolerance, torch.finfo(initial_cost.dtype).eps)
+    # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
+    slack = 1 + 8 * torch.finfo(initial_cost.dtype).eps
     damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
     for _ in range(iterations):
         estimate, decrease = problem.step(model, damping)
         share = decrease.detach() / model.cost.detach()
         trial = problem.evaluate(estimate, share < _NEAR)
-        accept = active & (trial.cost < model.cost)
+        accept = active & share.isfinite() & (trial.cost <= slack * model.cost)
         steps = steps + active
         active = active & (share > tolerance)
         model = problem.select(accept, trial, model)
