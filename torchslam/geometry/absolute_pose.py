@@ -12,19 +12,20 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.least_squares import State, minimize, retract_pose
-from torchslam.geometry.lie import rigid, se3_exp, transform
+from torchslam.geometry.lie import rigid, se3_exp, skew, transform
 from torchslam.geometry.p3p import p3p
+from torchslam.geometry.projections import fit_projections, score_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     gather_rows,
     is_significant,
     sample_minimal,
-    score_projections,
     search,
+    truncated_rows,
     valid_first,
 )
 
-_FIRST_ROUND = 48  # samples
+_FIRST_ROUND = 128  # samples
 _CANDIDATES = 4  # hypotheses of each round that are optimised
 _LOCAL_ITERATIONS, _FINAL_ITERATIONS = 3, 8
 _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
@@ -101,7 +102,7 @@ class _Problem:
     """The data of the search. Points are relative to their mean, so that float32 is enough for scores.
 
     points, pixels, mask, rays: (B, N, ...); camera; threshold in pixels; centre: (B, 3) mean of the points
-    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N) thresholds per unit of them; float32
+    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N) thresholds per unit of them
     """
 
     points: Tensor
@@ -134,9 +135,9 @@ class _Problem:
             mask,
             centre,
             rays,
-            torch.cat((points, ones), dim=-1).mT.float(),
-            normalized.float(),
-            (camera.pixel_scale(normalized) / threshold).float(),
+            torch.cat((points, ones), dim=-1).mT,
+            normalized,
+            camera.pixel_scale(normalized) / threshold,
         )
 
     def select(self, rows: Tensor) -> _Problem:
@@ -158,51 +159,58 @@ class _Problem:
         score = torch.where(valid, self.score(P), -1.0)
         best = score.topk(min(_CANDIDATES, score.shape[1]), dim=1).indices
         P = gather_rows(P.flatten(2), best).unflatten(-1, (3, 4))
-        state, cost = minimize((P[..., :3], P[..., 3]), self.evaluate, retract_pose, _LOCAL_ITERATIONS)
+        P, cost = self.fit(P)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
-        R, t = (gather_rows(x.flatten(2), best[:, None]).squeeze(1).unflatten(-1, x.shape[2:]) for x in state)
+        P = P[torch.arange(len(best), device=best.device), best]
+        R, t = P[..., :3], P[..., 3]
         near = (self.squared_errors(R, t) < SUPPORT_WIDTH**2) & self.mask
         return (R, t), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Tensor) -> Tensor:
         """Truncated scores of many poses, in float32. (B, M, 3, 4) -> (B, M)."""
-        return score_projections(P.float(), self.homogeneous, self.normalized, self.scale, self.mask)
+        homogeneous, normalized = self.homogeneous.float(), self.normalized.float()
+        return score_projections(P.float(), homogeneous, normalized, self.scale, self.mask)
 
-    def evaluate(self, R: Tensor, t: Tensor, width: float = 1.0) -> tuple[Tensor, Tensor]:
-        """Normal equations and truncated cost of (B, K) poses, in thresholds."""
-        residual, J, valid = self.residuals(R, t)
-        squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf)
-        used = (squared < width * width) & self.mask[:, None]
-        cost = torch.where(self.mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
-        rows = (
-            torch.cat((J, residual[..., None]), dim=-1).masked_fill(~used[..., None, None], 0.0).flatten(2, 3)
+    def fit(self, P: Tensor) -> tuple[Tensor, Tensor]:
+        """Local optimisation in undistorted coordinates. (B, K, 3, 4) -> the same, and costs (B, K)."""
+        axes = torch.eye(3, dtype=P.dtype, device=P.device)
+        translation = torch.cat(
+            (torch.zeros(3, 3, 3, dtype=P.dtype, device=P.device), axes[..., None]), dim=-1
         )
-        return rows.mT @ rows, cost
+        generators = skew(axes)
 
-    def residuals(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Reprojection errors in thresholds (B, K, N, 2), Jacobians (B, K, N, 2, 6), validity (B, K, N)."""
-        K = t.shape[1]
-        points_c = (self.points[:, None] @ R.mT + t[:, :, None]).flatten(1, 2)
-        projected, valid, J = self.camera.project_with_point_jacobians(points_c)
-        J = J / self.threshold
-        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
-        residual = (projected.unflatten(1, (K, -1)) - self.pixels[:, None]) / self.threshold
-        J = torch.cat((J, J_rotation), dim=-1).unflatten(1, (K, -1))
-        return residual, J, valid.unflatten(1, (K, -1))
+        def tangent(P: Tensor) -> Tensor:
+            return torch.cat((translation.expand(*P.shape[:2], 3, 3, 4), generators @ P[:, :, None]), dim=2)
+
+        def retract(P: Tensor, step: Tensor) -> Tensor:
+            R, t = retract_pose((P[..., :3], P[..., 3]), step)
+            return torch.cat((R, t[..., None]), dim=-1)
+
+        return fit_projections(
+            P, self.homogeneous, self.normalized, self.scale, self.mask, tangent, retract, _LOCAL_ITERATIONS
+        )
 
     def squared_errors(self, R: Tensor, t: Tensor) -> Tensor:
         """Squared errors in thresholds of one pose per problem; infinite behind the camera. (B, N)."""
-        residual, _, valid = self.residuals(R[:, None], t[:, None])
-        return (residual * residual).sum(-1).masked_fill(~valid, torch.inf)[:, 0]
+        projected, valid = self.camera.project(transform(rigid(R, t), self.points))
+        squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
+        return squared.masked_fill(~valid, torch.inf)
 
     def refine(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The minimum of the truncated squared error, and the rows (B, N) that it uses."""
+        """The minimum of the truncated squared reprojection error, and the rows (B, N) that it uses."""
 
         def evaluate(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            return self.evaluate(R, t, _FINAL_WIDTH)
+            points_c = self.points @ R.mT + t[:, None]
+            projected, valid, J = self.camera.project_with_point_jacobians(points_c)
+            residual = projected - self.pixels
+            squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / self.threshold**2
+            used, cost = truncated_rows(squared[:, None], self.mask, _FINAL_WIDTH)
+            J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
+            rows = torch.cat((J, J_rotation, residual[..., None]), dim=-1) * used[:, 0, :, None, None]
+            rows = rows.flatten(1, 2)
+            return rows.mT @ rows, cost[:, 0]
 
-        state, _ = minimize((R[:, None], t[:, None]), evaluate, retract_pose, _FINAL_ITERATIONS)
-        R, t = state[0][:, 0], state[1][:, 0]
+        R, t = minimize((R, t), evaluate, retract_pose, _FINAL_ITERATIONS)[0]
         return R, t, (self.squared_errors(R, t) < _FINAL_WIDTH**2) & self.mask
 
 

@@ -56,8 +56,8 @@ def small_rotation(omega: Tensor) -> Tensor:
     return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, W + W @ W)
 
 
-def retract_pose(state: State, step: Tensor) -> State:
+def retract_pose(pose: State, step: Tensor) -> State:
     """Moves (R, t) by [rho, omega] from the left. (..., 3, 3), (..., 3), (..., 6)."""
-    R, t = state
-    moved = small_rotation(step[..., 3:]) @ torch.cat((R, t[..., None]), dim=-1)
-    return moved[..., :3], moved[..., 3] + step[..., :3]
+    R, t = pose
+    turn = small_rotation(step[..., 3:])
+    return turn @ R, (turn @ t[..., None]).squeeze(-1) + step[..., :3]

@@ -59,19 +59,10 @@ def truncated_score(squared: Tensor, mask: Tensor) -> Tensor:
     return (gain @ mask.to(gain.dtype)[..., None]).squeeze(-1)
 
 
-def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, mask: Tensor) -> Tensor:
-    """Truncated scores of many projections or homographies.
-
-    P: (B, M, 3, D); homogeneous: (B, D, N) what they map; x: (B, N, 2) to where; scale: (B, N) thresholds per unit
-    of x; mask: (B, N). Returns (B, M). A negative depth counts as an outlier.
-    """
-    M = P.shape[1]
-    u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, M)).unbind(1)
-    du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
-    dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
-    # Behind the camera the denominator vanishes and the error becomes huge.
-    factor = (scale[:, None].to(w.dtype) / w.clamp_min_(1e-6)).square_()
-    return truncated_score(du.square_().addcmul_(dv, dv).mul_(factor), mask)
+def truncated_rows(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:
+    """Which rows count, (B, K, N), and the truncated cost, (B, K), of squared residuals (B, K, N)."""
+    cost = torch.where(mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
+    return (squared < width * width) & mask[:, None], cost
 
 
 def search(

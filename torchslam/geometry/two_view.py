@@ -6,7 +6,6 @@ match would have to move in both images together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,12 +17,13 @@ from torchslam.geometry.essential import decompose_essential, essential_from_pos
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
 from torchslam.geometry.least_squares import State, minimize, small_rotation
 from torchslam.geometry.lie import skew
+from torchslam.geometry.projections import fit_projections, score_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     gather_rows,
     pad_groups,
     sample_minimal,
-    score_projections,
+    truncated_rows,
     truncated_score,
 )
 
@@ -99,12 +99,6 @@ class TwoViews:
         return (self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()).rsqrt() / 1.5
 
 
-def _truncated(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """Which rows count, and the truncated cost, of squared residuals (B, K, N) with a mask (B, N)."""
-    cost = torch.where(mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
-    return (squared < width * width) & mask[:, None], cost
-
-
 def best_of(state: State, cost: Tensor) -> tuple[State, Tensor]:
     """The candidate of least cost of each problem. (B, K, ...), (B, K) -> (B, ...), (B,)."""
     cost, best = cost.nan_to_num(torch.inf).min(dim=1)
@@ -166,7 +160,7 @@ def fit_essential(views: TwoViews, state: State, iterations: int, width: float =
         residual = value[:, :, :1] * inverse
         # d(c / s) = dc / s - c ds / s^2, with ds = (half the derivative of s^2) / s
         J = torch.addcmul(value[:, :, 1:] * inverse, residual * inverse * inverse, spread[:, :, 1:], value=-1)
-        used, cost = _truncated(residual.squeeze(2).square(), views.mask, width)
+        used, cost = truncated_rows(residual.squeeze(2).square(), views.mask, width)
         rows = torch.cat((J, residual), dim=2) * used[:, :, None]
         return rows @ rows.mT, cost
 
@@ -212,37 +206,6 @@ def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
     return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
-def _fit_mapping(
-    views: TwoViews,
-    H: Tensor,
-    tangent: Callable[[Tensor], Tensor],
-    retract: Callable[[State, Tensor], State],
-    iterations: int,
-    width: float,
-) -> tuple[Tensor, Tensor]:
-    """Optimises mappings H (B, K, 3, 3) whose derivatives by local parameters are `tangent(H)` (B, K, D, 3, 3)."""
-    scale = views.transfer_scale[:, None, None]
-    h_1, x_2 = views.h_1.mT, views.x_2.mT[:, None, :, None]
-
-    def evaluate(H: Tensor) -> tuple[Tensor, Tensor]:
-        both = torch.cat((H[:, :, None], tangent(H)), dim=2)
-        x, y, z = (both.transpose(2, 3).flatten(1, 3) @ h_1).unflatten(1, (H.shape[1], 3, -1)).unbind(2)
-        inverse = scale / z[:, :, :1].clamp_min(1e-9)
-        u, v = x[:, :, :1] * inverse / scale, y[:, :, :1] * inverse / scale
-        # derivatives of x / z and y / z; the first row becomes the residual
-        du, dv = torch.addcmul(x, u, z, value=-1) * inverse, torch.addcmul(y, v, z, value=-1) * inverse
-        residual = torch.stack(((u - x_2[:, :, 0]) * scale, (v - x_2[:, :, 1]) * scale), dim=-1)
-        used, cost = _truncated(residual.square().sum(-1).squeeze(2), views.mask, width)
-        rows = (
-            torch.cat((torch.stack((du, dv), dim=-1)[:, :, 1:], residual), dim=2) * used[:, :, None, :, None]
-        )
-        rows = rows.flatten(3)
-        return rows @ rows.mT, cost
-
-    (H,), cost = minimize((H,), evaluate, retract, iterations)
-    return H, cost
-
-
 def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
     """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
     entries = torch.eye(8, 9, dtype=H.dtype, device=H.device).unflatten(-1, (3, 3))
@@ -250,10 +213,10 @@ def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1
     def tangent(H: Tensor) -> Tensor:
         return entries.expand(*H.shape[:2], 8, 3, 3)
 
-    def retract(state: State, step: Tensor) -> State:
-        return (state[0] + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3)),)
+    def retract(H: Tensor, step: Tensor) -> Tensor:
+        return H + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3))
 
-    return _fit_mapping(views, H, tangent, retract, iterations, width)
+    return fit_projections(H, *_transfer(views), tangent, retract, iterations, width)
 
 
 def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -263,10 +226,15 @@ def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0
     def tangent(R: Tensor) -> Tensor:
         return generators @ R[:, :, None]
 
-    def retract(state: State, step: Tensor) -> State:
-        return (small_rotation(step) @ state[0],)
+    def retract(R: Tensor, step: Tensor) -> Tensor:
+        return small_rotation(step) @ R
 
-    return _fit_mapping(views, R, tangent, retract, iterations, width)
+    return fit_projections(R, *_transfer(views), tangent, retract, iterations, width)
+
+
+def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The matches as a problem for `fit_projections`."""
+    return views.h_1.mT, views.x_2, views.transfer_scale, views.mask
 
 
 def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
