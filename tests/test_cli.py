@@ -18,7 +18,7 @@ from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.output.map_file import read_map
 
-ROOM = "synthetic:room?frames=24"
+ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
 
 
@@ -65,7 +65,7 @@ def test_run_writes_all_results(finished: Path) -> None:
     }
     assert names == files | {"metrics.json", "frames.csv", "example.png"} | pictures
     figures = json.loads((finished / "metrics.json").read_text())
-    assert figures["frames"] == 24
+    assert figures["frames"] == 16
     assert len(read_trajectory(finished / "trajectory.txt")) == figures["posed"]
     assert len(read_trajectory(finished / "keyframes.txt")) == figures["keyframes"]
     assert read_map(finished / "map.safetensors")[0].num_points == figures["points"]
@@ -124,16 +124,25 @@ def test_demo_shares_the_way_of_run(
     status, out, err = run_and_read(capsys, "demo", "--output", str(tmp_path / "demo"), *FAST)
     assert status == 0
     assert "ATE" in out
-    assert "24/24" in err
+    assert "16/16" in err
     assert "tracking" in err
     assert (tmp_path / "demo" / "plots" / "scene.png").exists()
 
 
 def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
-    arguments = ["--features", "simulated", "--scale", "groundtruth", "--limit", "20"]
+    arguments = [
+        "--features",
+        "simulated",
+        "--scale",
+        "groundtruth",
+        "--limit",
+        "12",
+        "--set",
+        "features.num_keypoints=300",
+    ]
     assert main(["run", ROOM + "&blank=1", "--output", str(tmp_path), *arguments]) == 0
     figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures["frames"] == 20
+    assert figures["frames"] == 12
     assert figures["scale"] == pytest.approx(1.0, abs=1e-3)
 
 
@@ -154,7 +163,7 @@ def test_interrupt_writes_what_there_is(
     original = SyntheticSequence.image
 
     def image(self: SyntheticSequence, index: int) -> torch.Tensor:
-        if index == 15:
+        if index == 9:
             os.kill(os.getpid(), signal.SIGINT)
         return original(self, index)
 
@@ -164,7 +173,7 @@ def test_interrupt_writes_what_there_is(
     assert "interrupted" in err
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["interrupted"]
-    assert figures["frames"] == 16
+    assert figures["frames"] == 10
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == figures["posed"] > 0
 
 

@@ -26,6 +26,8 @@ def plot_features(
     previous:  (N, 2) pixels of the same map points in an earlier frame, NaN where it did not see them
     lengths:   (N,) in how many keyframes the point was seen, for the colour
     """
+    from matplotlib.ticker import MaxNLocator
+
     grey = image.detach().cpu().float().numpy()
     height, width = grey.shape
     is_matched = matched.cpu().numpy()
@@ -58,8 +60,9 @@ def plot_features(
             zorder=3,
         )
         if is_matched.any():
+            ticks = MaxNLocator(integer=True)
             figure.colorbar(
-                dots, ax=axes, shrink=0.7, pad=0.015, label="keyframes that saw the point", format="%d"
+                dots, ax=axes, shrink=0.7, pad=0.015, ticks=ticks, label="keyframes that saw the point"
             )
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")
         axes.grid(visible=False)
