@@ -12,9 +12,9 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.least_squares import State, minimize, retract_pose
-from torchslam.geometry.lie import rigid, se3_exp, skew, transform
+from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
-from torchslam.geometry.projections import fit_projections, score_projections
+from torchslam.geometry.projections import fit_projections, pose_tangent, score_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     gather_rows,
@@ -77,7 +77,7 @@ def estimate_absolute_pose(
     with torch.no_grad():
         generator = torch.Generator().manual_seed(seed)
         problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
-        R, t = search(
+        (P,) = search(
             lambda rows, count: problem.select(rows).propose(count, generator),
             mask.sum(-1),
             3,
@@ -85,15 +85,18 @@ def estimate_absolute_pose(
             _FIRST_ROUND,
             max_samples,
         )
-        R, t, used = problem.refine(R, t)
-        squared = problem.squared_errors(R, t)
+        P = problem.refine(P)
+        squared = problem.squared_errors(P)
         inliers = (squared < 1) & mask
         success = _is_success(inliers, mask, problem.points, camera, threshold)
         score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-        t = t - (R @ problem.centre[..., None]).squeeze(-1)
-        T_cw = torch.where(success[:, None, None], rigid(R, t), torch.eye(4, dtype=R.dtype, device=R.device))
+        t = P[..., 3] - (P[..., :3] @ problem.centre[..., None]).squeeze(-1)
+        T_cw = torch.where(
+            success[:, None, None], rigid(P[..., :3], t), torch.eye(4, dtype=t.dtype, device=t.device)
+        )
     if needs_gradient(points_w, pixels, camera.params):
-        T_cw = _with_gradient(T_cw, points_w, pixels, camera, used & success[:, None])
+        used = (squared < _FINAL_WIDTH**2) & mask & success[:, None]
+        T_cw = _with_gradient(T_cw, points_w, pixels, camera, used)
     return AbsolutePose(T_cw, inliers & success[:, None], success, score)
 
 
@@ -102,7 +105,7 @@ class _Problem:
     """The data of the search. Points are relative to their mean, so that float32 is enough for scores.
 
     points, pixels, mask, rays: (B, N, ...); camera; threshold in pixels; centre: (B, 3) mean of the points
-    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N) thresholds per unit of them
+    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N, 2) thresholds per unit of them
     """
 
     points: Tensor
@@ -159,48 +162,38 @@ class _Problem:
         score = torch.where(valid, self.score(P), -1.0)
         best = score.topk(min(_CANDIDATES, score.shape[1]), dim=1).indices
         P = gather_rows(P.flatten(2), best).unflatten(-1, (3, 4))
-        P, cost = self.fit(P)
+        P, cost = self.fit(P, _LOCAL_ITERATIONS, 1.0)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         P = P[torch.arange(len(best), device=best.device), best]
-        R, t = P[..., :3], P[..., 3]
-        near = (self.squared_errors(R, t) < SUPPORT_WIDTH**2) & self.mask
-        return (R, t), self.mask.sum(-1) - cost, near.sum(-1)
+        near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
+        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Tensor) -> Tensor:
         """Truncated scores of many poses, in float32. (B, M, 3, 4) -> (B, M)."""
         homogeneous, normalized = self.homogeneous.float(), self.normalized.float()
         return score_projections(P.float(), homogeneous, normalized, self.scale, self.mask)
 
-    def fit(self, P: Tensor) -> tuple[Tensor, Tensor]:
-        """Local optimisation in undistorted coordinates. (B, K, 3, 4) -> the same, and costs (B, K)."""
-        axes = torch.eye(3, dtype=P.dtype, device=P.device)
-        translation = torch.cat(
-            (torch.zeros(3, 3, 3, dtype=P.dtype, device=P.device), axes[..., None]), dim=-1
-        )
-        generators = skew(axes)
-
-        def tangent(P: Tensor) -> Tensor:
-            return torch.cat((translation.expand(*P.shape[:2], 3, 3, 4), generators @ P[:, :, None]), dim=2)
-
-        def retract(P: Tensor, step: Tensor) -> Tensor:
-            R, t = retract_pose((P[..., :3], P[..., 3]), step)
-            return torch.cat((R, t[..., None]), dim=-1)
-
+    def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
+        """Poses (B, K, 3, 4) of least truncated error in undistorted coordinates, and their costs (B, K)."""
+        tangent = pose_tangent(P.dtype, P.device)
         return fit_projections(
-            P, self.homogeneous, self.normalized, self.scale, self.mask, tangent, retract, _LOCAL_ITERATIONS
+            P, tangent, self.homogeneous, self.normalized, self.scale, self.mask, iterations, width
         )
 
-    def squared_errors(self, R: Tensor, t: Tensor) -> Tensor:
+    def squared_errors(self, P: Tensor) -> Tensor:
         """Squared errors in thresholds of one pose per problem; infinite behind the camera. (B, N)."""
-        projected, valid = self.camera.project(transform(rigid(R, t), self.points))
+        projected, valid = self.camera.project((P @ self.homogeneous).mT)
         squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
         return squared.masked_fill(~valid, torch.inf)
 
-    def refine(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The minimum of the truncated squared reprojection error, and the rows (B, N) that it uses."""
+    def refine(self, P: Tensor) -> Tensor:
+        """The poses (B, 3, 4) of least truncated squared reprojection error."""
+        P = self.fit(P[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)[0][:, 0]
+        if self.camera.model == "pinhole":
+            return P  # whose undistorted coordinates are pixels up to their scale
 
-        def evaluate(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            points_c = self.points @ R.mT + t[:, None]
+        def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
+            points_c = (P @ self.homogeneous).mT
             projected, valid, J = self.camera.project_with_point_jacobians(points_c)
             residual = projected - self.pixels
             squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / self.threshold**2
@@ -210,8 +203,8 @@ class _Problem:
             rows = rows.flatten(1, 2)
             return rows.mT @ rows, cost[:, 0]
 
-        R, t = minimize((R, t), evaluate, retract_pose, _FINAL_ITERATIONS)[0]
-        return R, t, (self.squared_errors(R, t) < _FINAL_WIDTH**2) & self.mask
+        (P,), _ = minimize((P,), evaluate, retract_pose, _FINAL_ITERATIONS)
+        return P
 
 
 def _is_success(inliers: Tensor, mask: Tensor, points: Tensor, camera: Camera, threshold: float) -> Tensor:

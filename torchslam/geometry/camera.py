@@ -205,16 +205,15 @@ class Camera:
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
     def pixel_scale(self, normalized: Tensor) -> Tensor:
-        """Pixels per unit of undistorted image coordinates, locally, without gradient.
+        """Pixels per unit of undistorted image coordinates, along x and y, locally, without gradient.
 
-        (..., N, 2) -> (..., N).
+        (..., N, 2) -> (..., N, 2). Exact without distortion; with it, the mean over all directions.
         """
-        params = self.params.detach()
-        scale = (params[..., 0] * params[..., 1]).abs().sqrt()[..., None].expand(normalized.shape[:-1])
+        scale = self.params.detach()[..., None, :2].expand(normalized.shape)
         if self.model == "pinhole":
             return scale
-        J = self._distortion.slope(normalized.detach(), params[..., None, 4:])
-        return scale * torch.linalg.det(J).abs().sqrt()
+        J = self._distortion.slope(normalized.detach(), self.params.detach()[..., None, 4:])
+        return scale * torch.linalg.det(J).abs().sqrt()[..., None]
 
     def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:
         """Pixels of distorted image coordinates; the middle of the image, a constant, where invalid."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -48,16 +49,21 @@ def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(condition.reshape(condition.shape + (1,) * (new.dim() - condition.dim())), new, old)
 
 
+@lru_cache(maxsize=16)
+def generators(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(3, 3, 3) the matrices of the cross products with the axes."""
+    return skew(torch.eye(3, dtype=dtype, device=device))
+
+
 def small_rotation(omega: Tensor) -> Tensor:
     """Cayley's rotation, equal to exp(omega) to second order, and cheaper. (..., 3) -> (..., 3, 3)."""
     half = 0.5 * omega
-    W = skew(half)
+    W = (half @ generators(omega.dtype, omega.device).flatten(1)).view(*omega.shape, 3)
     factor = 2 / (1 + (half * half).sum(-1))[..., None, None]
     return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, W + W @ W)
 
 
 def retract_pose(pose: State, step: Tensor) -> State:
-    """Moves (R, t) by [rho, omega] from the left. (..., 3, 3), (..., 3), (..., 6)."""
-    R, t = pose
-    turn = small_rotation(step[..., 3:])
-    return turn @ R, (turn @ t[..., None]).squeeze(-1) + step[..., :3]
+    """Moves [R t] by [rho, omega] from the left. (..., 3, 4), (..., 6)."""
+    moved = small_rotation(step[..., 3:]) @ pose[0]
+    return (moved + torch.nn.functional.pad(step[..., :3, None], (3, 0)),)

@@ -53,11 +53,11 @@ def vee(W: Tensor) -> Tensor:
 
 def rigid(R: Tensor, t: Tensor) -> Tensor:
     """Homogeneous matrix [R t; 0 1]. (..., 3, 3), (..., 3) -> (..., 4, 4)."""
-    shape = torch.broadcast_shapes(R.shape[:-2], t.shape[:-1])
-    top = torch.cat((R.expand(*shape, 3, 3), t.expand(*shape, 3)[..., None]), dim=-1)
-    bottom = torch.zeros(*shape, 1, 4, dtype=top.dtype, device=top.device)
-    bottom[..., 3] = 1.0
-    return torch.cat((top, bottom), dim=-2)
+    if R.shape[:-2] != t.shape[:-1]:
+        shape = torch.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+        R, t = R.expand(*shape, 3, 3), t.expand(*shape, 3)
+    bottom = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=R.dtype, device=R.device).expand(*t.shape[:-1], 1, 4)
+    return torch.cat((torch.cat((R, t[..., None]), dim=-1), bottom), dim=-2)
 
 
 def transform(T: Tensor, points: Tensor) -> Tensor:

@@ -1,17 +1,19 @@
 """Scores and fits of what maps homogeneous points to image coordinates: poses, homographies, pure rotations.
 
 All map homogeneous (B, D, N) points by P (3, D) to x (B, N, 2): D = 4 for scene points, D = 3 for image points.
-Errors are in thresholds, of which `scale` (B, N) go into one unit of x; rows outside `mask` (B, N) do not count.
+Errors are in thresholds, of which `scale` (B, N, 1 or 2) go into one unit of x; rows outside `mask` (B, N) do not count.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from torchslam.geometry.least_squares import State, minimize
+from torchslam.geometry.least_squares import State, generators, minimize, retract_pose, small_rotation
 from torchslam.geometry.ransac import truncated_rows, truncated_score
 
 
@@ -25,46 +27,99 @@ def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, 
     du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
     dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
     # Behind the camera the denominator vanishes and the error becomes huge.
-    factor = (scale[:, None].to(w.dtype) / w.clamp_min_(1e-6)).square_()
-    return truncated_score(du.square_().addcmul_(dv, dv).mul_(factor), mask)
+    inverse, scale = w.clamp_min_(1e-6).reciprocal_(), scale.to(w.dtype)[:, None]
+    du, dv = du.mul_(inverse).mul_(scale[..., 0]), dv.mul_(inverse).mul_(scale[..., -1])
+    return truncated_score(du.square_().addcmul_(dv, dv), mask)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """How a mapping P (3, D) depends on T local parameters.
+
+    constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of P and of its T derivatives, as an affine
+    function of the entries of P, ordered by row of P, parameter, column of P
+    retract: (P,), step (..., T) -> (P,)
+    """
+
+    constant: Tensor
+    linear: Tensor
+    retract: Callable[[State, Tensor], State]
+
+    @staticmethod
+    def of(
+        derivatives: Callable[[Tensor], Tensor],
+        retract: Callable[[State, Tensor], State],
+        columns: int,
+        dtype: torch.dtype,
+        device: torch.device,
+    ) -> Tangent:
+        """From the derivatives, an affine function of P: (3, D) -> (T, 3, D)."""
+
+        def entries(P: Tensor) -> Tensor:
+            return torch.cat((P[None], derivatives(P))).transpose(0, 1).flatten()
+
+        constant = entries(torch.zeros(3, columns, dtype=dtype, device=device))
+        units = torch.eye(3 * columns, dtype=dtype, device=device).unflatten(-1, (3, columns))
+        return Tangent(constant, torch.stack([entries(unit) - constant for unit in units]), retract)
+
+
+@lru_cache(maxsize=16)
+def pose_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
+    """Of poses [R t], by [rho, omega] from the left."""
+    axes = generators(dtype, device)
+    translation = torch.nn.functional.pad(torch.eye(3, dtype=dtype, device=device)[..., None], (3, 0))
+    return Tangent.of(lambda P: torch.cat((translation, axes @ P)), retract_pose, 4, dtype, device)
+
+
+@lru_cache(maxsize=16)
+def rotation_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
+    """Of rotations, by omega from the left."""
+    axes = generators(dtype, device)
+    return Tangent.of(lambda R: axes @ R, lambda R, step: (small_rotation(step) @ R[0],), 3, dtype, device)
+
+
+@lru_cache(maxsize=16)
+def homography_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
+    """Of homographies whose last entry stays one, by the other eight."""
+    entries = torch.eye(8, 9, dtype=dtype, device=device).unflatten(-1, (3, 3))
+
+    def retract(H: State, step: Tensor) -> State:
+        return (H[0] + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3)),)
+
+    return Tangent.of(lambda H: entries, retract, 3, dtype, device)
 
 
 def fit_projections(
     P: Tensor,
+    tangent: Tangent,
     homogeneous: Tensor,
     x: Tensor,
     scale: Tensor,
     mask: Tensor,
-    tangent: Callable[[Tensor], Tensor],
-    retract: Callable[[Tensor, Tensor], Tensor],
     iterations: int,
     width: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
     """Mappings (B, K, 3, D) of least truncated squared error near the given ones, and their costs (B, K).
 
-    tangent: P -> (B, K, T, 3, D), derivatives by the T local parameters; retract: P, step (B, K, T) -> P; width: in
-    thresholds, where the error is truncated.
+    width: in thresholds, where the error is truncated.
     """
-    scale, x_u, x_v = scale[:, None, None], x[:, None, None, :, 0], x[:, None, None, :, 1]
-    K = P.shape[1]
+    B, K, _, D = P.shape
+    T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]
+    scale = scale.mT[:, None, :, None]
+    x = x.mT[:, None, :, None]
 
     def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
-        rows = torch.cat((P[:, :, None], tangent(P)), dim=2)  # the mapping, then its derivatives
-        u, v, w = (rows.transpose(2, 3).flatten(1, 3) @ homogeneous).unflatten(1, (K, 3, -1)).unbind(2)
-        inverse = w[:, :, :1].clamp_min(1e-9).reciprocal()
-        image_u, image_v = u[:, :, :1] * inverse, v[:, :, :1] * inverse
+        rows = torch.addmm(tangent.constant, P.reshape(B * K, 3 * D), tangent.linear)
+        mapped = torch.bmm(rows.view(B, -1, D), homogeneous).view(B, K, 3, T + 1, N)
+        inverse = mapped[:, :, 2:, :1].clamp_min(1e-9).reciprocal()
+        image = mapped[:, :, :2, :1] * inverse
         # d(u / w) = (du - (u / w) dw) / w; the row of the mapping itself becomes the residual
-        inverse = inverse * scale
-        J_u = torch.addcmul(u, image_u, w, value=-1)[:, :, 1:] * inverse
-        J_v = torch.addcmul(v, image_v, w, value=-1)[:, :, 1:] * inverse
-        r_u, r_v = (image_u - x_u) * scale, (image_v - x_v) * scale
-        used, cost = truncated_rows((r_u * r_u + r_v * r_v).squeeze(2), mask, width)
-        rows = torch.cat((torch.cat((J_u, r_u), dim=2), torch.cat((J_v, r_v), dim=2)), dim=-1)
-        rows = rows * used.repeat(1, 1, 2)[:, :, None]
-        return rows @ rows.mT, cost
+        J = torch.addcmul(mapped[:, :, :2, 1:], image, mapped[:, :, 2:, 1:], value=-1) * (inverse * scale)
+        residual = (image - x) * scale
+        used, cost = truncated_rows(residual.square().sum((2, 3)), mask, width)
+        rows = torch.cat((J, residual), dim=3) * used[:, :, None, None]
+        rows = rows.transpose(2, 3).reshape(B * K, T + 1, 2 * N)
+        return torch.bmm(rows, rows.mT).view(B, K, T + 1, T + 1), cost
 
-    def move(state: State, step: Tensor) -> State:
-        return (retract(state[0], step),)
-
-    (P,), cost = minimize((P,), evaluate, move, iterations)
+    (P,), cost = minimize((P,), evaluate, tangent.retract, iterations)
     return P, cost

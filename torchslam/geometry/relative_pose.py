@@ -162,7 +162,7 @@ def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int)
         _FIRST_ROUND,
         max_samples,
     )
-    (R, t), _ = fit_essential(views, (R[:, None], t[:, None]), _FINAL_ITERATIONS, _FINAL_WIDTH)
+    R, t, _ = fit_essential(views, R[:, None], t[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
     essential = sampson_squared(views, R, t)
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
     near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))

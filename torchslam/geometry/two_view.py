@@ -7,7 +7,7 @@ match would have to move in both images together.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -15,9 +15,14 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
-from torchslam.geometry.least_squares import State, minimize, small_rotation
+from torchslam.geometry.least_squares import State, generators, minimize, small_rotation
 from torchslam.geometry.lie import skew
-from torchslam.geometry.projections import fit_projections, score_projections
+from torchslam.geometry.projections import (
+    fit_projections,
+    homography_tangent,
+    rotation_tangent,
+    score_projections,
+)
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     gather_rows,
@@ -52,8 +57,11 @@ class TwoViews:
         pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera, threshold: float, mask: Tensor
     ) -> TwoViews:
         x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
-        scale_1, scale_2 = camera_1.pixel_scale(x_1) / threshold, camera_2.pixel_scale(x_2) / threshold
-        return TwoViews(x_1, x_2, scale_1.expand_as(mask), scale_2.expand_as(mask), mask)
+        scale_1, scale_2 = (
+            camera.pixel_scale(x).prod(-1).sqrt() / threshold
+            for camera, x in ((camera_1, x_1), (camera_2, x_2))
+        )
+        return TwoViews(x_1, x_2, scale_1, scale_2, mask)
 
     def select(self, rows: Tensor) -> TwoViews:
         """Some of the problems."""
@@ -114,64 +122,79 @@ def sampson_squared(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
     E = essential_from_pose(R, t)
     constraint, variance = views.epipolar
     squared = (E.flatten(-2) @ constraint).square()
-    return squared / (_variance_form(E, E) @ variance).clamp_min(torch.finfo(R.dtype).tiny)
+    return squared / (_variance_form(E) @ variance).clamp_min(torch.finfo(R.dtype).tiny)
 
 
-def _variance_form(E: Tensor, F: Tensor) -> Tensor:
-    """Coefficients of the variance of the constraint, bilinear in E and F. (..., 3, 3) twice -> (..., 18)."""
-    rows = E[..., :2, :].mT @ F[..., :2, :]
-    columns = E[..., :2] @ F[..., :2].mT
+def _variance_form(E: Tensor) -> Tensor:
+    """The coefficients of the variance of the constraint. (..., 3, 3) -> (..., 18)."""
+    rows, columns = E[..., :2, :].mT @ E[..., :2, :], E[..., :2] @ E[..., :2].mT
     return torch.cat((rows, columns), dim=-2).flatten(-2)
+
+
+@lru_cache(maxsize=16)
+def _essential_tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Two linear maps that make E, its derivatives and those of its variance matrix products.
+
+    (9, 54): from the frame of the direction (t, a, b, as rows) to the left factors L of E = L R and of its
+    derivatives by the rotation (three) and by turning the frame about its b and a; (9, 162): from E to the (9, 18)
+    matrix that takes dE to half the derivative of `_variance_form`.
+    """
+    axes = generators(dtype, device)
+    units = torch.eye(9, dtype=dtype, device=device).unflatten(-1, (3, 3))
+    crosses = skew(units)  # (9, row of the frame, 3, 3)
+    left = torch.cat((crosses[:, :1], crosses[:, :1] @ axes, crosses[:, 1:2], -crosses[:, 2:]), dim=1)
+    bilinear = [[_variance_form(E + F) - _variance_form(E) - _variance_form(F) for F in units] for E in units]
+    return left.flatten(1), 0.5 * torch.stack([torch.stack(row) for row in bilinear]).flatten(1)
 
 
 def tangent_basis(t: Tensor) -> Tensor:
     """Two unit vectors perpendicular to t and to each other. (..., 3) -> (..., 2, 3)."""
-    smallest = t.abs().argmin(-1, keepdim=True)
-    axis = torch.zeros_like(t).scatter(-1, smallest, 1.0)
+    axis = torch.nn.functional.one_hot(t.abs().argmin(-1), 3).to(t.dtype)
     a = torch.linalg.cross(t, axis, dim=-1)
     a = a / a.norm(dim=-1, keepdim=True)
     return torch.stack((a, torch.linalg.cross(t, a, dim=-1)), dim=-2)
 
 
-def _essential_tangent(R: Tensor, t: Tensor) -> Tensor:
-    """E and its derivatives by the rotation from the left and the directions of `tangent_basis`. (..., 6, 3, 3)."""
-    generators = skew(torch.eye(3, dtype=t.dtype, device=t.device))
-    cross = skew(torch.cat((t[..., None, :], tangent_basis(t)), dim=-2))
-    rotation = cross[..., :1, :, :] @ generators
-    return torch.cat((cross[..., :1, :, :], rotation, cross[..., 1:, :, :]), dim=-3) @ R[..., None, :, :]
-
-
 def _retract_essential(state: State, step: Tensor) -> State:
-    R, t = state
-    t = t + (step[..., None, 3:] @ tangent_basis(t)).squeeze(-2)
-    return small_rotation(step[..., :3]) @ R, t / t.norm(dim=-1, keepdim=True)
+    """Turns R from the left and the frame of t, whose rows are t, a, b, about its own b and a."""
+    turns = torch.stack((step[..., :3], -torch.nn.functional.pad(step[..., 3:].flip(-1), (1, 0))), dim=-2)
+    return (small_rotation(turns) @ state[0],)
 
 
-def fit_essential(views: TwoViews, state: State, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
-    """Optimises (R, t) of (B, K) candidates; also returns their truncated costs (B, K)."""
+def fit_essential(
+    views: TwoViews, R: Tensor, t: Tensor, iterations: int, width: float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their truncated costs (B, K)."""
+    B, K = t.shape[:2]
     constraint, variance = views.epipolar
+    left_table, variance_table = _essential_tables(R.dtype, R.device)
+    frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
 
-    def evaluate(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        K, E = t.shape[1], _essential_tangent(R, t)
-        form = _variance_form(E[:, :, :1], E)
-        value = (E.flatten(1, 2).flatten(2) @ constraint).unflatten(1, (K, 6))
-        spread = (form.flatten(1, 2) @ variance).unflatten(1, (K, 6))
+    def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
+        R, frame = pose.reshape(B * K, 2, 9).unbind(1)
+        left = (frame @ left_table).view(B * K, 18, 3)
+        E = torch.bmm(left, R.view(B * K, 3, 3)).view(B * K, 6, 9)
+        form = torch.bmm(E, (E[:, 0] @ variance_table).view(B * K, 9, 18))
+        value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, -1)
+        spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, -1)
         inverse = spread[:, :, :1].clamp_min(torch.finfo(R.dtype).tiny).rsqrt()
-        residual = value[:, :, :1] * inverse
-        # d(c / s) = dc / s - c ds / s^2, with ds = (half the derivative of s^2) / s
-        J = torch.addcmul(value[:, :, 1:] * inverse, residual * inverse * inverse, spread[:, :, 1:], value=-1)
+        # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
+        rows = value * inverse
+        residual = rows[:, :, :1]
+        J = torch.addcmul(rows[:, :, 1:], residual * inverse * inverse, spread[:, :, 1:], value=-1)
         used, cost = truncated_rows(residual.squeeze(2).square(), views.mask, width)
-        rows = torch.cat((J, residual), dim=2) * used[:, :, None]
-        return rows @ rows.mT, cost
+        rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, -1)
+        return torch.bmm(rows, rows.mT).view(B, K, 6, 6), cost
 
-    return minimize(state, evaluate, _retract_essential, iterations)
+    (pose,), cost = minimize((torch.stack((R, frame), dim=2),), evaluate, _retract_essential, iterations)
+    return pose[:, :, 0], pose[:, :, 1, 0], cost
 
 
 def score_essential(views: TwoViews, E: Tensor) -> Tensor:
     """Truncated scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M)."""
     constraint, variance = views.epipolar_float
     squared = (E.flatten(-2).float() @ constraint).square_()
-    spread = (_variance_form(E, E).float() @ variance).clamp_min_(1e-20)
+    spread = (_variance_form(E).float() @ variance).clamp_min_(1e-20)
     return truncated_score(squared.div_(spread), views.mask)
 
 
@@ -192,7 +215,8 @@ def propose_essential(
         valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
     )
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
-    (R, t), cost = best_of(*fit_essential(views, (R, t), _ITERATIONS))
+    R, t, cost = fit_essential(views, R, t, _ITERATIONS)
+    (R, t), cost = best_of((R, t), cost)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
 
@@ -208,33 +232,17 @@ def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
 
 def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
     """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
-    entries = torch.eye(8, 9, dtype=H.dtype, device=H.device).unflatten(-1, (3, 3))
-
-    def tangent(H: Tensor) -> Tensor:
-        return entries.expand(*H.shape[:2], 8, 3, 3)
-
-    def retract(H: Tensor, step: Tensor) -> Tensor:
-        return H + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3))
-
-    return fit_projections(H, *_transfer(views), tangent, retract, iterations, width)
+    return fit_projections(H, homography_tangent(H.dtype, H.device), *_transfer(views), iterations, width)
 
 
 def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
     """Optimises pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
-    generators = skew(torch.eye(3, dtype=R.dtype, device=R.device))
-
-    def tangent(R: Tensor) -> Tensor:
-        return generators @ R[:, :, None]
-
-    def retract(R: Tensor, step: Tensor) -> Tensor:
-        return small_rotation(step) @ R
-
-    return fit_projections(R, *_transfer(views), tangent, retract, iterations, width)
+    return fit_projections(R, rotation_tangent(R.dtype, R.device), *_transfer(views), iterations, width)
 
 
 def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The matches as a problem for `fit_projections`."""
-    return views.h_1.mT, views.x_2, views.transfer_scale, views.mask
+    return views.h_1.mT, views.x_2, views.transfer_scale[..., None], views.mask
 
 
 def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
