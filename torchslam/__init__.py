@@ -1,3 +1,49 @@
-"""Monocular visual SLAM as a PyTorch program."""
+"""Monocular visual SLAM as a PyTorch program.
+
+sequence = torchslam.open_sequence(path)
+run = torchslam.SLAM(sequence.camera).run(sequence)
+torchslam.evaluate(run.trajectory, sequence.groundtruth).ate_m
+"""
+
+from torchslam.config import Config, load_config
+from torchslam.data import open_sequence
+from torchslam.errors import TorchslamError
+from torchslam.evaluation import evaluate
+from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
+from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, triangulate, umeyama
+from torchslam.run import Run
+from torchslam.slam import SLAM
+from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
+from torchslam.types import Features, Frame, Matches, State, StepResult, Trajectory
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "ALIKED",
+    "ORB",
+    "SLAM",
+    "BundleProblem",
+    "Camera",
+    "Config",
+    "Features",
+    "Frame",
+    "Matches",
+    "OpenCVORB",
+    "Run",
+    "State",
+    "StepResult",
+    "TorchslamError",
+    "Trajectory",
+    "XFeat",
+    "bundle_adjust",
+    "estimate_absolute_pose",
+    "estimate_relative_pose",
+    "evaluate",
+    "load_config",
+    "match",
+    "match_projected",
+    "open_sequence",
+    "refine_pose",
+    "triangulate",
+    "umeyama",
+]

@@ -71,7 +71,12 @@ def project_points(
 
 
 def match_near(
-    slam_map: Map, projected: Projected, view: View, radius_px: float, settings: MatchingConfig, ratio: float | None
+    slam_map: Map,
+    projected: Projected,
+    view: View,
+    radius_px: float,
+    settings: MatchingConfig,
+    ratio: float | None,
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) point ids and keypoints that match within a radius around the projection, one to one.
 

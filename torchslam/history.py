@@ -81,4 +81,6 @@ class History:
             )
             is_better = refined.success & (mask.sum(1) >= 10)
             moved = refined.T_cw @ se3_inverse(slam_map.T_cw[self.frames["reference"][rows]])
-            self.frames["T_cr"][rows] = torch.where(is_better[:, None, None], moved, self.frames["T_cr"][rows])
+            self.frames["T_cr"][rows] = torch.where(
+                is_better[:, None, None], moved, self.frames["T_cr"][rows]
+            )

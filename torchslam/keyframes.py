@@ -9,12 +9,12 @@ import torch
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import se3_inverse, so3_log, transform
 from torchslam.map import Map
-from torchslam.tracking import Tracked
+from torchslam.tracking import Tracked, Tracker
 from torchslam.types import View
 
 
 def why_keyframe(
-    view: View, tracked: Tracked, reference: int, slam_map: Map, settings: KeyframesConfig
+    view: View, tracked: Tracked, tracker: Tracker, slam_map: Map, settings: KeyframesConfig
 ) -> str:
     """Why a tracked frame should become a keyframe, in words; empty when it should not.
 
@@ -25,12 +25,11 @@ def why_keyframe(
     age = view.index - newest
     if age < max(1, settings.min_interval):
         return ""
-    T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[reference])
+    T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[tracker.reference])
     depth = transform(tracked.T_cw, slam_map.positions_w[tracked.point_ids])[:, 2].median()
     translation = float(torch.linalg.vector_norm(T_cr[:3, 3]) / depth)
     rotation = math.degrees(float(torch.linalg.vector_norm(so3_log(T_cr[:3, :3]))))
-    seen_by_reference = int((slam_map.keyframes["point_ids"][reference] >= 0).sum())
-    overlap = tracked.inliers / max(seen_by_reference, 1)
+    overlap = tracked.inliers / max(tracker.reference_size, 1)
     if translation > settings.max_translation:
         return f"moved by {translation:.2f} of the depth of the scene"
     if rotation > settings.max_rotation_deg:

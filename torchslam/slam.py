@@ -66,7 +66,7 @@ class SLAM:
         if tracked is None:
             return self._lose(view)
         self.state = State.TRACKING
-        why = why_keyframe(view, tracked, self.tracker.reference, self.map, self.config.keyframes)
+        why = why_keyframe(view, tracked, self.tracker, self.map, self.config.keyframes)
         if why:
             self.tracker.follow(self.mapper.insert(view, tracked))
         self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)

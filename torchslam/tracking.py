@@ -43,6 +43,7 @@ class Tracker:
         self.config = config
         self.map = slam_map
         self.reference = -1  # keyframe
+        self.reference_size = 0  # points of the reference keyframe that other keyframes see too
         self.T_cr = torch.eye(
             4, dtype=camera.params.dtype
         )  # last frame, seen from the reference: it moves with the map
@@ -72,6 +73,7 @@ class Tracker:
         self.reference = keyframe
         near = self.map.covisible(keyframe, self.config.tracking.local_keyframes)
         self.local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
+        self.reference_size = self._well_observed(keyframe)
         recent = self.config.tracking.recent_frames
         if recent:
             last_seen = self.map.points["last_seen"]
@@ -80,6 +82,14 @@ class Tracker:
             )[:, 0]
         else:
             self.local_points = self.map.points_seen_by(self.local_keyframes)
+
+    def _well_observed(self, keyframe: int) -> int:
+        """How many points of a keyframe three local keyframes see: what the next frames can be expected to see."""
+        table = self.map.keyframes["point_ids"]
+        local = table[self.local_keyframes].flatten()
+        counts = torch.bincount(local[local >= 0], minlength=len(self.map.points))
+        seen = table[keyframe]
+        return int((counts[seen[seen >= 0]] >= min(3, len(self.local_keyframes))).sum())
 
     def predict(self) -> Tensor:
         """(4, 4) where the next frame should be: constant velocity."""

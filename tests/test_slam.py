@@ -1,0 +1,174 @@
+"""The whole system: simulated features for the geometry, a rendered room for the images."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from tests.walks import Walk, arc, still, turn
+from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence
+from torchslam.errors import ConfigError, FrameError
+
+SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+
+
+def run_walk(walk: Walk, *overrides: str, progress: Callable[[StepResult], None] | None = None) -> Run:
+    return SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides])).run(walk, progress)
+
+
+def test_exact_features_give_the_exact_trajectory() -> None:
+    walk = Walk(arc(60))
+    run = run_walk(walk)
+    assert len(run.trajectory) == 60  # frames before the start are posed once there is a map
+    result = evaluate(run.trajectory, walk.groundtruth)
+    assert result.ate_m < 1e-4 * result.path_length_m
+    assert all(r.state is State.TRACKING for r in run.results[-50:])
+
+
+def test_noise_and_outliers_are_withstood() -> None:
+    walk = Walk(arc(60))
+    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    assert len(run.trajectory) == 60
+    result = evaluate(run.trajectory, walk.groundtruth)
+    assert result.ate_m < 0.01 * result.path_length_m
+
+
+def test_the_scale_of_ground_truth() -> None:
+    walk = Walk(arc(40))
+    run = run_walk(walk, "scale=groundtruth")
+    assert evaluate(run.trajectory, walk.groundtruth).scale == pytest.approx(1.0, rel=1e-3)
+
+
+def test_unit_scale_puts_the_median_depth_of_the_start_at_one() -> None:
+    walk = Walk(arc(12))
+    run = run_walk(walk, "bundle.enabled=false", "mapping.cull=false")
+    born = run.map.points["born"] == 1
+    assert float(run.map.positions_w[born, 2].median()) == pytest.approx(1.0, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"), [(still(20), "stands still"), (turn(20), "translation|parallax")]
+)
+def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, message: str) -> None:
+    run = run_walk(Walk(poses), "simulated.noise_px=0.3", "simulated.depth_near=2", "simulated.depth_far=6")
+    assert run.map.num_keyframes == 0
+    assert len(run.trajectory) == 0
+    assert "no map was initialised in 20 frames" in run.failure
+    assert re.search(message, run.failure)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
+    walk = Walk(arc(30))
+    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1")
+    one, two, other = run_walk(walk, *noisy), run_walk(walk, *noisy), run_walk(walk, *noisy, "seed=1")
+    assert torch.equal(one.trajectory.T_wc, two.trajectory.T_wc)
+    assert torch.equal(one.map.positions_w, two.map.positions_w)
+    assert not torch.equal(one.trajectory.T_wc, other.trajectory.T_wc)
+
+
+class Gap(Walk):
+    """Some frames show nothing that was seen before or after: their poses are far away."""
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = super().__getitem__(index)
+        if 35 <= index < 40:
+            away = torch.eye(4, dtype=torch.float64)
+            away[2, 3] = -1e6
+            return Frame(index, frame.timestamp, frame.image, frame.name, away)
+        return frame
+
+
+def test_lost_is_reported_and_tracking_comes_back() -> None:
+    walk = Gap(arc(60))
+    run = run_walk(walk)
+    states = [r.state for r in run.results]
+    assert states[35:40] == [State.LOST] * 5
+    assert all(r.T_cw is None for r in run.results[35:40])
+    assert states[40:] == [State.TRACKING] * 20
+    assert len(run.trajectory) == 55
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
+
+
+class Damaged(Walk):
+    def image(self, index: int) -> torch.Tensor:
+        if index in (3, 17):
+            raise FrameError(f"rgb.txt:{index}: is not an image")
+        return super().image(index)
+
+
+def test_damaged_frames_are_skipped_with_a_warning_and_counted() -> None:
+    walk = Damaged(arc(40))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run = run_walk(walk)
+    assert [str(w.message) for w in caught if "skipped a frame" in str(w.message)] != []
+    assert run.skipped == ["rgb.txt:3: is not an image", "rgb.txt:17: is not an image"]
+    assert len(run.trajectory) == 38
+
+
+def test_an_interrupt_keeps_what_there_is() -> None:
+    def interrupt(result: StepResult) -> None:
+        if result.index == 30:
+            raise KeyboardInterrupt
+
+    run = run_walk(Walk(arc(60)), progress=interrupt)
+    assert run.interrupted
+    assert len(run.results) == 31
+    assert len(run.trajectory) == 31
+
+
+def test_simulated_features_need_true_poses() -> None:
+    walk = Walk(arc(5))
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    with pytest.raises(ConfigError, match="true poses"):
+        slam.step(walk[0])
+
+
+def test_poses_are_rigid_and_results_tell_their_stages() -> None:
+    run = run_walk(Walk(arc(40)), "simulated.noise_px=0.5")
+    R = run.trajectory.T_wc[:, :3, :3]
+    assert torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), atol=1e-9)
+    assert torch.allclose(torch.linalg.det(R), torch.ones(len(R), dtype=R.dtype))
+    keyframe = next(r for r in run.results if r.is_keyframe and "bundle" in r.stage_ms)
+    assert {"features", "tracking", "mapping", "bundle", "total"} <= keyframe.stage_ms.keys()
+    assert keyframe.reason
+
+
+def test_every_frame_looks_at_a_bounded_part_of_the_map() -> None:
+    walk = Walk(arc(80, length=40.0))
+    slam = SLAM(
+        walk.camera, load_config(None, [*SIMULATED, "simulated.depth_near=0.02", "simulated.depth_far=0.1"])
+    )
+    slam.run(walk)
+    assert slam.map.num_keyframes > 15
+    assert len(slam.tracker.local_keyframes) <= Config().tracking.local_keyframes + 1
+    assert len(slam.tracker.local_points) < 0.5 * slam.map.num_points
+
+
+def test_a_rendered_room_is_tracked() -> None:
+    sequence = open_sequence("synthetic:room").part(0, 45)
+    run = SLAM(sequence.camera).run(sequence)
+    assert len(run.trajectory) >= 44
+    result = evaluate(run.trajectory, sequence.groundtruth)
+    assert result.ate_m < 0.02 * result.path_length_m
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "frames", "ate_m"), [("shelf_bin", 50, 0.02), ("machine_hall", 100, 0.02)])
+def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m: float) -> None:
+    sequence = open_sequence(f"{data_dir}/{name}").part(0, frames)
+    run = SLAM(sequence.camera).run(sequence)
+    assert len(run.trajectory) >= 0.9 * frames
+    assert evaluate(run.trajectory, sequence.groundtruth).ate_m < ate_m
+
+
+@pytest.mark.data
+def test_a_real_standstill_starts_no_map(data_dir: object) -> None:
+    sequence = open_sequence(f"{data_dir}/standstill")
+    run = SLAM(sequence.camera).run(sequence)
+    assert run.map.num_keyframes == 0
+    assert "stands still" in run.failure
