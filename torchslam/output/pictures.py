@@ -48,22 +48,33 @@ def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
 
 def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     points_w = results.map.positions_w[results.map.living_points()]
-    trajectory, keyframes, truth, unit, title = (
-        results.trajectory,
-        results.keyframes,
-        None,
-        "",
-        "Path and map",
-    )
     evaluation = _evaluation(results)
-    if evaluation is not None:
-        S = evaluation.S_groundtruth_estimate
-        points_w, keyframes, trajectory = transform(S, points_w), _aligned(keyframes, S), evaluation.aligned
-        truth, unit = results.groundtruth, "m"
-        title = f"Path and map, ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
-        yield "errors", _errors(evaluation, results)
+    if evaluation is None:
+        yield from _path_and_map(results.trajectory, results.keyframes, points_w, None, "Path and map")
+        return
+    yield "errors", _errors(evaluation, results)
+    S = evaluation.S_groundtruth_estimate
+    title = f"Path and map, ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
+    yield from _path_and_map(
+        evaluation.aligned, _aligned(results.keyframes, S), transform(S, points_w), _truth(results), title
+    )
+
+
+def _path_and_map(
+    trajectory: Trajectory, keyframes: Trajectory, points_w: Tensor, truth: Trajectory | None, title: str
+) -> Iterator[tuple[str, Figure]]:
+    unit = "" if truth is None else "m"
     yield "scene", plots.plot_scene(trajectory, points_w, truth, keyframes, unit, title)
     yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title)
+
+
+def _truth(results: Results) -> Trajectory | None:
+    """The ground truth from the first frame to the last: it may go on where the run did not."""
+    truth, frames = results.groundtruth, results.frames
+    if truth is None:
+        return None
+    during = (truth.timestamps >= frames[0].timestamp) & (truth.timestamps <= frames[-1].timestamp)
+    return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
 def _errors(evaluation: Evaluation, results: Results) -> Figure:

@@ -40,7 +40,7 @@ def plot_features(
             x[~is_matched],
             y[~is_matched],
             "o",
-            ms=3.2,
+            ms=2.6,
             mfc="none",
             mec="#f2ede2",
             mew=0.6,

@@ -87,7 +87,7 @@ def plot_top_view(
         axes.set(xlim=box[0], ylim=box[1], aspect="equal")
         axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
         axes.set_title(_title(title, scene, box))
-        figure.legend(loc="outside lower center", ncols=6)
+        figure.legend(loc="outside lower center", ncols=6 if width > 8.0 else 3)
     return figure
 
 
@@ -140,7 +140,7 @@ def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit:
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), scene.labels, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_label_text(f"{name} ({unit})")
-        axis.labelpad = 2.0
+        axis.labelpad = 0.0 if axis is axes.zaxis else 6.0
         axis.set_major_locator(_few_ticks())
 
 
