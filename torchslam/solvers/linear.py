@@ -40,11 +40,13 @@ def factorize(matrix: Tensor, strict: bool = True) -> DefiniteFactor:
     """
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-    factor, info = torch.linalg.cholesky_ex(scale[..., :, None] * matrix * scale[..., None, :])
+    scaled = scale[..., :, None] * matrix * scale[..., None, :]
+    factor, info = torch.linalg.cholesky_ex(scaled)
     definite = info == 0
     if strict:
         smallest = torch.finfo(matrix.dtype).eps ** 0.4
         definite = definite & (factor.diagonal(dim1=-2, dim2=-1) > smallest).all(-1)
-    # Where the factorisation broke off, a unit matrix keeps what follows finite, its gradient included.
-    unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    return DefiniteFactor(scale, torch.where(definite[..., None, None], factor, unit), definite)
+    if not definite.all():  # unit matrices instead: what follows stays finite, its gradient included
+        unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], scaled, unit))
+    return DefiniteFactor(scale, factor, definite)
