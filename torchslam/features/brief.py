@@ -52,23 +52,37 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _rotated_offsets(stride: int, device: torch.device) -> Tensor:
-    """(ANGLE_BINS, 512) int32: flat offsets of both ends of all tests, for every rotation of the pattern."""
+def rotated_offsets(points: tuple[tuple[int, int], ...], stride: int, device: torch.device) -> Tensor:
+    """(ANGLE_BINS, K) int32: flat offsets of K points (x, y) around a keypoint, turned by every angle and rounded."""
     angles = torch.arange(ANGLE_BINS, dtype=torch.float64) * (2 * math.pi / ANGLE_BINS)
     cos, sin = angles.cos()[:, None], angles.sin()[:, None]
-    ends = torch.tensor(PATTERN, dtype=torch.float64).view(-1, 2, 2).transpose(0, 1).reshape(-1, 2)
-    x, y = (ends[:, 0] * cos - ends[:, 1] * sin).round(), (ends[:, 0] * sin + ends[:, 1] * cos).round()
-    return (y * stride + x).to(device=device, dtype=torch.int32)
+    x, y = torch.tensor(points, dtype=torch.float64).unbind(-1)
+    offsets = (x * sin + y * cos).round() * stride + (x * cos - y * sin).round()
+    return offsets.to(device=device, dtype=torch.int32)
 
 
-def describe(blurred: Tensor, positions: Tensor, angles: Tensor, stride: int) -> Tensor:
-    """256 brightness comparisons around each keypoint, turned by its angle.
+def sample_rotated(
+    blurred: Tensor, positions: Tensor, angles: Tensor, stride: int, points: tuple[tuple[int, int], ...]
+) -> Tensor:
+    """Values of a blurred image at points around each keypoint, turned by its angle.
 
-    blurred: from `blur`; positions: (N,) int64 into the image before blurring, RADIUS + BLUR_RADIUS inside its edges;
-    angles: (N,) radians. Returns (N, 32) uint8.
+    blurred: from `blur`; positions: (N,) int64 into the image before blurring; angles: (N,) radians; points: K times
+    (x, y) in pixels of the level. Returns (N, K) int16.
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)
-    samples = _rotated_offsets(stride, blurred.device).index_select(0, bins) + origins[:, None]
-    first, second = blurred.index_select(0, samples.view(-1)).view(samples.shape).chunk(2, dim=1)
+    samples = rotated_offsets(points, stride, blurred.device).index_select(0, bins) + origins[:, None]
+    return blurred.index_select(0, samples.view(-1)).view(samples.shape)
+
+
+# The first ends of all tests, then the second ends.
+_ENDS = tuple((test[2 * end], test[2 * end + 1]) for end in (0, 1) for test in PATTERN)
+
+
+def describe(blurred: Tensor, positions: Tensor, angles: Tensor, stride: int) -> Tensor:
+    """256 brightness comparisons around each keypoint, turned by its angle: (N, 32) uint8, arguments as above.
+
+    Keypoints must lie RADIUS + BLUR_RADIUS inside their level.
+    """
+    first, second = sample_rotated(blurred, positions, angles, stride, _ENDS).chunk(2, dim=1)
     return pack_bits(first < second)

@@ -82,11 +82,11 @@ def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
     return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-limit, limit)
 
 
-def soft_peak(responses: Tensor, temperature: float = 0.1) -> tuple[Tensor, Tensor]:
-    """Soft arg-max over a neighbourhood: offset (x, y) from its centre and the score there, differentiable.
+def soft_peak(responses: Tensor, temperature: float = 0.1) -> Tensor:
+    """Soft arg-max over a neighbourhood: offset (x, y) of its maximum from its centre, differentiable.
 
     responses: (N, S, S), S odd. Responses are divided by the largest magnitude of their neighbourhood (held constant
-    for the gradient), so that `temperature` has no unit. Returns (N, 2) pixels and (N,) softmax-weighted responses.
+    for the gradient), so that `temperature` has no unit. Returns (N, 2) pixels.
     """
     side = responses.shape[-1]
     scale = (
@@ -95,4 +95,4 @@ def soft_peak(responses: Tensor, temperature: float = 0.1) -> tuple[Tensor, Tens
     weights = torch.softmax((responses / scale / temperature).flatten(1), dim=-1)
     axis = torch.arange(side, device=responses.device, dtype=responses.dtype) - side // 2
     grid = torch.stack([axis.expand(side, side), axis[:, None].expand(side, side)], dim=-1).view(-1, 2)
-    return weights @ grid, (weights * responses.flatten(1)).sum(-1)
+    return weights @ grid

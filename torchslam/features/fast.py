@@ -14,6 +14,8 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
+PIECE = 1 << 17  # pixels worked on at once: their intermediate results stay in the cache
+
 Extremum = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -28,13 +30,33 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
     count = pixels.shape[0] - 2 * margin
     if count <= 0:
         return torch.zeros_like(pixels)
-    ring = [pixels.narrow(0, margin + dy * stride + dx, count) for dx, dy in CIRCLE]
-    centre = pixels.narrow(0, margin, count)
+    pieces = [
+        _piece_scores(pixels, stride, start, min(PIECE, margin + count - start))
+        for start in range(margin, margin + count, PIECE)
+    ]
+    rim = pixels.new_zeros(margin)
+    return torch.cat([rim, *pieces, rim])
+
+
+def _piece_scores(pixels: Tensor, stride: int, start: int, count: int) -> Tensor:
+    """`fast_scores` of `count` pixels from `start` on."""
+    ring = [pixels.narrow(0, start + dy * stride + dx, count) for dx, dy in CIRCLE]
+    return _scores(ring, pixels.narrow(0, start, count))
+
+
+def patch_scores(patches: Tensor) -> Tensor:
+    """FAST scores wherever the circle fits into a patch, differentiable: (N, S, S) floats -> (N, S - 6, S - 6)."""
+    inner = patches.shape[-1] - 6
+    ring = [patches[:, 3 + dy :, 3 + dx :][:, :inner, :inner] for dx, dy in CIRCLE]
+    return _scores(ring, patches[:, 3:-3, 3:-3])
+
+
+def _scores(ring: list[Tensor], centre: Tensor) -> Tensor:
+    """FAST scores of pixels, given their sixteen neighbours on the circle."""
     # The darkest pixel of the brightest arc, and the brightest pixel of the darkest one.
     bright = _best_arc(ring, torch.minimum, torch.maximum)
     dark = _best_arc(ring, torch.maximum, torch.minimum)
-    scores = torch.maximum(torch.maximum(bright, centre) - centre, centre - torch.minimum(dark, centre))
-    return F.pad(scores, (margin, margin))
+    return torch.maximum(torch.maximum(bright, centre) - centre, centre - torch.minimum(dark, centre))
 
 
 def _best_arc(ring: list[Tensor], inner: Extremum, outer: Extremum) -> Tensor:

@@ -62,7 +62,7 @@ class XFeat(nn.Module):
 
         windows = F.pad(heat[:, 0], (2, 2, 2, 2)).unfold(1, 5, 1).unfold(2, 5, 1)
         image = torch.arange(len(images), device=images.device)[:, None].expand_as(x)
-        offsets, _ = soft_peak(windows[image, y, x].flatten(0, 1))
+        offsets = soft_peak(windows[image, y, x].flatten(0, 1))
         positions = torch.stack([x, y], dim=-1) + offsets.view(*x.shape, 2)
         # Pixels from 0 to W - 1 span the coarse map from edge to edge: so the network was trained.
         grid = 2 * positions / positions.new_tensor([inner[1] - 1, inner[0] - 1]) - 1
