@@ -25,9 +25,9 @@ from torchslam.geometry.ransac import (
     valid_first,
 )
 
-_FIRST_ROUND = 128  # samples
+_FIRST_ROUND = 160  # samples
 _CANDIDATES = 4  # hypotheses of each round that are optimised
-_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 3, 8
+_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
 _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
 
 
@@ -201,7 +201,7 @@ class _Problem:
             J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
             rows = torch.cat((J, J_rotation, residual[..., None]), dim=-1) * used[:, 0, :, None, None]
             rows = rows.flatten(1, 2)
-            return rows.mT @ rows, cost[:, 0]
+            return torch.bmm(rows.mT, rows), cost[:, 0]
 
         (P,), _ = minimize((P,), evaluate, retract_pose, _FINAL_ITERATIONS)
         return P

@@ -18,35 +18,37 @@ def minimize(
     evaluate: Callable[..., tuple[Tensor, Tensor]],
     retract: Callable[[State, Tensor], State],
     iterations: int,
-    tolerance: float = 1e-7,
 ) -> tuple[State, Tensor]:
     """Minimises many small problems at once, each with its own damping.
 
-    state:    tensors with leading dimensions (...)
-    evaluate: state -> (A, cost): A (..., D + 1, D + 1) is [J r]^T W [J r], and cost (...) what must not grow
-    retract:  state, step (..., D) -> state
-    Stops early once no problem moves by more than `tolerance`. Returns the state and its cost; problems that
-    become singular or NaN keep their last good state.
+    state:    tensors with one leading dimension (P), the problems
+    evaluate: state -> (A, cost): A (P, D + 1, D + 1) is [J r]^T W [J r], and cost (P,) what must not grow
+    retract:  state, step (P, D) -> state
+    Stops once no problem can gain more than 1e-9 of its cost. Returns the state and its cost; problems that become
+    singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
-    damping = torch.full_like(cost, 1e-4)[..., None, None]
+    damping = torch.full_like(cost, 1e-4)[:, None, None]
     eye = torch.eye(A.shape[-1] - 1, dtype=A.dtype, device=A.device)
     for _ in range(iterations):
-        H, g = A[..., :-1, :-1], A[..., :-1, -1]
-        step = -torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0]
+        H, g = A[:, :-1, :-1], A[:, :-1, -1]
+        step = torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0].neg_()
         moved = retract(state, step)
+        gain = (g * step).sum(-1).abs()
+        if bool((gain <= 1e-9 * cost).all()):  # too little to be worth a check
+            return tuple(
+                _select(gain < torch.inf, new, old) for new, old in zip(moved, state, strict=True)
+            ), cost
         A_moved, cost_moved = evaluate(*moved)
         better = cost_moved < cost
         state = tuple(_select(better, new, old) for new, old in zip(moved, state, strict=True))
         A, cost = _select(better, A_moved, A), torch.where(better, cost_moved, cost)
-        damping = torch.where(better[..., None, None], 0.1 * damping, 10 * damping).clamp(1e-9, 1e6)
-        if bool(step.abs().max() < tolerance):
-            break
+        damping = (damping * torch.where(better, 0.1, 10.0)[:, None, None]).clamp(1e-9, 1e6)
     return state, cost
 
 
 def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(condition.reshape(condition.shape + (1,) * (new.dim() - condition.dim())), new, old)
+    return torch.where(condition.view(-1, *(1,) * (new.dim() - 1)), new, old)
 
 
 @lru_cache(maxsize=16)
@@ -56,14 +58,14 @@ def generators(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def small_rotation(omega: Tensor) -> Tensor:
-    """Cayley's rotation, equal to exp(omega) to second order, and cheaper. (..., 3) -> (..., 3, 3)."""
-    half = 0.5 * omega
-    W = (half @ generators(omega.dtype, omega.device).flatten(1)).view(*omega.shape, 3)
-    factor = 2 / (1 + (half * half).sum(-1))[..., None, None]
-    return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, W + W @ W)
+    """Cayley's rotation, equal to exp(omega) to second order, and cheaper. (P, 3) -> (P, 3, 3)."""
+    W = (omega @ generators(omega.dtype, omega.device).view(3, 9)).view(-1, 3, 3)
+    factor = 1 / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
+    turned = torch.baddbmm(W, W, W, alpha=0.5)  # W + W^2 / 2
+    return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, turned)
 
 
 def retract_pose(pose: State, step: Tensor) -> State:
-    """Moves [R t] by [rho, omega] from the left. (..., 3, 4), (..., 6)."""
-    moved = small_rotation(step[..., 3:]) @ pose[0]
-    return (moved + torch.nn.functional.pad(step[..., :3, None], (3, 0)),)
+    """Moves [R t] by [rho, omega] from the left. (P, 3, 4), (P, 6)."""
+    turn = small_rotation(step[:, 3:])
+    return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, pose[0]),)

@@ -140,15 +140,13 @@ def _cubic_root(b: Tensor, c: Tensor, d: Tensor) -> Tensor:
 
 
 def _polish(depths: Tensor, cosine: Tensor, distance: Tensor) -> Tensor:
-    """Two Newton steps on the three distance equations. (..., 4, 3), (..., 1, 3), (..., 1, 3)."""
-    for _ in range(2):
-        following = depths.roll(-1, -1)
-        residual = depths * (depths - 2 * cosine * following) + following * following - distance
-        # J = 2 [[a1 b1 0], [0 a2 b2], [b3 0 a3]], solved by Cramer's rule
-        a, b = depths - cosine * following, following - cosine * depths
-        a_1, b_1 = a.roll(-1, -1), b.roll(-1, -1)
-        a_2 = a.roll(-2, -1)
-        determinant = 2 * (a.prod(-1, keepdim=True) + b.prod(-1, keepdim=True))
-        numerator = a_1 * a_2 * residual - b * a_2 * residual.roll(-1, -1) + b * b_1 * residual.roll(-2, -1)
-        depths = depths - numerator / torch.where(determinant == 0, 1.0, determinant)
-    return depths
+    """A Newton step on the three distance equations. (..., 4, 3), (..., 1, 3), (..., 1, 3)."""
+    following = depths.roll(-1, -1)
+    residual = depths * (depths - 2 * cosine * following) + following * following - distance
+    # J = 2 [[a1 b1 0], [0 a2 b2], [b3 0 a3]], solved by Cramer's rule
+    a, b = depths - cosine * following, following - cosine * depths
+    a_2 = a.roll(-2, -1)
+    determinant = 2 * (a.prod(-1, keepdim=True) + b.prod(-1, keepdim=True))
+    numerator = a_2 * (a.roll(-1, -1) * residual - b * residual.roll(-1, -1))
+    numerator = numerator + b * b.roll(-1, -1) * residual.roll(-2, -1)
+    return depths - numerator / torch.where(determinant == 0, 1.0, determinant)

@@ -38,7 +38,7 @@ class Tangent:
 
     constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of P and of its T derivatives, as an affine
     function of the entries of P, ordered by row of P, parameter, column of P
-    retract: (P,), step (..., T) -> (P,)
+    retract: (P,), step (problems, T) -> (P,)
     """
 
     constant: Tensor
@@ -119,7 +119,7 @@ def fit_projections(
         used, cost = truncated_rows(residual.square().sum((2, 3)), mask, width)
         rows = torch.cat((J, residual), dim=3) * used[:, :, None, None]
         rows = rows.transpose(2, 3).reshape(B * K, T + 1, 2 * N)
-        return torch.bmm(rows, rows.mT).view(B, K, T + 1, T + 1), cost
+        return torch.bmm(rows, rows.mT), cost.view(-1)
 
-    (P,), cost = minimize((P,), evaluate, tangent.retract, iterations)
-    return P, cost
+    (P,), cost = minimize((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)
+    return P.view(B, K, 3, D), cost.view(B, K)

@@ -157,8 +157,9 @@ def tangent_basis(t: Tensor) -> Tensor:
 
 def _retract_essential(state: State, step: Tensor) -> State:
     """Turns R from the left and the frame of t, whose rows are t, a, b, about its own b and a."""
-    turns = torch.stack((step[..., :3], -torch.nn.functional.pad(step[..., 3:].flip(-1), (1, 0))), dim=-2)
-    return (small_rotation(turns) @ state[0],)
+    zero, (a, b) = torch.zeros_like(step[:, :1]), step[:, 3:].split(1, dim=-1)
+    turns = torch.cat((step[:, :3], zero, -b, -a), dim=-1)
+    return (torch.bmm(small_rotation(turns.view(-1, 3)), state[0].view(-1, 3, 3)).view_as(state[0]),)
 
 
 def fit_essential(
@@ -171,23 +172,24 @@ def fit_essential(
     frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
 
     def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
-        R, frame = pose.reshape(B * K, 2, 9).unbind(1)
-        left = (frame @ left_table).view(B * K, 18, 3)
-        E = torch.bmm(left, R.view(B * K, 3, 3)).view(B * K, 6, 9)
+        left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
+        E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
         form = torch.bmm(E, (E[:, 0] @ variance_table).view(B * K, 9, 18))
         value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, -1)
         spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, -1)
-        inverse = spread[:, :, :1].clamp_min(torch.finfo(R.dtype).tiny).rsqrt()
+        inverse = spread[:, :, :1].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt()
         # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
         rows = value * inverse
         residual = rows[:, :, :1]
         J = torch.addcmul(rows[:, :, 1:], residual * inverse * inverse, spread[:, :, 1:], value=-1)
         used, cost = truncated_rows(residual.squeeze(2).square(), views.mask, width)
         rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, -1)
-        return torch.bmm(rows, rows.mT).view(B, K, 6, 6), cost
+        return torch.bmm(rows, rows.mT), cost.view(-1)
 
-    (pose,), cost = minimize((torch.stack((R, frame), dim=2),), evaluate, _retract_essential, iterations)
-    return pose[:, :, 0], pose[:, :, 1, 0], cost
+    start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
+    (pose,), cost = minimize((start,), evaluate, _retract_essential, iterations)
+    pose = pose.view(B, K, 2, 3, 3)
+    return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
 
 
 def score_essential(views: TwoViews, E: Tensor) -> Tensor:
