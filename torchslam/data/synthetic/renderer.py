@@ -29,38 +29,42 @@ class Renderer:
         self._axes_u = np.stack([rectangle.axis_u for rectangle in rectangles])
         self._axes_v = np.stack([rectangle.axis_v for rectangle in rectangles])
         self._sizes = np.array([rectangle.size for rectangle in rectangles])
+        du, dv = self._sizes[:, :1] * self._axes_u, self._sizes[:, 1:] * self._axes_v
+        self._corners = np.stack((np.zeros_like(du), du, du + dv, dv), axis=1) + self._origins[:, None]
         shapes = np.array([rectangle.texture.shape[::-1] for rectangle in rectangles])
-        self._texels = (shapes / self._sizes).astype(np.float32)
-        self._atlas, self._offsets = _pack([_pyramid(rectangle.texture) for rectangle in rectangles])
+        self._texels = shapes / self._sizes  # per metre
+        self._atlas, offsets = _pack([_pyramid(rectangle.texture) for rectangle in rectangles])
+        # Per texture and level: what a texel shrinks to and where the corner of the first one lies in the atlas, half
+        # a texel before its centre.
+        shrink = np.tile(np.exp2(-np.arange(MIP_LEVELS)), len(rectangles))
+        self._tiles = np.stack((shrink, *(offsets.reshape(-1, 2) - 0.5).T)).astype(np.float32)
 
     def render(self, T_cw: np.ndarray) -> np.ndarray:
         """The image seen from T_cw (4, 4), (H, W) float32 in [0, 255]; black where no rectangle is hit."""
         forms = self._linear_forms(T_cw)
-        winner = self._nearest(forms, T_cw)
+        winner = self._nearest(forms, self._bounds(T_cw))
         hit = winner >= 0
         winner[~hit] = 0
-        width, height = self._size
-        x = np.arange(width, dtype=np.float32)[None, :]
-        y = np.arange(height, dtype=np.float32)[:, None]
-        a = forms.astype(np.float32)[winner]  # (H, W, 3, 3)
-        inverse_depth = a[..., 2, 0] * x + a[..., 2, 1] * y + a[..., 2, 2]
+        x = np.arange(self._size[0], dtype=np.float32)[None, :]
+        y = np.arange(self._size[1], dtype=np.float32)[:, None]
+        # Of each pixel's rectangle: (u, v, 1) / z in texels as a x + b y + c.
+        texels = np.append(self._texels, np.ones((len(forms), 1)), axis=1)
+        a, b, c = ((texels * forms[..., i]).astype(np.float32).T[:, winner] for i in range(3))
+        u, v, inverse_depth = a * x + b * y + c
         depth = 1.0 / np.where(hit, inverse_depth, 1.0)
-        texels = self._texels[winner]
-        u = (a[..., 0, 0] * x + a[..., 0, 1] * y + a[..., 0, 2]) * depth
-        v = (a[..., 1, 0] * x + a[..., 1, 1] * y + a[..., 1, 2]) * depth
-        # How many texels the image moves by along either side of a pixel, from the derivatives of u and v.
+        u *= depth
+        v *= depth
+        # How many texels the texture moves by from a pixel to the next one, from the derivatives of u and v.
         steps = [
-            np.hypot(
-                (a[..., 0, i] - u * a[..., 2, i]) * depth * texels[..., 0],
-                (a[..., 1, i] - v * a[..., 2, i]) * depth * texels[..., 1],
-            )
-            for i in (0, 1)
+            depth * depth * ((slope[0] - u * slope[2]) ** 2 + (slope[1] - v * slope[2]) ** 2)
+            for slope in (a, b)
         ]
-        level = np.log2(SHARPNESS * np.maximum(*steps) + 1e-6).clip(0, MIP_LEVELS - 1.001)
+        level = 0.5 * np.log2(SHARPNESS**2 * np.maximum(*steps) + 1e-12)
+        level = level.clip(0, MIP_LEVELS - 1.001)
         fine = level.astype(np.int64)
-        u, v = u * texels[..., 0], v * texels[..., 1]
         blend = level - fine
-        image = self._sample(winner, fine, u, v) * (1 - blend) + self._sample(winner, fine + 1, u, v) * blend
+        tile = winner * MIP_LEVELS + fine
+        image = self._sample(tile, u, v) * (1 - blend) + self._sample(tile + 1, u, v) * blend
         return np.where(hit, image, 0.0).astype(np.float32)
 
     def _linear_forms(self, T_cw: np.ndarray) -> np.ndarray:
@@ -72,55 +76,50 @@ class Renderer:
         forms = np.linalg.inv(np.where(edge_on[:, None, None], np.eye(3), M)) @ np.linalg.inv(self._K)
         return np.where(edge_on[:, None, None], 0.0, forms)
 
-    def _nearest(self, forms: np.ndarray, T_cw: np.ndarray) -> np.ndarray:
+    def _nearest(self, forms: np.ndarray, bounds: np.ndarray) -> np.ndarray:
         """(H, W) int64: the rectangle seen at each pixel, -1 for none."""
-        width, height = self._size
-        best = np.zeros((height, width), np.float32)
-        winner = np.full((height, width), -1, np.int64)
-        for row, (form, size) in enumerate(zip(forms, self._sizes, strict=True)):
-            bounds = self._bounds(row, T_cw)
-            if bounds is None:
+        best = np.zeros(self._size[::-1], np.float32)
+        winner = np.full(self._size[::-1], -1, np.int64)
+        for row, (x0, y0, x1, y1) in enumerate(bounds.tolist()):
+            if x0 >= x1 or y0 >= y1:
                 continue
-            x0, y0, x1, y1 = bounds
             x = np.arange(x0, x1)[None, :]
             y = np.arange(y0, y1)[:, None]
             u, v, inverse_depth = (
-                (a * x).astype(np.float32) + (b * y + c).astype(np.float32) for a, b, c in form
+                (a * x).astype(np.float32) + (b * y + c).astype(np.float32) for a, b, c in forms[row]
             )
+            width, height = self._sizes[row].astype(np.float32)
             window = np.s_[y0:y1, x0:x1]
             seen = (inverse_depth > best[window]) & (u >= 0) & (v >= 0)
-            seen &= (u <= size[0] * inverse_depth) & (v <= size[1] * inverse_depth)
+            seen &= (u <= width * inverse_depth) & (v <= height * inverse_depth)
             np.copyto(best[window], inverse_depth, where=seen)
-            winner[window][seen] = row
+            np.copyto(winner[window], row, where=seen)
         return winner
 
-    def _bounds(self, row: int, T_cw: np.ndarray) -> tuple[int, int, int, int] | None:
-        """The pixels x0, y0, x1, y1 (end exclusive) a rectangle may cover; None where it is out of sight."""
-        du, dv = self._sizes[row, 0] * self._axes_u[row], self._sizes[row, 1] * self._axes_v[row]
-        corners = self._origins[row] + np.stack((np.zeros(3), du, du + dv, dv))
-        corners = corners @ T_cw[:3, :3].T + T_cw[:3, 3]
-        following = np.roll(corners, -1, axis=0)
-        in_front = corners[:, 2] > NEAR
-        crossing = in_front != (following[:, 2] > NEAR)
-        run = np.where(crossing, following[:, 2] - corners[:, 2], 1.0)
-        cut = corners + ((NEAR - corners[:, 2]) / run)[:, None] * (following - corners)
-        outline = np.concatenate((corners[in_front], cut[crossing]))
-        if len(outline) == 0:
-            return None
-        pixels = outline @ self._K.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        x0, y0 = np.maximum(np.floor(pixels.min(axis=0)), 0).astype(int)
-        x1, y1 = np.minimum(np.ceil(pixels.max(axis=0)) + 1, self._size).astype(int)
-        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+    def _bounds(self, T_cw: np.ndarray) -> np.ndarray:
+        """(R, 4) int64: the pixels x0, y0, x1, y1 (end exclusive) that each rectangle may cover; empty out of sight."""
+        corners = self._corners @ T_cw[:3, :3].T + T_cw[:3, 3]
+        following = np.roll(corners, -1, axis=1)
+        z, z_following = corners[..., 2:], following[..., 2:]
+        in_front = z > NEAR
+        # Where a side crosses the near plane it is cut there: the outline is the corners in front and the cuts.
+        is_cut = in_front != (z_following > NEAR)
+        cuts = corners + (NEAR - z) / np.where(is_cut, z_following - z, 1.0) * (following - corners)
+        outline = np.concatenate((corners, cuts), axis=1)
+        exists = np.concatenate((in_front, is_cut), axis=1)
+        pixels = np.where(exists, outline, (0.0, 0.0, 1.0)) @ self._K.T
+        pixels = pixels[..., :2] / pixels[..., 2:]
+        start = np.floor(np.where(exists, pixels, np.inf).min(axis=1)).clip(0, self._size)
+        end = np.ceil(np.where(exists, pixels, -np.inf).max(axis=1) + 1).clip(0, self._size)
+        return np.concatenate((start, end), axis=1).astype(np.int64)
 
-    def _sample(self, winner: np.ndarray, level: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear lookup in the atlas at texel coordinates u, v (of level 0, from the texture's corner)."""
-        offset = self._offsets[winner, level]
-        shrink = np.exp2(-level.astype(np.float32))
-        # The corner of the texture is half a texel before the centre of its first texel.
-        x = u * shrink - 0.5 + offset[..., 0]
-        y = v * shrink - 0.5 + offset[..., 1]
-        return cv2.remap(self._atlas, x, y, cv2.INTER_LINEAR).astype(np.float32)
+    def _sample(self, tile: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Bilinear lookup of the atlas, (H, W) float32.
+
+        tile: (H, W) row of `_tiles`; u, v: (H, W) texels of level 0 from the texture's corner.
+        """
+        shrink, x, y = (column[tile] for column in self._tiles)
+        return cv2.remap(self._atlas, u * shrink + x, v * shrink + y, cv2.INTER_LINEAR).astype(np.float32)
 
 
 def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
