@@ -15,7 +15,7 @@ NEAR = 0.05
 """Metres: what is nearer to the camera is not drawn."""
 PADDING = 2
 SHARPNESS = 0.7
-"""Texels a pixel of the image may cover before the next coarser level is taken."""
+"""Of the choice of level: 1 takes one texel a pixel; less is sharper, at the price of some aliasing."""
 
 
 class Renderer:
