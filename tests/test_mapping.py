@@ -1,0 +1,259 @@
+"""Initialisation, tracking, mapping and adjustment on a small exact world."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc, turn
+from torchslam.config import Config, load_config
+from torchslam.correspondences import match_near, match_points, project_points
+from torchslam.errors import ConfigError
+from torchslam.extraction import simulated_extractor
+from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.initialization import Initializer, Start
+from torchslam.keyframes import why_keyframe
+from torchslam.local_bundle import adjust, adjust_all
+from torchslam.map import NO_POINT
+from torchslam.mapping import Mapper, world_scale
+from torchslam.new_points import has_consistent_scale, match_along_epipolar_lines
+from torchslam.slam import SLAM
+from torchslam.tracking import Tracked
+from torchslam.types import View
+
+OVERRIDES = [
+    "features.kind=simulated",
+    "features.num_keypoints=400",
+    "simulated.points_per_view=250",
+    "simulated.depth_near=0.6",
+    "simulated.depth_far=2",
+    "scale=groundtruth",
+]
+CONFIG = load_config(None, OVERRIDES)
+WALK = Walk(arc(30))
+
+
+@pytest.fixture(scope="module")
+def slam_after_20() -> SLAM:
+    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    for i in range(20):
+        slam.step(WALK[i])
+    return slam
+
+
+@pytest.fixture
+def slam(slam_after_20: SLAM) -> SLAM:
+    """A system that has followed the walk for 20 frames, to be changed at will."""
+    return copy.deepcopy(slam_after_20)
+
+
+def view_of(slam: SLAM, index: int) -> View:
+    assert slam.extractor is not None
+    return View.of(WALK[index], slam.extractor(WALK[index]), torch.float64)
+
+
+def walk_from_start(slam: SLAM, index: int) -> torch.Tensor:
+    """The true pose in the frame of the map, which starts at the reference frame of the start."""
+    first = int(slam.map.keyframes["frame_index"][0])
+    return true_T_cw(WALK)[index] @ se3_inverse(true_T_cw(WALK)[first])
+
+
+def test_the_map_is_exact(slam: SLAM) -> None:
+    for k in range(slam.map.num_keyframes):
+        frame = int(slam.map.keyframes["frame_index"][k])
+        assert torch.allclose(slam.map.T_cw[k], walk_from_start(slam, frame), atol=1e-6)
+
+
+def test_every_observation_reprojects(slam: SLAM) -> None:
+    seen = slam.map.observations()
+    points_c = transform(slam.map.T_cw[seen.keyframe_index], slam.map.positions_w[seen.point_index][:, None])[
+        :, 0
+    ]
+    pixels, valid = slam.camera.project(points_c)
+    assert valid.all()
+    assert float((pixels - seen.pixels).norm(dim=-1).max()) < 1e-3
+
+
+def test_points_project_where_they_are_seen(slam: SLAM) -> None:
+    view = view_of(slam, 20)
+    near = project_points(
+        slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, 1.0
+    )
+    ids, keypoints = match_near(slam.map, near, view, 1.0, CONFIG.matching, ratio=0.9)
+    assert len(ids) > 150
+    assert len(torch.unique(keypoints)) == len(keypoints)
+    anywhere_ids, anywhere_keypoints = match_points(slam.map, near.ids, view, CONFIG.matching)
+    both = dict(zip(anywhere_ids.tolist(), anywhere_keypoints.tolist(), strict=True))
+    assert all(both.get(i, k) == k for i, k in zip(ids.tolist(), keypoints.tolist(), strict=True))
+
+
+def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
+    tracked = slam.tracker.track(view_of(slam, 20))
+    assert tracked is not None
+    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "override", ["tracking.predict=false", "tracking.guided=false", "tracking.recent_frames=10"]
+)
+def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
+    slam.tracker.config = load_config(None, ["features.kind=simulated", override])
+    slam.tracker.follow(slam.map.num_keyframes - 1)
+    tracked = slam.tracker.track(view_of(slam, 20))
+    assert tracked is not None
+    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
+
+
+def test_relocalization_anywhere_in_the_map(slam: SLAM) -> None:
+    slam.tracker.lost_for = 1
+    tracked = slam.tracker.track(view_of(slam, 2))
+    assert tracked is not None
+    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
+    assert slam.tracker.reference <= 2
+
+
+def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Generator) -> None:
+    count = slam.map.num_keyframes
+    shake = 0.01 * torch.randn(count - 1, 6, generator=generator, dtype=torch.float64)
+    slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
+    adjust_all(slam.map, slam.camera, CONFIG.bundle)
+    scale = (
+        slam.map.T_cw[-1, :3, 3].norm()
+        / walk_from_start(slam, int(slam.map.keyframes["frame_index"][-1]))[:3, 3].norm()
+    )
+    for k in range(1, count):
+        truth = walk_from_start(slam, int(slam.map.keyframes["frame_index"][k]))
+        assert torch.allclose(slam.map.T_cw[k, :3, :3], truth[:3, :3], atol=1e-4)
+        assert torch.allclose(slam.map.T_cw[k, :3, 3], scale * truth[:3, 3], atol=1e-3)
+
+
+def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
+    keyframe = slam.map.num_keyframes - 1
+    keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])
+    slam.map.keyframes["keypoints"][keyframe, keypoint] += 40.0
+    adjust(slam.map, keyframe, slam.camera, CONFIG.bundle)
+    assert slam.map.keyframes["point_ids"][keyframe, keypoint] == NO_POINT
+
+
+def test_the_first_keyframe_stays(slam: SLAM) -> None:
+    before = slam.map.T_cw[0].clone()
+    adjust(slam.map, 1, slam.camera, CONFIG.bundle)
+    adjust_all(slam.map, slam.camera, CONFIG.bundle)
+    assert torch.equal(slam.map.T_cw[0], before)
+
+
+def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
+    keyframe = slam.map.num_keyframes - 1
+    seen = torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[:5, 0]
+    originals = slam.map.keyframes["point_ids"][keyframe, seen]
+    doubles = slam.map.add_points(
+        slam.map.positions_w[originals], slam.map.points["descriptors"][originals], keyframe
+    )
+    slam.map.observe(keyframe, seen, doubles)
+    slam.map.refresh(torch.tensor([keyframe]))
+    slam.mapper.fuse(keyframe, slam.map.covisible(keyframe, 5, min_shared=5))
+    assert torch.equal(slam.map.resolve(doubles), slam.map.resolve(originals))
+
+
+def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
+    newest = slam.map.num_keyframes - 1
+    born = torch.nonzero((slam.map.points["born"] >= newest - 2) & slam.map.points["alive"])[:3, 0]
+    assert len(born) > 0
+    slam.map.points["times_visible"][born] += 1000
+    slam.mapper.cull_recent_points(newest)
+    assert not slam.map.points["alive"][born].any()
+
+
+def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
+    views = [view_of(slam, i) for i in (4, 9)]
+    T_21 = walk_from_start(slam, 9) @ se3_inverse(walk_from_start(slam, 4))
+    rows = [torch.nonzero(view.mask)[:, 0] for view in views]
+    first, second = match_along_epipolar_lines(*views, *rows, T_21, slam.camera, 1.0, CONFIG.matching)
+    assert len(first) > 50
+    assert torch.equal(views[0].descriptors[first], views[1].descriptors[second])
+
+
+def test_scale_consistency() -> None:
+    points_w = torch.tensor([[0.0, 0.0, 4.0]] * 3, dtype=torch.float64)
+    T_1w = torch.eye(4, dtype=torch.float64)
+    T_2w = T_1w.clone()
+    T_2w[2, 3] = -2.0  # two metres ahead: the point appears twice as large
+    scales = torch.tensor([2.0, 1.0, 4.0], dtype=torch.float64)
+    consistent = has_consistent_scale(points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, 8.0)
+    assert consistent.tolist() == [True, False, False]
+
+
+def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[Start | None, str]:
+    extract = simulated_extractor(config, walk.camera, true_T_cw(walk))
+    initializer = Initializer(walk.camera, config)
+    for i in indices:
+        result = initializer.step(View.of(walk[i], extract(walk[i]), torch.float64))
+    return result
+
+
+def test_two_views_make_a_start_with_the_true_motion() -> None:
+    start, reason = start_of((0, 5), WALK, CONFIG)
+    assert start is not None, reason
+    truth = true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0])
+    truth[:3, 3] /= truth[:3, 3].norm()
+    assert torch.allclose(start.T_cw, truth, atol=1e-6)
+    assert world_scale(start, "groundtruth") == pytest.approx(
+        float((true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0]))[:3, 3].norm())
+    )
+
+
+def test_the_parallax_criterion_waits_longer() -> None:
+    strict = load_config(None, [*OVERRIDES, "initialization.criterion=parallax"])
+    assert start_of((0, 1), WALK, strict)[0] is None
+    assert "parallax" in start_of((0, 1), WALK, strict)[1]
+    assert start_of((0, 6), WALK, strict)[0] is not None
+
+
+def test_pure_rotation_is_no_start() -> None:
+    walk = Walk(turn(10))
+    config = load_config(None, [*OVERRIDES, "simulated.noise_px=0.3"])
+    start, reason = start_of((0, 5), walk, config)
+    assert start is None
+    assert reason
+
+
+def test_scale_from_ground_truth_needs_ground_truth() -> None:
+    start, _ = start_of((0, 5), WALK, CONFIG)
+    assert start is not None
+    view = View(**{**start.view.__dict__, "T_cw_groundtruth": None})
+    with pytest.raises(ConfigError, match="ground truth"):
+        world_scale(
+            Start(start.reference, view, start.T_cw, start.points_w, start.keypoints_1, start.keypoints_2),
+            "groundtruth",
+        )
+
+
+def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
+    tracked = slam.tracker.track(view_of(slam, 20))
+    assert tracked is not None
+    reference = slam.map.T_cw[slam.tracker.reference]
+    view = View(**{**view_of(slam, 20).__dict__, "index": 100})
+
+    def why(T_cr: list[float], overlap: float = 1.0) -> str:
+        pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference
+        slam.tracker.reference_size = int(tracked.inliers / overlap)
+        moved = Tracked(pose, tracked.point_ids, tracked.keypoints, tracked.matches)
+        return why_keyframe(view, moved, slam.tracker, slam.map, Config().keyframes)
+
+    assert why([0.0] * 6) == ""
+    assert why([2.0, 0, 0, 0, 0, 0]).startswith("moved")
+    assert why([0, 0, 0, 0, 0.4, 0]).startswith("turned")
+    assert why([0.0] * 6, overlap=0.3).startswith("sees 30%")
+
+
+def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
+    start, _ = start_of((0, 5), WALK, CONFIG)
+    assert start is not None
+    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    first, second = Mapper(slam.camera, CONFIG, slam.map, slam.clock).start(start)
+    seen = [slam.map.points_seen_by(torch.tensor([k])) for k in (first, second)]
+    assert torch.equal(*seen)
+    assert len(seen[0]) == len(start.points_w)
