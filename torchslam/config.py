@@ -80,7 +80,7 @@ class TrackingConfig:
 class KeyframesConfig:
     max_translation: float = 0.10  # as a share of the median depth of the tracked points
     max_rotation_deg: float = 12.0
-    min_overlap: float = 0.75  # tracked points as a share of those of the reference keyframe
+    min_overlap: float = 0.8  # tracked points as a share of the well observed ones of the reference keyframe
     min_interval: int = 0  # frames between two keyframes
 
 

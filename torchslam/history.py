@@ -32,6 +32,7 @@ class History:
         self.observations.append(
             row=row.expand(tracked.inliers),
             point_ids=tracked.point_ids,
+            keypoints=tracked.keypoints,
             pixels=view.keypoints[tracked.keypoints],
             scales=view.scales[tracked.keypoints],
         )
