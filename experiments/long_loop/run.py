@@ -25,7 +25,17 @@ def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:
     heading = -(s + 0.4)
     zero, one = torch.zeros_like(s), torch.ones_like(s)
     # x right, y down, z forward; the camera turns about the world's y axis.
-    rows = [torch.cos(heading), zero, torch.sin(heading), zero, one, zero, -torch.sin(heading), zero, torch.cos(heading)]
+    rows = [
+        torch.cos(heading),
+        zero,
+        torch.sin(heading),
+        zero,
+        one,
+        zero,
+        -torch.sin(heading),
+        zero,
+        torch.cos(heading),
+    ]
     return se3_inverse(rigid(torch.stack(rows, -1).reshape(-1, 3, 3), centres))
 
 
@@ -45,7 +55,13 @@ def main() -> None:
         ms.append(result.stage_ms["total"])
         states.append(result.state.value)
         if i % 300 == 299:
-            print(i + 1, f"{torch.tensor(ms[-300:]).median():.1f} ms", slam.map.num_keyframes, slam.map.num_points, flush=True)
+            print(
+                i + 1,
+                f"{torch.tensor(ms[-300:]).median():.1f} ms",
+                slam.map.num_keyframes,
+                slam.map.num_points,
+                flush=True,
+            )
     cost = torch.tensor(ms, dtype=torch.float64)
     rows = []
     for start in range(0, frames - 299, 300):
@@ -56,7 +72,9 @@ def main() -> None:
         f"\nMedian of the last 300 frames over that of frames 300 to 600: {ratio:.2f}. "
         f"{slam.map.num_keyframes} keyframes, {slam.map.num_points} points, {states.count('lost')} frames lost.\n"
     )
-    write_between(Path(__file__).parent / "README.md", table(["frames", "median (ms)", "95 % (ms)"], rows) + summary)
+    write_between(
+        Path(__file__).parent / "README.md", table(["frames", "median (ms)", "95 % (ms)"], rows) + summary
+    )
     print(summary)
 
 
