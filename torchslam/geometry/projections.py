@@ -1,7 +1,8 @@
 """Scores and fits of what maps homogeneous points to image coordinates: poses, homographies, pure rotations.
 
 All map homogeneous (B, D, N) points by P (3, D) to x (B, N, 2): D = 4 for scene points, D = 3 for image points.
-Errors are in thresholds, of which `scale` (B, N, 1 or 2) go into one unit of x; rows outside `mask` (B, N) do not count.
+Errors are in thresholds, of which `scale` (B, N, 1 or 2) go into one unit of x; rows outside
+`mask` (B, N) do not count.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, 
     u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, M)).unbind(1)
     du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
     dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
-    # Behind the camera the denominator vanishes and the error becomes huge.
-    inverse, scale = w.clamp_min_(1e-6).reciprocal_(), scale.to(w.dtype)[:, None]
+    # Behind the camera the error becomes infinite, or NaN.
+    inverse, scale = w.clamp_min_(0.0).reciprocal_(), scale.to(w.dtype)[:, None]
     du, dv = du.mul_(inverse).mul_(scale[..., 0]), dv.mul_(inverse).mul_(scale[..., -1])
     return truncated_score(du.square_().addcmul_(dv, dv), mask)
 

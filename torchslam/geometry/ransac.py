@@ -55,8 +55,9 @@ def truncated_score(squared: Tensor, mask: Tensor) -> Tensor:
     squared: (B, M, N) squared residuals in units of the threshold, NaN counted as outliers; mask: (B, N). Returns
     (B, M); higher is better. Source: Torr and Zisserman, "MLESAC", 2000.
     """
-    gain = squared.neg_().add_(1.0).clamp_min_(0.0).nan_to_num_(0.0)
-    return (gain @ mask.to(gain.dtype)[..., None]).squeeze(-1)
+    weights = mask.to(squared.dtype)[..., None]
+    cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
+    return (weights.sum(1, keepdim=True) - cost).squeeze(-1)
 
 
 def truncated_rows(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:

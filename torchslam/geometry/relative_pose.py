@@ -41,6 +41,7 @@ _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
 _CLEARLY_OFF = (
     2.0  # thresholds of the transfer error, three standard deviations of noise as large as the threshold
 )
+_NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
 
 
@@ -178,12 +179,17 @@ def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int)
 def _choose(fits: _Fits, mask: Tensor, chance: float) -> Tensor:
     """The index of the simplest model that no significant number of matches contradicts. (B,)"""
     essential, homography, rotation = fits.squared
-    explained = (torch.minimum(essential, homography) < 1) & mask
+    # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
+    # does not touch, show how large it is.
+    near = (essential < _NOISE_WIDTH**2) & mask
+    noise = essential.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
+    noise = noise.clamp_min(1.0)[:, None]
+    explained = (torch.minimum(essential, homography) < noise) & mask
 
     def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
-        off = (simple > _CLEARLY_OFF**2) & mask
-        against = (off & (rich < 1)).sum(-1)
-        accident = ~is_significant(against, off.sum(-1), 2, torch.full_like(rich[:, 0], chance), 1)
+        off = (simple > _CLEARLY_OFF**2 * noise) & mask
+        against = (off & (rich < noise)).sum(-1)
+        accident = ~is_significant(against, off.sum(-1), 2, chance * noise[:, 0].sqrt(), 1)
         return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
 
     plane = ~contradicted(homography, essential)
@@ -206,7 +212,7 @@ def _pose(views: TwoViews, fits: _Fits, model: Tensor) -> tuple[Tensor, Tensor, 
     support = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0).sum(-1)
     support = torch.where(share > 0.9, support, -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
-    ambiguous = second > first - 0.02 * first.clamp_min(0.0)
+    ambiguous = second > 0.8 * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
     best = order[0]
     flat = model == _HOMOGRAPHY
