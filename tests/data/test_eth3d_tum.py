@@ -59,6 +59,18 @@ def test_part_is_renumbered_and_keeps_its_poses(tum_folder: Folder) -> None:
     assert sequence.frame_rate == pytest.approx(5.0)
 
 
+def test_nothing_left_and_other_impossible_requests(tum_folder: Folder) -> None:
+    folder = tum_folder()
+    with pytest.raises(SequenceError, match="no frames left of 5"):
+        open_sequence(folder, limit=0)
+    with pytest.raises(SequenceError, match="stride must be positive, not 0"):
+        open_sequence(folder, stride=0)
+    with pytest.raises(SequenceError, match="frames per second must be positive, not -5"):
+        open_sequence(folder, fps=-5)
+    with pytest.raises(CalibrationError, match="camera of their own"):
+        open_sequence("synthetic:room", camera="60,61,31.5,23.5")
+
+
 def test_negative_index_counts_from_the_end(tum_folder: Folder) -> None:
     sequence = open_sequence(tum_folder())
     assert sequence[-1].index == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from torchslam.data.calibration import Calibration, parse_camera, read_calibration
@@ -13,7 +14,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.data.synthetic import open_synthetic
 from torchslam.data.video import SUFFIXES as VIDEO_SUFFIXES
 from torchslam.data.video import VideoSequence
-from torchslam.errors import SequenceError
+from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
 
@@ -34,6 +35,8 @@ def open_sequence(
 
     Raises SequenceError, CalibrationError or TrajectoryError that name file and line.
     """
+    if fps is not None and not 0 < fps < math.inf:
+        raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
     if isinstance(camera, str | Path):
         camera = _calibration(camera)
     sequence = _open(path, camera, fps)
@@ -44,6 +47,8 @@ def open_sequence(
 
 def _open(path: str | Path, camera: Camera | Calibration | None, fps: float | None) -> Sequence:
     if str(path).startswith("synthetic:"):
+        if camera is not None:
+            raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
         return open_synthetic(str(path))
     path = Path(path)
     if path.is_dir():

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.association import interpolate_poses
+from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Frame, Trajectory
@@ -75,8 +76,16 @@ class Sequence(ABC):
         return self._T_cw[index]
 
     def part(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Sequence:
-        """Every `stride`-th frame from `start` to before `stop`, numbered from 0 again."""
-        return _Part(self, range(len(self))[start:stop:stride])
+        """Every `stride`-th frame from `start` to before `stop`, numbered from 0 again.
+
+        Raises SequenceError where that leaves none.
+        """
+        if stride < 1:
+            raise SequenceError(f"{self.name}: the stride must be positive, not {stride}")
+        indices = range(len(self))[start:stop:stride]
+        if not indices:
+            raise SequenceError(f"{self.name}: no frames left of {len(self)}")
+        return _Part(self, indices)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -114,8 +123,6 @@ class _Part(Sequence):
     """A range of another sequence's frames."""
 
     def __init__(self, whole: Sequence, indices: range) -> None:
-        if not indices:
-            raise ValueError(f"no frames left of the {len(whole)} of {whole.name}")
         super().__init__(
             whole.name, whole.kind, whole.camera, whole.timestamps[list(indices)], whole.groundtruth
         )
