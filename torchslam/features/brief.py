@@ -19,11 +19,11 @@ ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle 
 
 @lru_cache(maxsize=8)
 def _moment_weights(device: torch.device) -> Tensor:
-    """(side^2, 2) float32: x and y of each pixel of the patch within the disk of RADIUS, else 0."""
+    """(2, side^2) float32: x and y of each pixel of the patch within the disk of RADIUS, else 0."""
     axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
-    return torch.stack([x * disk, y * disk], dim=-1).view(-1, 2).to(device)
+    return torch.stack([x * disk, y * disk]).flatten(1).to(device)
 
 
 def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
@@ -33,8 +33,9 @@ def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
     from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
     """
     patches = gather_patches(pixels, positions, stride, RADIUS)
-    moments = patches.flatten(1).to(torch.float32) @ _moment_weights(pixels.device)
-    return torch.atan2(moments[:, 1], moments[:, 0])
+    # This order of factors is much faster than (N, side^2) @ (side^2, 2) on the CPU.
+    x, y = _moment_weights(pixels.device) @ patches.flatten(1).to(torch.float32).T
+    return torch.atan2(y, x)
 
 
 def blur(pixels: Tensor, stride: int) -> Tensor:

@@ -82,7 +82,7 @@ def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
     return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-limit, limit)
 
 
-def soft_peak(responses: Tensor, temperature: float = 0.1) -> Tensor:
+def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
     """Soft arg-max over a neighbourhood: offset (x, y) of its maximum from its centre, differentiable.
 
     responses: (N, S, S), S odd. Responses are divided by the largest magnitude of their neighbourhood (held constant

@@ -75,18 +75,19 @@ def _best_arc(ring: list[Tensor], inner: Extremum, outer: Extremum) -> Tensor:
     return best
 
 
-def suppress_non_maxima(scores: Tensor, stride: int) -> Tensor:
-    """True where a score exceeds all eight neighbours; of equal neighbours the first in reading order wins.
+def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
+    """True where a score exceeds its floor and its eight neighbours; of equal neighbours the first wins.
 
-    scores: (P,) uint8, flattened with row length `stride`. Returns (P,) bool, False on the margins.
+    scores, floor: (P,) uint8, flattened with row length `stride`. Returns (P,) bool, False on the margins.
     """
-    count = scores.shape[0] - 2 * (stride + 1)
+    margin = stride + 1
+    count = scores.shape[0] - 2 * margin
     if count <= 0:
         return torch.zeros_like(scores, dtype=torch.bool)
     left, middle, right = (scores[k : scores.shape[0] - 2 + k] for k in range(3))
-    sideways = torch.maximum(left, right)
-    rows = torch.maximum(sideways, middle)  # rows[i] covers columns i, i+1, i+2
-    centre = middle.narrow(0, stride, count)
+    rows = torch.maximum(torch.maximum(left, right), middle)  # rows[i] covers columns i, i+1, i+2
     before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
     after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
-    return F.pad((centre > before) & (centre >= after), (stride + 1, stride + 1))
+    before = torch.maximum(before, floor.narrow(0, margin, count))
+    centre = middle.narrow(0, stride, count)
+    return F.pad((centre > before) & (centre >= after), (margin, margin))

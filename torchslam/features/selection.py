@@ -18,18 +18,25 @@ class Grid:
     """Cells over every level of a pyramid, less a border where no keypoint may lie.
 
     table:   (rows * stride,) int32, the cell of each atlas pixel, -1 on the border and between levels
+    floor:   (rows * stride,) uint8, the FAST score that a corner must exceed there; 255 where none may lie
     levels:  (cells,) int64, the level of each cell
     budgets: (levels,) int64, how many keypoints each level may give
     """
 
     table: Tensor
+    floor: Tensor
     levels: Tensor
     budgets: Tensor
 
 
 @lru_cache(maxsize=8)
-def plan_grid(atlas: Atlas, num_keypoints: int, per_cell: int, border: int, device: torch.device) -> Grid:
-    """Budgets per level and square cells whose share of the budget is about `per_cell` keypoints."""
+def plan_grid(
+    atlas: Atlas, num_keypoints: int, per_cell: int, border: int, threshold: int, device: torch.device
+) -> Grid:
+    """Budgets per level and square cells whose share of the budget is about `per_cell` keypoints.
+
+    threshold: the FAST score that a corner must exceed.
+    """
     table = torch.full((atlas.rows, atlas.stride), -1, dtype=torch.int32)
     budgets = _level_budgets(num_keypoints, atlas, border)
     levels: list[int] = []
@@ -47,6 +54,7 @@ def plan_grid(atlas: Atlas, num_keypoints: int, per_cell: int, border: int, devi
     as_tensor = torch.tensor
     return Grid(
         table.flatten().to(device),
+        torch.where(table.flatten() >= 0, threshold, 255).to(device=device, dtype=torch.uint8),
         as_tensor(levels, dtype=torch.int64, device=device),
         as_tensor(budgets, dtype=torch.int64, device=device),
     )
