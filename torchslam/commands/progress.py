@@ -27,7 +27,7 @@ class ProgressBar:
             unit=" frames",
             file=sys.stderr,
             dynamic_ncols=True,
-            bar_format="{n_fmt}/{total_fmt} |{bar:24}| {rate_fmt}, {remaining} left{postfix}",
+            bar_format="{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
         )
         self._warnings = warnings.catch_warnings()
         self._is_stopping = False

@@ -52,7 +52,7 @@ def run(sequence: Sequence, config: Config, output: Path) -> int:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return INTERRUPTED
     if finished.failure:
-        print(f"torchslam: no map: {finished.failure}", file=sys.stderr)
+        print(f"torchslam: {finished.failure}", file=sys.stderr)
         return NO_MAP
     return DONE
 

@@ -65,7 +65,7 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     frames, skipped = figures["frames"], len(figures["skipped"])
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
     if figures["initialised_at"] is None:
-        return rows | {"map": f"none: {figures['failure']}"}
+        return rows | {"map": "none"}
     rows |= {
         "posed": f"{figures['posed']} ({figures['posed'] / frames:.1%}), "
         f"{figures['posed_share_after_initialisation']:.1%} since the start at frame {figures['initialised_at']}",
