@@ -122,7 +122,7 @@ def bundle_scene() -> Callable[..., BundleScene]:
             point_index,
             pixels,
             camera,
-            **options,
+            **({"fixed_frames": (0, 1)} | options),
         )
         return BundleScene(T_cw, points_w, problem)
 

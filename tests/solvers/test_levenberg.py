@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -59,7 +60,7 @@ def test_elements_do_not_see_each_other():
 
 def test_cost_never_rises():
     costs = [minimize(Rosenbrock(3), STARTS, iterations=n, tolerance=0.0)[0].cost for n in range(12)]
-    for before, after in zip(costs[:-1], costs[1:], strict=True):
+    for before, after in pairwise(costs):
         assert (after <= before * (1 + 1e-12)).all()
 
 

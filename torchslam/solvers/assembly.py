@@ -1,6 +1,6 @@
 """From second-order expansions per observation to the normal equations over poses, points and camera.
 
-A point in the camera frame moves with its pose and its world position as dp = G xi + R dX, G = [I, -p^], to first order;
+To first order a point in the camera frame moves with its pose and its world position as dp = G xi + R dX, G = [I, -p^];
 to second order the rotation adds omega x (omega x p) / 2 + omega x (R dX).
 """
 

@@ -28,8 +28,9 @@ class BundleProblem:
     pixels:       (O, 2)
     camera:       one for all frames, params (K,)
     weights:      (O,) inverse variances in px^-2, one if None
-    fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are and so fix the gauge: two frames, or one
-                  and a point, or more
+    fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are. One frame fixes all but the scale, which
+                  then is that of the start; with none the answer keeps the position and the orientation, too.
+                  Whatever more is fixed constrains the shape.
     fixed_points: rows of points_w, or a (P,) bool mask, likewise
     """
 
@@ -40,7 +41,7 @@ class BundleProblem:
     pixels: Tensor
     camera: Camera
     weights: Tensor | None = None
-    fixed_frames: Tensor | Sequence[int] = (0, 1)
+    fixed_frames: Tensor | Sequence[int] = (0,)
     fixed_points: Tensor | Sequence[int] | None = None
 
 
@@ -50,8 +51,8 @@ class BundleSolution:
 
     T_cw:       (F, 4, 4); points_w: (P, 3); camera
     cost:       () half the sum of robustified squared whitened residuals, detached
-    success:    () bool, all that moves is determined. If not, the estimate is still the best that was found, but it
-                has no gradient.
+    success:    () bool, all that moves is determined, up to the gauge. If not, the estimate is still the best that was
+                found, but it has no gradient.
     convergence: of the one element
     """
 
@@ -102,7 +103,7 @@ def bundle_adjust(
 
     Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
     positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
-    is not counts as fixed. Raises ValueError for shapes and indices that do not fit and for unknown names.
+    is not counts as fixed. With an open gauge the gradient is right for losses that do not depend on the gauge. Raises ValueError for shapes and indices that do not fit and for unknown names.
     """
     check_backward(backward)
     counted, inputs = _sanitized(problem, scale)
@@ -117,7 +118,7 @@ def bundle_adjust(
         bundle = build(inputs)
         model, convergence = minimize(bundle, bundle.start, iterations, tolerance)
     with torch.no_grad():
-        success = bundle.solvable[0] & model.equations.factorized().reduced.definite
+        success = bundle.solvable[0] & bundle.factorized(model).reduced.definite
     minimum = Estimate(*(tensor.detach() for tensor in model.estimate))
     solution = model.estimate
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
 from torchslam.solvers.assembly import assemble
 from torchslam.solvers.residuals import (
     Linearization,
@@ -19,7 +20,14 @@ from torchslam.solvers.residuals import (
     variance_factor,
 )
 from torchslam.solvers.robust import Kernel
-from torchslam.solvers.schur import Marginals, NormalEquations, Structure, Tangent, build_structure
+from torchslam.solvers.schur import (
+    FactorizedEquations,
+    Marginals,
+    NormalEquations,
+    Structure,
+    Tangent,
+    build_structure,
+)
 from torchslam.solvers.tangent import move, pull_back, retract
 
 _MIN_POINTS_PER_FRAME = 3
@@ -151,6 +159,23 @@ class Bundle:
     def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
         return new if bool(accept) else old
 
+    def factorized(self, model: BundleModel) -> FactorizedEquations:
+        """The undamped equations of a model at a minimum, ready to be solved."""
+        return model.equations.factorized(gauge=self._gauge(model.estimate.T_cw))
+
+    def _gauge(self, T_cw: Tensor) -> Tensor | None:
+        """Directions (F', 6, g) that what is fixed leaves open: scale, or all of a similarity; None where nothing is."""
+        layout = self.layout
+        if not layout.free_points.all() or len(layout.free_frames) < len(T_cw) - 1:
+            return None
+        fixed = torch.ones(len(T_cw), dtype=torch.bool, device=T_cw.device)
+        fixed[layout.free_frames] = False
+        T_free = T_cw[layout.free_frames]
+        origin = se3_inverse(T_cw[fixed][0] if fixed.any() else T_free[0])[:3, 3]
+        scaling = torch.nn.functional.pad(transform(T_free, origin[None]).squeeze(-2), (0, 3))[..., None]
+        motions = scaling if fixed.any() else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
+        return torch.linalg.qr(motions.flatten(0, 1)).Q.view_as(motions)
+
     def marginals(self, estimate: Estimate) -> Marginals:
         """Covariances (F, 6, 6), (P, 3, 3), (K, K) in the order of the problem, zero for what does not move."""
         lin, _, _ = self._linearize(estimate)
@@ -160,7 +185,7 @@ class Bundle:
             6 * structure.num_frames + 3 * int(layout.free_points.sum()) + len(model.equations.camera)
         )
         factor = variance_factor(self.observations, lin, num_parameters)
-        free, points, camera = model.equations.factorized().marginals()
+        free, points, camera = self.factorized(model).marginals()
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         return Marginals(factor * frames, factor * points[layout.point_rank], factor * camera)
 
@@ -168,7 +193,8 @@ class Bundle:
         """g(minimum, inputs) . lambda with H lambda = gradient of the loss in the unknowns, for `implicit.attach`."""
         layout = self.layout
         with torch.no_grad():
-            direction = self._exact_equations(minimum).factorized().solve(self._tangent(minimum, gradient))
+            exact = self._exact_equations(minimum).factorized(gauge=self._gauge(minimum.T_cw))
+            direction = exact.solve(self._tangent(minimum, gradient))
         at = self.at_minimum(minimum)
         lin, points_c, R_cw = self._linearize(at)
         motion = direction.frames.new_zeros(len(at.T_cw), 6).index_copy(

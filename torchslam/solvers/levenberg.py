@@ -75,14 +75,15 @@ def minimize(
 ) -> tuple[M, Convergence]:
     """Minimise from `start`; returns the model at the last accepted estimate.
 
-    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, and
-    rests from then on.
+    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, or
+    when the residuals have vanished; it rests from then on.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
     initial_cost = model.cost.detach()
     # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
-    slack = 1 + 8 * torch.finfo(initial_cost.dtype).eps
+    rounding = torch.finfo(initial_cost.dtype).eps
+    slack = 1 + 8 * rounding
     damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
     for _ in range(iterations):
@@ -91,7 +92,7 @@ def minimize(
         trial = problem.evaluate(estimate, share < _NEAR)
         accept = active & share.isfinite() & (trial.cost <= slack * model.cost)
         steps = steps + active
-        active = active & (share > tolerance)
+        active = active & (share > tolerance) & (model.cost.detach() > rounding**1.5 * initial_cost)
         model = problem.select(accept, trial, model)
         damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():

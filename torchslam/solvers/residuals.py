@@ -4,8 +4,8 @@ Everything that the camera model and the robust kernel contribute to a refinemen
 camera frame (and, where it is free, of the camera's parameters). Poses and world points enter through the chain rule,
 in `pose` and in `bundle`.
 
-An observation of a point that cannot be projected (behind the camera, beyond the distortion's range) costs as much as an
-error of the image's diagonal and pulls nowhere: no step gains by pushing a point behind the camera.
+An observation of a point that cannot be projected (behind the camera, beyond the distortion's range) costs as much as
+an error of the image's diagonal and pulls nowhere: no step gains by pushing a point behind the camera.
 """
 
 from __future__ import annotations
@@ -179,19 +179,24 @@ def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_ca
 def variance_factor(observations: Observations, linearization: Linearization, num_parameters: int) -> Tensor:
     """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate. -> (...).
 
-    From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, where
-    psi = rho' r; for least squares this is the variance of unit weight. One where there is no redundancy.
-    Source: Huber, "Robust statistics", 1981, section 7.6.
+    From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, psi = rho' r,
+    with Huber's correction for small samples; for least squares this is the variance of unit weight. One where there is
+    no redundancy. Source: Huber, "Robust statistics", 1981, section 7.6.
     """
     weights = observations.weights
     counted = (linearization.weight > 0) & (weights > 0)
     variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
     squared = linearization.residual.square().sum(-1)
-    weight = 2 * (linearization.weight * variance).sum(-1)
-    psi_squared = (linearization.weight.square() * squared * variance).sum(-1)
-    psi_slope = weight + (linearization.bend * squared * variance).sum(-1)
+    across = linearization.weight * variance  # the slope of psi across the residual and along it
+    along = across + linearization.bend * squared * variance
     components = 2 * counted.sum(-1)
-    redundant = (components > num_parameters) & (psi_slope > 0)
-    spare = torch.where(redundant, components - num_parameters, 1)
-    factor = psi_squared * weight * components / (spare * psi_slope.square())
+    mean_slope = (across + along).sum(-1) / components
+    redundant = (components > num_parameters) & (mean_slope > 0)
+    mean_slope = torch.where(redundant, mean_slope, 1.0)
+    spread = (across.square() + along.square()).sum(-1) / components / mean_slope.square() - 1
+    correction = 1 + num_parameters / components * spread
+    psi_squared = (linearization.weight.square() * squared * variance).sum(-1)
+    psi_squared = psi_squared / torch.where(redundant, components - num_parameters, 1)
+    mean_weight = 2 * across.sum(-1) / components
+    factor = correction.square() * psi_squared * mean_weight / mean_slope.square()
     return torch.where(redundant, factor, 1.0)

@@ -151,10 +151,12 @@ class NormalEquations:
     coupling: Tensor
     free_points: Tensor
 
-    def factorized(self, damping: Tensor | None = None) -> FactorizedEquations:
+    def factorized(self, damping: Tensor | None = None, gauge: Tensor | None = None) -> FactorizedEquations:
         """Eliminate the points and factorise what is left, after the diagonals grew by the share `damping`.
 
         Points that their observations do not determine are left out, as if fixed.
+        gauge: (F, 6, g) directions of the frames along which the solution is to be zero. Where these fix what the
+        observations leave open, and no more, they change no right side that is orthogonal to what is open.
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
@@ -163,6 +165,9 @@ class NormalEquations:
         for tile, A in zip(self.structure.tiles, whitened, strict=True):
             rows = self._rows(tile)
             reduced.index_put_((rows[:, None], rows[None, :]), -(A.mT @ A), accumulate=True)
+        if gauge is not None:
+            c = gauge.flatten(0, 1) * reduced.diagonal().mean().sqrt()
+            reduced[: len(c), : len(c)] += c @ c.mT
         return FactorizedEquations(self, root, whitened, factorize(reduced, strict=damping is None))
 
     def _frames_and_camera(self, damping: Tensor | None) -> Tensor:
