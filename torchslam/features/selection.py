@@ -82,16 +82,9 @@ def true_indices(mask: Tensor) -> Tensor:
     return torch.cat([words[hits[:, 0]] * 8 + hits[:, 1], tail])
 
 
-def order_by(*keys: Tensor) -> Tensor:
-    """Indices that sort rows by the first key, ties by the second, and so on; ascending and stable."""
-    order = torch.argsort(keys[-1], stable=True)
-    for key in reversed(keys[:-1]):
-        order = order[torch.argsort(key[order], stable=True)]
-    return order
-
-
-def ranks_within(groups: Tensor, order: Tensor, num_groups: int) -> Tensor:
-    """Place of each row among the rows of its group, from 0, when taken in `order`, which must be sorted by group."""
+def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
+    """Place of each row among the rows of its group, from 0, in the order in which they come: (N,) int64 -> (N,)."""
+    order = torch.argsort(groups, stable=True)
     sizes = torch.bincount(groups, minlength=num_groups)
     starts = sizes.cumsum(0) - sizes
     ranks = torch.empty_like(order)
@@ -100,9 +93,12 @@ def ranks_within(groups: Tensor, order: Tensor, num_groups: int) -> Tensor:
 
 
 def best_per_cell(cells: Tensor, scores: Tensor, count: int, num_cells: int) -> Tensor:
-    """Rows that are among the `count` best of their cell: (N,) int64, (N,) uint8 -> (K,) int64, ascending."""
+    """Rows that are among the `count` best of their cell: (N,) int64, (N,) uint8 -> (K,) int64, by cell."""
     order = torch.argsort(cells * 256 + (255 - scores.to(torch.int64)), stable=True)
-    return (ranks_within(cells, order, num_cells) < count).nonzero().squeeze(1)
+    sizes = torch.bincount(cells, minlength=num_cells)
+    starts = sizes.cumsum(0) - sizes
+    ranks = torch.arange(order.shape[0], device=order.device) - starts[cells[order]]
+    return order[ranks < count]
 
 
 def spread(
@@ -123,16 +119,21 @@ def spread(
     Returns the chosen rows (K,) and the place (K,) of each in its image's list, 0 ... count - 1, by falling score.
     """
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
-    image_cells = images * num_cells + cells
-    order = order_by(image_cells, -scores)
-    extra = ranks_within(image_cells, order, num_images * num_cells) >= per_cell
-    rows = (strong | ~extra).nonzero().squeeze(1)
-    scores, extra, images, levels = scores[rows], extra[rows], images[rows], grid.levels[cells[rows]]
+    rows = torch.argsort(scores, descending=True, stable=True)  # every rank below follows this order
+    cells, images = cells[rows], images[rows]
+    extra = ranks_within(images * num_cells + cells, num_images * num_cells) >= per_cell
 
-    groups = images * num_levels + levels
-    order = order_by(groups * 2 + extra, -scores)
-    over_budget = ranks_within(groups, order, num_images * num_levels) >= grid.budgets[levels]
-    order = order_by(images * 2 + over_budget, -scores)
-    chosen = ranks_within(images, order, num_images) < count
-    rows, images, scores = rows[chosen], images[chosen], scores[chosen]
-    return rows, ranks_within(images, order_by(images, -scores), num_images)
+    kept = (strong[rows] | ~extra).nonzero().squeeze(1)
+    rows, extra, images, levels = rows[kept], extra[kept], images[kept], grid.levels[cells[kept]]
+    # A level counts its cells' first corners, then the others; so does an image with what the levels' budgets hold.
+    within_level = _ranks_in_turn(images * num_levels + levels, extra, num_images * num_levels)
+    within_image = _ranks_in_turn(images, within_level >= grid.budgets[levels], num_images)
+    chosen = (within_image < count).nonzero().squeeze(1)
+    return rows[chosen], ranks_within(images[chosen], num_images)
+
+
+def _ranks_in_turn(groups: Tensor, second: Tensor, num_groups: int) -> Tensor:
+    """Place of each row within its group if all rows that are not `second` come first."""
+    ranks = ranks_within(groups * 2 + second, num_groups * 2)
+    firsts = torch.bincount(groups[~second], minlength=num_groups)
+    return ranks + firsts[groups] * second
