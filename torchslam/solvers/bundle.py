@@ -103,7 +103,8 @@ def bundle_adjust(
 
     Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
     positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
-    is not counts as fixed. With an open gauge the gradient is right for losses that do not depend on the gauge. Raises ValueError for shapes and indices that do not fit and for unknown names.
+    is not counts as fixed. With an open gauge the gradient is right for losses that do not depend on it.
+    Raises ValueError for shapes and indices that do not fit and for unknown names.
     """
     check_backward(backward)
     counted, inputs = _sanitized(problem, scale)

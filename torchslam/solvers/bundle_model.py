@@ -164,7 +164,7 @@ class Bundle:
         return model.equations.factorized(gauge=self._gauge(model.estimate.T_cw))
 
     def _gauge(self, T_cw: Tensor) -> Tensor | None:
-        """Directions (F', 6, g) that what is fixed leaves open: scale, or all of a similarity; None where nothing is."""
+        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is."""
         layout = self.layout
         if not layout.free_points.all() or len(layout.free_frames) < len(T_cw) - 1:
             return None
