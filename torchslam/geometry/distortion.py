@@ -198,8 +198,8 @@ def _fisheye_slope(xy: Tensor, k: Tensor) -> Tensor:
 
 def _fisheye_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
     """d distorted / d k. (..., 2, 4)."""
-    radius, _ = _safe_radius(xy)
-    angle = torch.atan(radius)
+    radius, zero = _safe_radius(xy)
+    angle = torch.atan(torch.where(zero, 0.0, radius))
     u = angle * angle
     powers = angle[..., None] * torch.stack((u, u * u, u * u * u, u * u * u * u), dim=-1)
     return (xy / radius[..., None])[..., None] * powers[..., None, :]

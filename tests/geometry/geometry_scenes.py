@@ -1,0 +1,87 @@
+"""Synthetic scenes with known poses, noise and wrong matches, for the tests of the estimators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, transform
+
+CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """pixels_1, pixels_2: (1, N, 2); points_1: (1, N, 3); T_21: (1, 4, 4); mask: (1, N) right matches."""
+
+    pixels_1: Tensor
+    pixels_2: Tensor
+    points_1: Tensor
+    T_21: Tensor
+    mask: Tensor
+
+
+def two_views(
+    seed: int,
+    count: int = 200,
+    outliers: float = 0.3,
+    noise: float = 0.5,
+    baseline: float = 0.35,
+    plane: bool = False,
+    camera: Camera = CAMERA,
+) -> Scene:
+    """Two views of a scene between 2 and 8 away, or of a slanted plane."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    size = torch.tensor(camera.size, dtype=torch.float64)
+    omega, direction = 0.08 * normal(3), normal(3) * torch.tensor((1.0, 1.0, 0.3))
+    T_21 = rigid(so3_exp(omega), baseline * direction / direction.norm())
+    pixels = torch.rand(8 * count, 2, generator=generator, dtype=torch.float64) * size
+    depth = 2 + 6 * torch.rand(8 * count, generator=generator, dtype=torch.float64)
+    rays = camera.unproject(pixels)
+    if plane:
+        plane_normal = torch.tensor((0.3, -0.2, 1.0), dtype=torch.float64)
+        depth = 4 * plane_normal.norm() / (rays / rays[:, 2:] @ plane_normal)
+    points = rays / rays[:, 2:] * depth[:, None]
+    projected, valid = camera.project(transform(T_21, points))
+    rows = (valid & camera.in_image(projected)).nonzero().squeeze(-1)[:count]
+    pixels_1 = pixels[rows] + noise * normal(count, 2)
+    pixels_2 = projected[rows] + noise * normal(count, 2)
+    wrong = torch.arange(count) < int(outliers * count)
+    elsewhere = torch.rand(count, 2, generator=generator, dtype=torch.float64) * size
+    pixels_2 = torch.where(wrong[:, None], elsewhere, pixels_2)
+    return Scene(pixels_1[None], pixels_2[None], points[rows][None], T_21[None], ~wrong[None])
+
+
+def points_and_pixels(
+    seed: int, count: int = 150, outliers: float = 0.3, noise: float = 0.5, camera: Camera = CAMERA
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points (1, N, 3) in the world, their pixels (1, N, 2), and the camera's pose (1, 4, 4)."""
+    generator = torch.Generator().manual_seed(seed)
+    T_cw = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    size = torch.tensor(camera.size, dtype=torch.float64)
+    pixels = torch.rand(count, 2, generator=generator, dtype=torch.float64) * size
+    depth = 1.5 + 6 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    rays = camera.unproject(pixels)
+    points_w = transform(se3_inverse(T_cw), rays / rays[:, 2:] * depth)
+    pixels = pixels + noise * torch.randn(count, 2, generator=generator, dtype=torch.float64)
+    wrong = torch.arange(count) < int(outliers * count)
+    elsewhere = torch.rand(count, 2, generator=generator, dtype=torch.float64) * size
+    return points_w[None], torch.where(wrong[:, None], elsewhere, pixels)[None], T_cw[None]
+
+
+def rotation_error(R: Tensor, R_true: Tensor) -> float:
+    """Largest angle between rotations, degrees."""
+    chord = (R - R_true).flatten(-2).norm(dim=-1) / (2 * 2**0.5)
+    return float(torch.rad2deg(2 * torch.asin(chord.clamp(max=1.0))).max())
+
+
+def direction_error(t: Tensor, t_true: Tensor) -> float:
+    """Largest angle between directions, degrees."""
+    cosine = torch.nn.functional.cosine_similarity(t, t_true, dim=-1)
+    return float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max())

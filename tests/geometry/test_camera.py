@@ -1,0 +1,174 @@
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from torchslam.geometry import Camera
+from torchslam.geometry.distortion import first_positive_root
+
+SIZE = (640, 480)
+CAMERAS = {
+    "pinhole": Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=SIZE),
+    "radial_tangential": Camera.radial_tangential(
+        500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=SIZE
+    ),
+    "barrel": Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.3, 0.0, 0.0, 0.0, size=SIZE),
+    "fisheye": Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=SIZE),
+}
+
+
+@pytest.fixture(params=CAMERAS.values(), ids=CAMERAS.keys())
+def camera(request: pytest.FixtureRequest) -> Camera:
+    return request.param
+
+
+def points(count: int = 20) -> Tensor:
+    """In front of the camera, the first on its axis."""
+    generator = torch.Generator().manual_seed(0)
+    spread = torch.tensor((0.6, 0.5, 0.5), dtype=torch.float64)
+    cloud = spread * (2 * torch.rand(2, count, 3, generator=generator, dtype=torch.float64) - 1)
+    cloud[..., 2] += 2
+    cloud[:, 0, :2] = 0
+    return cloud
+
+
+def with_bad_rows(cloud: Tensor) -> Tensor:
+    cloud = cloud.clone()
+    cloud[0, 1] = torch.tensor((0.1, 0.1, -2.0))
+    cloud[0, 2] = torch.nan
+    cloud[0, 3] = torch.inf
+    cloud[0, 4] = 0.0
+    return cloud
+
+
+def test_project_agrees_with_opencv(camera: Camera) -> None:
+    cloud = points()[0].numpy()
+    K, coefficients, zero = camera.K.numpy(), camera.params[4:].numpy(), np.zeros(3)
+    if camera.model == "fisheye":
+        expected = cv2.fisheye.projectPoints(cloud[:, None], zero, zero, K, coefficients)[0]
+    else:
+        expected = cv2.projectPoints(cloud, zero, zero, K, coefficients if len(coefficients) else None)[0]
+    pixels, valid = camera.project(torch.from_numpy(cloud))
+    assert valid.all()
+    torch.testing.assert_close(pixels, torch.from_numpy(expected).squeeze(1), atol=1e-10, rtol=0)
+
+
+def test_unproject_inverts_project(camera: Camera) -> None:
+    cloud = points()
+    pixels, _ = camera.project(cloud)
+    bearings = cloud / cloud.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(camera.unproject(pixels), bearings, atol=1e-12, rtol=0)
+    torch.testing.assert_close(camera.normalize(pixels), cloud[..., :2] / cloud[..., 2:], atol=1e-12, rtol=0)
+
+
+def test_bad_points_are_invalid_and_finite(camera: Camera) -> None:
+    cloud = with_bad_rows(points()).requires_grad_()
+    params = camera.params.clone().requires_grad_()
+    pixels, valid, J_points, J_params = camera.with_params(params).project_with_jacobians(cloud)
+    assert valid[0].tolist() == [True] + 4 * [False] + 15 * [True]
+    assert all(torch.isfinite(x).all() for x in (pixels, J_points, J_params))
+    assert (J_points[0, 1:5] == 0).all()
+    camera.with_params(params).project(cloud)[0].sum().backward()
+    assert torch.isfinite(cloud.grad).all()
+    assert torch.isfinite(params.grad).all()
+
+
+def test_analytic_jacobians_agree_with_autograd(camera: Camera) -> None:
+    cloud = with_bad_rows(points())
+
+    def project(cloud: Tensor, params: Tensor) -> Tensor:
+        return camera.with_params(params).project(cloud)[0]
+
+    by_points, by_params = torch.autograd.functional.jacobian(project, (cloud, camera.params))
+    pixels, valid, J_points, J_params = camera.project_with_jacobians(cloud)
+    torch.testing.assert_close(J_points, torch.einsum("bnibnj->bnij", by_points))
+    torch.testing.assert_close(J_params, by_params)
+    for one, other in zip(camera.project_with_point_jacobians(cloud), (pixels, valid, J_points), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_gradients(camera: Camera) -> None:
+    cloud, params = points(5).requires_grad_(), camera.params.clone().requires_grad_()
+    pixels = camera.project(points(5))[0].detach().requires_grad_()
+    assert gradcheck(lambda x, p: camera.with_params(p).project(x)[0], (cloud, params))
+    assert gradcheck(lambda x, p: camera.with_params(p).normalize(x), (pixels, params))
+    assert gradcheck(lambda x, p: camera.with_params(p).unproject(x), (pixels, params))
+    for function in (camera.project_with_jacobians, camera.project_with_point_jacobians):
+        assert gradcheck(
+            lambda x, function=function: [y for y in function(x) if y.is_floating_point()], (cloud,)
+        )
+
+
+def test_points_beyond_the_monotone_radius_are_invalid() -> None:
+    camera = CAMERAS["barrel"]
+    limit = math.sqrt(1 / 0.9)  # where 1 + 3 k1 r^2 vanishes
+    assert float(camera.limit) == pytest.approx(limit)
+    x = torch.tensor(((0.99 * limit, 0.0, 1.0), (1.01 * limit, 0.0, 1.0)), dtype=torch.float64)
+    assert camera.project(x)[1].tolist() == [True, False]
+    assert math.isinf(CAMERAS["pinhole"].limit)
+    # far outside the image the inverse is clamped to the edge, not wrapped
+    far = camera.normalize(torch.tensor(((5000.0, 240.0),), dtype=torch.float64))
+    assert 0.99 * limit < float(far[0, 0]) <= limit
+
+
+def test_first_positive_root() -> None:
+    coefficients = torch.tensor(((-3.0, 2.0, 0.0), (1.0, 1.0, 1.0), (0.0, 0.0, -8.0), (torch.nan, 0.0, 0.0)))
+    expected = torch.tensor((0.5, torch.inf, 0.5, torch.inf))
+    torch.testing.assert_close(first_positive_root(coefficients.double()), expected.double())
+
+
+def test_batched_cameras_equal_a_loop() -> None:
+    camera = CAMERAS["radial_tangential"]
+    params = torch.stack((camera.params, 1.1 * camera.params))
+    cloud = points()
+    both = Camera(camera.model, params, SIZE)
+    for i in range(2):
+        one = camera.with_params(params[i])
+        assert torch.equal(both.project(cloud)[0][i], one.project(cloud[i])[0])
+        torch.testing.assert_close(
+            both.unproject(cloud[..., :2] * 100 + 200)[i], one.unproject(cloud[i, :, :2] * 100 + 200)
+        )
+
+
+def test_float32_and_device(camera: Camera, device: torch.device, dtype: torch.dtype) -> None:
+    camera = camera.to(device).to(dtype)
+    cloud = points().to(device, dtype).requires_grad_()
+    pixels, _ = camera.project(cloud)
+    assert (pixels.dtype, pixels.device.type) == (dtype, device.type)
+    camera.unproject(pixels).square().sum().backward()
+    assert torch.isfinite(cloud.grad).all()
+    torch.testing.assert_close(
+        pixels.double().cpu(), camera.to("cpu").to(torch.float64).project(points())[0], atol=1e-3, rtol=0
+    )
+
+
+def test_image_border_properties_and_errors() -> None:
+    camera = CAMERAS["pinhole"]
+    pixels = torch.tensor(
+        ((-0.5, 0.0), (-0.6, 0.0), (639.5, 479.5), (639.6, 479.5), (15.4, 100.0), (15.5, 100.0))
+    )
+    assert camera.in_image(pixels).tolist() == [True, False, True, False, True, True]
+    assert camera.in_image(pixels, border=16).tolist() == [False] * 5 + [True]
+    assert (camera.width, camera.height) == SIZE
+    assert float(camera.focal) == pytest.approx(math.sqrt(500 * 510))
+    with pytest.raises(ValueError, match="unknown camera model"):
+        Camera("telescope", torch.ones(4), SIZE)
+    with pytest.raises(ValueError, match="4 parameters"):
+        Camera("pinhole", torch.ones(5), SIZE)
+
+
+def test_pixel_scale_is_the_local_magnification(camera: Camera) -> None:
+    x = points()[0, :, :2]
+    step = 1e-6
+    cloud = torch.cat((x, torch.ones_like(x[:, :1])), dim=-1)
+    moved_x, moved_y = cloud.clone(), cloud.clone()
+    moved_x[:, 0] += step
+    moved_y[:, 1] += step
+    base = camera.project(cloud)[0]
+    d_x, d_y = (camera.project(moved_x)[0] - base) / step, (camera.project(moved_y)[0] - base) / step
+    area = (d_x[:, 0] * d_y[:, 1] - d_x[:, 1] * d_y[:, 0]).abs()
+    torch.testing.assert_close(camera.pixel_scale(x).prod(-1), area, rtol=1e-4, atol=0)

@@ -1,0 +1,136 @@
+import pytest
+import torch
+from geometry_scenes import CAMERA
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from torchslam.geometry import (
+    Camera,
+    correct_matches,
+    se3_exp,
+    se3_inverse,
+    skew,
+    transform,
+    triangulate,
+    triangulate_many,
+)
+
+RADIAL = Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
+FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
+
+
+def views(
+    camera: Camera = CAMERA, count: int = 30, noise: float = 0.0, extra: int = 0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses (V, 4, 4), pixels (N, V, 2) and points (N, 3)."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    steps = torch.tensor(((-0.4, 0.02, 0.05, 0.02, -0.03, 0.01),), dtype=torch.float64)
+    steps = torch.cat(
+        (0.0 * steps, steps, steps * torch.linspace(-1, 2, extra)[:, None] + 0.05 * normal(extra, 6))
+    )
+    T_cw = se3_exp(steps) @ se3_exp(0.3 * normal(6))
+    uniform = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    points_c = (uniform - 0.5) * torch.tensor((3.0, 2.0, 4.0)) + torch.tensor((0.0, 0.0, 5.0))
+    points_w = transform(se3_inverse(T_cw[0]), points_c)
+    pixels = camera.project(transform(T_cw, points_w))[0].transpose(0, 1)
+    return T_cw, pixels + noise * normal(*pixels.shape), points_w
+
+
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
+def test_exact_matches_give_the_points_back(camera: Camera) -> None:
+    T_cw, pixels, points_w = views(camera, extra=2)
+    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera)
+    many = triangulate_many(T_cw, pixels, camera)
+    centres = se3_inverse(T_cw)[:, :3, 3]
+    rays = points_w - centres[0], points_w - centres[1]
+    angles = torch.acos(torch.nn.functional.cosine_similarity(*rays, dim=-1))
+    for result in (two, many):
+        assert result.mask.all()
+        torch.testing.assert_close(result.points_w, points_w, atol=1e-9, rtol=0)
+    torch.testing.assert_close(two.angles, angles, atol=1e-7, rtol=0)
+    assert (many.angles >= two.angles - 1e-9).all()
+    assert float(two.errors_1.max()) < 1e-8
+    assert float(many.errors.max()) < 1e-8
+    torch.testing.assert_close(two.depths_2, transform(T_cw[1], points_w)[:, 2])
+
+
+def test_two_views_reach_the_least_reprojection_error() -> None:
+    T_cw, pixels, _ = views(noise=1.0)
+    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], CAMERA, CAMERA)
+    many = triangulate_many(T_cw, pixels, CAMERA, iterations=10)
+    cost = two.errors_1.square() + two.errors_2.square()
+    torch.testing.assert_close(cost, many.errors.square().sum(-1), rtol=1e-6, atol=1e-9)
+
+
+def test_corrected_matches_satisfy_the_constraint() -> None:
+    T_cw, pixels, _ = views(noise=1.0)
+    T_21 = T_cw[1] @ se3_inverse(T_cw[0])
+    E = skew(T_21[:3, 3]) @ T_21[:3, :3]
+    x_1, x_2 = correct_matches(E, CAMERA.normalize(pixels[:, 0]), CAMERA.normalize(pixels[:, 1]))
+    h_1, h_2 = (torch.cat((x, torch.ones_like(x[:, :1])), dim=-1) for x in (x_1, x_2))
+    assert float((h_2 * (h_1 @ E.mT)).sum(-1).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
+def test_gradients(camera: Camera, noise: float) -> None:
+    T_cw, pixels, _ = views(camera, count=3, noise=noise)
+    inputs = [x.clone().requires_grad_() for x in (T_cw, pixels, camera.params)]
+
+    def two(T_cw: Tensor, pixels: Tensor, params: Tensor) -> tuple[Tensor, ...]:
+        one = camera.with_params(params)
+        result = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], one, one)
+        return result.points_w, result.angles, *((result.errors_1,) if noise else ())
+
+    def many(T_cw: Tensor, pixels: Tensor, params: Tensor) -> tuple[Tensor, ...]:
+        result = triangulate_many(T_cw, pixels, camera.with_params(params))
+        return result.points_w, result.angles, *((result.errors,) if noise else ())
+
+    assert gradcheck(two, inputs)
+    assert gradcheck(many, inputs)
+
+
+def test_bad_rows_are_masked_and_finite(dtype: torch.dtype) -> None:
+    T_cw, pixels, _ = (x.to(dtype) for x in views(noise=0.1))
+    pixels[0], pixels[1, 1] = torch.nan, torch.inf
+    behind = 2 * transform(T_cw, views()[2].to(dtype))[:, 2, :2]  # arbitrary, but far from the epipolar line
+    pixels[2, 1] = pixels[2, 0] + behind[0]
+    pixels[3] = pixels[3, :1]
+    given = torch.ones(len(pixels), dtype=torch.bool)
+    given[4] = False
+    T_cw, pixels = T_cw.requires_grad_(), pixels.requires_grad_()
+    camera = CAMERA.to(dtype)
+    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera, given)
+    many = triangulate_many(T_cw, pixels, camera, given[:, None].expand(-1, 2))
+    assert not two.mask[[0, 1, 4]].any()
+    assert not many.mask[[0, 1, 4]].any()
+    assert torch.isinf(two.errors_1[[0, 1, 4]]).all()
+    loss = sum(
+        x.sum() for x in (two.points_w, two.angles, two.depths_1, two.depths_2, many.points_w, many.angles)
+    )
+    assert torch.isfinite(loss)
+    loss.backward()
+    assert torch.isfinite(T_cw.grad).all()
+    assert torch.isfinite(pixels.grad).all()
+
+
+def test_no_baseline_or_parallel_rays_give_no_point() -> None:
+    T_cw, pixels, _ = views()
+    same = triangulate(T_cw[0], T_cw[0], pixels[:, 0], pixels[:, 0], CAMERA, CAMERA)
+    assert not same.mask.any()
+    assert torch.isfinite(same.points_w).all()
+    one_view = triangulate_many(T_cw, pixels, CAMERA, torch.tensor((True, False)).expand(len(pixels), 2))
+    assert not one_view.mask.any()
+
+
+def test_batch_equals_loop_and_device(device: torch.device) -> None:
+    T_cw, pixels, _ = (x.to(device) for x in views(noise=0.5, extra=1))
+    camera = CAMERA.to(device)
+    batch = triangulate_many(torch.stack((T_cw, T_cw)), torch.stack((pixels, pixels.flip(0))), camera)
+    single = triangulate_many(T_cw, pixels, camera)
+    torch.testing.assert_close(batch.points_w[0], single.points_w)
+    torch.testing.assert_close(batch.points_w[1], single.points_w.flip(0))
