@@ -16,7 +16,7 @@ FORMAT = 1
 
 def write_map(path: str | Path, slam_map: Map, camera: Camera) -> None:
     """Write all of a map, dead points included (ids are row numbers), and its camera; same map, same bytes."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors = {f"points.{name}": column for name, column in slam_map.points.columns().items()}
     tensors |= {f"keyframes.{name}": column for name, column in slam_map.keyframes.columns().items()}
@@ -24,7 +24,7 @@ def write_map(path: str | Path, slam_map: Map, camera: Camera) -> None:
     # One metadata entry: several would be written in an order that differs from run to run.
     about = {"format": FORMAT, "camera": {"model": camera.model, "size": list(camera.size)}}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    save_file(tensors, str(path), metadata={"torchslam": json.dumps(about, sort_keys=True)})
+    Path(path).write_bytes(save(tensors, metadata={"torchslam": json.dumps(about, sort_keys=True)}))
 
 
 def read_map(path: str | Path) -> tuple[Map, Camera]:
