@@ -55,6 +55,7 @@ class InitializationConfig:
     min_good_share: float = 0.15  # ... and this share of the matches must count
     min_parallax_deg: float = 3.0  # parallax: a point counts from this angle on
     min_mean_parallax_deg: float = 5.0
+    min_explained: float = 0.8  # share of the frames since the reference that the start must explain
     max_reference_age: int = 60  # frames; an older reference is replaced
 
 
@@ -218,7 +219,7 @@ def _checked(name: str, value: Any, kind: type, source: str) -> Any:
         raise ConfigError(f"{source}: {name} must be of type {kind.__name__}, not {value!r}")
     if name in CHOICES and value not in CHOICES[name]:
         raise ConfigError(f"{source}: {name} must be one of {', '.join(CHOICES[name])}, not {value!r}")
-    if kind in (int, float) and not (value >= 0 and value < float("inf")):
+    if isinstance(value, int | float) and not 0 <= value < float("inf"):
         raise ConfigError(f"{source}: {name} must be finite and not negative, not {value!r}")
     return value
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
@@ -42,11 +43,14 @@ class SLAM:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the map and wait for a new start."""
+        """Forget everything and wait for a new start."""
+        self.initializer = Initializer(self.camera, self.config)
+        self._forget_map()
+
+    def _forget_map(self) -> None:
         self.state = State.INITIALIZING
         self.map = Map()
         self.history = History()
-        self.initializer = Initializer(self.camera, self.config)
         self.tracker = Tracker(self.camera, self.config, self.map)
         self.mapper = Mapper(self.camera, self.config, self.map, self.clock)
 
@@ -70,7 +74,7 @@ class SLAM:
         if why:
             self.tracker.follow(self.mapper.insert(view, tracked))
         self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)
-        return self._result(view, why, tracked, is_keyframe=bool(why))
+        return self._result(view, why, self.tracker.T_cw, tracked, is_keyframe=bool(why))
 
     def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
@@ -81,20 +85,28 @@ class SLAM:
         return self.history.trajectory(self.map)
 
     def _initialize(self, view: View) -> StepResult:
-        """Try to start a map; then pose the frames that were seen on the way to it."""
+        """Try to start a map, and believe it if it explains the frames that were seen on the way to it."""
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
             if start is None:
                 return self._result(view, reason)
             first, second = self.mapper.start(start)
             self.tracker.follow(first)
-            for earlier in self.initializer.views:
-                tracked = self.tracker.track(earlier)
-                if tracked is not None:
-                    self.history.add(earlier, tracked, self.tracker.T_cr, self.tracker.reference)
+            explained = [self._explain(earlier) for earlier in self.initializer.views]
             self.tracker.follow(second)
+        if sum(explained) < self.config.initialization.min_explained * len(explained):
+            self._forget_map()
+            return self._result(view, f"bad start: it explains {sum(explained)} of {len(explained)} frames")
         self.state = State.TRACKING
-        return self._result(view, "started the map", is_keyframe=True)
+        return self._result(view, "started the map", self.tracker.T_cw, is_keyframe=True)
+
+    def _explain(self, view: View) -> bool:
+        """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
+        tracked = self.tracker.track(view)
+        if tracked is None:
+            return False
+        self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)
+        return tracked.inliers > 0.5 * tracked.matches
 
     def _lose(self, view: View) -> StepResult:
         """Stay lost and try again with the next frame; a map that is lost right after its start is given up."""
@@ -106,13 +118,18 @@ class SLAM:
         return self._result(view, reason)
 
     def _result(
-        self, view: View, reason: str, tracked: Tracked | None = None, is_keyframe: bool = False
+        self,
+        view: View,
+        reason: str,
+        T_cw: Tensor | None = None,
+        tracked: Tracked | None = None,
+        is_keyframe: bool = False,
     ) -> StepResult:
         return StepResult(
             index=view.index,
             timestamp=view.timestamp,
             state=self.state,
-            T_cw=None if tracked is None else self.tracker.T_cw,
+            T_cw=T_cw,
             is_keyframe=is_keyframe,
             matches=tracked.matches if tracked else 0,
             inliers=tracked.inliers if tracked else 0,

@@ -13,6 +13,7 @@ from torchslam.correspondences import Projected, match_near, match_points, proje
 from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform
 from torchslam.map import Map
 from torchslam.solvers import refine_pose
+from torchslam.solvers.robust import Kernel
 from torchslam.types import View
 
 
@@ -181,7 +182,8 @@ class Tracker:
         """(4, 4) and (n,): the pose by robust least squares, once on all matches and once on those that agree."""
         points_w = self.map.positions_w[ids]
         mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
-        for kernel, iterations in (("cauchy", 10), ("huber", 5)):
+        passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
+        for kernel, iterations in passes:
             refined = refine_pose(
                 T_cw[None],
                 points_w[None],
