@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import to_toml
+from torchslam.data.image_file import read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
@@ -75,12 +76,12 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
 
 
 def read_results(directory: Path) -> Results:
-    """The results in a folder. Raises ResultsError or TrajectoryError where something is missing or damaged."""
+    """The results in a folder. Raises ResultsError, TrajectoryError or FrameError for what is missing or damaged."""
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
     slam_map, _ = read_map(directory / MAP)
     is_empty = slam_map.num_keyframes == 0
-    truth, image = directory / GROUND_TRUTH, cv2.imread(str(directory / EXAMPLE_IMAGE), cv2.IMREAD_GRAYSCALE)
+    truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
         trajectory=_no_poses() if is_empty else read_trajectory(directory / TRAJECTORY),
         keyframes=_no_poses() if is_empty else read_trajectory(directory / KEYFRAMES),
@@ -88,7 +89,7 @@ def read_results(directory: Path) -> Results:
         map=slam_map,
         frames=read_frames(directory / FRAMES),
         metrics=_read_metrics(directory / METRICS),
-        example_image=None if image is None else torch.from_numpy(image).float() / 255.0,
+        example_image=read_grey(example, str(example))[0, 0] if example.exists() else None,
     )
 
 
