@@ -30,9 +30,12 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
     count = pixels.shape[0] - 2 * margin
     if count <= 0:
         return torch.zeros_like(pixels)
+    piece = (
+        count if torch.compiler.is_compiling() else PIECE
+    )  # a compiled function has no intermediate results
     pieces = [
-        _piece_scores(pixels, stride, start, min(PIECE, margin + count - start))
-        for start in range(margin, margin + count, PIECE)
+        _piece_scores(pixels, stride, start, min(piece, margin + count - start))
+        for start in range(margin, margin + count, piece)
     ]
     rim = pixels.new_zeros(margin)
     return torch.cat([rim, *pieces, rim])

@@ -62,6 +62,8 @@ class ORB(nn.Module):
     ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
     differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
                     chosen, angles and descriptors stay discrete
+    compile:        run the FAST test through torch.compile: the same result in a fifth of the time, after some seconds
+                    at the first image of each size
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class ORB(nn.Module):
         low_threshold: int = 7,
         ranking: str = "fast",
         differentiable: bool = False,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         if num_keypoints < 1 or num_levels < 1 or scale_factor <= 1:
@@ -88,6 +91,7 @@ class ORB(nn.Module):
         self.low_threshold = low_threshold
         self.ranking = ranking
         self.differentiable = differentiable
+        self._fast_scores = torch.compile(fast_scores, dynamic=False) if compile else fast_scores
 
     def forward(self, images: Tensor) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
@@ -125,7 +129,7 @@ class ORB(nn.Module):
             levels = build_levels(images, atlas)
         with torch.no_grad():
             pixels = fill_atlas(levels, atlas).flatten()
-            scores = fast_scores(pixels, atlas.stride)
+            scores = self._fast_scores(pixels, atlas.stride)
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             positions = true_indices(find_peaks(scores, floor, atlas.stride))
             positions, slots, strengths = self._choose(pixels, scores, positions, grid, atlas.stride)
