@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from torchslam.map import NO_POINT, Map
@@ -30,8 +32,7 @@ def pose(x: float) -> Tensor:
     return T_cw
 
 
-@pytest.fixture
-def small_map(generator: torch.Generator) -> Map:
+def make_map(generator: torch.Generator) -> Map:
     """Three keyframes along x; points 0..3 seen by the first two, 4 and 5 by the last two, each at its own keypoint."""
     slam_map = Map()
     for k in range(3):
@@ -41,6 +42,11 @@ def small_map(generator: torch.Generator) -> Map:
     for keyframe, ids in ((0, [0, 1, 2, 3]), (1, [0, 1, 2, 3, 4, 5]), (2, [4, 5])):
         slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
     return slam_map
+
+
+@pytest.fixture
+def small_map(generator: torch.Generator) -> Map:
+    return make_map(generator)
 
 
 def test_observations_are_flat_and_ordered(small_map: Map) -> None:
@@ -58,7 +64,7 @@ def test_covisibility(small_map: Map) -> None:
     assert small_map.covisible(1, 5, min_shared=3).tolist() == [0]
     assert small_map.covisible(1, 1, min_shared=1).tolist() == [0]
     assert small_map.points_seen_by(torch.tensor([1, 2])).tolist() == [0, 1, 2, 3, 4, 5]
-    assert small_map.observation_counts().tolist() == [2] * 6
+    assert small_map.points["times_observed"].tolist() == [2] * 6
 
 
 def test_killed_points_are_observed_by_nobody_and_keep_their_ids(small_map: Map) -> None:
@@ -74,7 +80,7 @@ def test_merging_moves_observations_and_leaves_one_per_keyframe(small_map: Map) 
     assert (
         small_map.keyframes["point_ids"][1, 4] == NO_POINT
     )  # had seen both: the observation of 4 is dropped
-    assert small_map.observation_counts().tolist() == [3, 2, 2, 2, 0, 2]
+    assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 2]
     assert not small_map.points["alive"][4]
     assert small_map.points["times_found"][0] == 2
 
@@ -101,3 +107,31 @@ def test_a_view_comes_back_from_its_keyframe(small_map: Map, generator: torch.Ge
     assert (back.index, back.timestamp) == (view.index, view.timestamp)
     assert torch.equal(back.keypoints, view.keypoints)
     assert torch.equal(back.descriptors, view.descriptors)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["kill", "replace", "forget"]), st.integers(0, 5), st.integers(0, 5)),
+        max_size=8,
+    )
+)
+def test_the_count_of_observations_is_what_the_table_holds(changes: list[tuple[str, int, int]]) -> None:
+    slam_map = make_map(torch.Generator().manual_seed(0))
+    for change, one, other in changes:
+        alive = slam_map.points["alive"]
+        if change == "kill":
+            slam_map.kill(torch.tensor([one]))
+        elif change == "replace" and one != other and alive[one] and alive[other]:
+            slam_map.replace(torch.tensor([one]), torch.tensor([other]))
+        elif change == "forget" and slam_map.keyframes["point_ids"][1, one] >= 0:
+            slam_map.forget(torch.tensor([1]), torch.tensor([one]))
+        seen = slam_map.keyframes["point_ids"]
+        assert torch.equal(slam_map.points["times_observed"], torch.bincount(seen[seen >= 0], minlength=6))
+        for row in seen:
+            assert len(torch.unique(row[row >= 0])) == int((row >= 0).sum())
+
+
+def test_several_points_merge_into_one(small_map: Map) -> None:
+    small_map.replace(torch.tensor([4, 5]), torch.tensor([0, 0]))
+    assert small_map.keyframes["point_ids"][2].tolist()[:2].count(0) == 1
+    assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 0]

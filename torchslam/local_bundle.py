@@ -72,7 +72,7 @@ def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     wrong = ~valid[:, 0] | (errors > CHI_SQUARE * seen.scales**2)
     slam_map.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
     touched = torch.unique(seen.point_index[wrong])
-    slam_map.kill(touched[slam_map.observation_counts()[touched] < 2])
+    slam_map.kill(touched[slam_map.points["times_observed"][touched] < 2])
 
 
 def select(seen: Observations, rows: Tensor) -> Observations:

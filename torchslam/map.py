@@ -113,6 +113,7 @@ class Map:
             angles=like.new_zeros(n),
             last_seen=frame_index,
             born=torch.full((n,), keyframe, device=like.device),
+            times_observed=torch.zeros(n, dtype=torch.int64, device=like.device),
             times_visible=torch.ones(n, dtype=torch.int64, device=like.device),
             times_found=torch.ones(n, dtype=torch.int64, device=like.device),
             alive=torch.ones(n, dtype=torch.bool, device=like.device),
@@ -122,12 +123,18 @@ class Map:
     # --- observations ----------------------------------------------------------------------------------------
 
     def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
-        """Note that keypoints (n,) of a keyframe see points (n,)."""
+        """Note that keypoints (n,) of a keyframe, which see nothing yet, see points (n,)."""
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
+        self._count(point_ids, 1)
 
     def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
         """Drop observations, given by keyframe (n,) and keypoint (n,)."""
-        self.keyframes["point_ids"][keyframe_index, keypoint_index] = NO_POINT
+        table = self.keyframes["point_ids"]
+        self._count(table[keyframe_index, keypoint_index], -1)
+        table[keyframe_index, keypoint_index] = NO_POINT
+
+    def _count(self, point_ids: Tensor, step: int) -> None:
+        self.points["times_observed"].index_add_(0, point_ids, torch.full_like(point_ids, step))
 
     def observations(self, keyframes: Tensor | None = None) -> Observations:
         """All observations by the keyframes (k,) of this list; by all keyframes without it."""
@@ -152,11 +159,6 @@ class Map:
         return wanted[table if keyframes is None else table[keyframes]].sum(
             1
         )  # NO_POINT reads the last entry, which is never set
-
-    def observation_counts(self) -> Tensor:
-        """(L,) how many keyframes observe each point."""
-        table = self.keyframes["point_ids"].flatten()
-        return torch.bincount(table[table >= 0], minlength=len(self.points))
 
     def view(self, keyframe: int) -> View:
         """What a keyframe saw."""
@@ -187,6 +189,7 @@ class Map:
         if len(point_ids) == 0:
             return
         self.points["alive"][point_ids] = False
+        self.points["times_observed"][point_ids] = 0
         doomed = torch.zeros(len(self.points) + 1, dtype=torch.bool, device=point_ids.device)
         doomed[point_ids] = True
         table = self.keyframes["point_ids"]
@@ -195,7 +198,8 @@ class Map:
     def replace(self, old: Tensor, new: Tensor) -> None:
         """Merge points: every observation of old (n,) becomes one of new (n,); old are dead from now on.
 
-        A keyframe that saw both keeps its observation of the new point alone.
+        Several may be merged into one; none of the new points may be among the old. A keyframe that saw both keeps
+        one observation.
         """
         if len(old) == 0:
             return
@@ -205,12 +209,9 @@ class Map:
         table = self.keyframes["point_ids"]
         touched = torch.nonzero((renamed[table] != table).any(1))[:, 0]
         rows = table[touched]
-        changed = renamed[rows]
-        already = torch.zeros(len(touched), len(self.points) + 1, dtype=torch.bool, device=old.device)
-        already.scatter_(1, rows.where(rows >= 0, len(self.points)), True)
-        is_moved = changed != rows
-        clash = is_moved & already.gather(1, changed.clamp(min=0))
-        table[touched] = changed.masked_fill(clash, NO_POINT)
+        table[touched] = without_repetitions(renamed[rows], preferred=renamed[rows] == rows)
+        self._count(rows[rows >= 0], -1)
+        self._count(table[touched][table[touched] >= 0], 1)
         self.points["alive"][old] = False
         self.points["replaced_by"][old] = new
         for counter in ("times_visible", "times_found"):
@@ -252,3 +253,14 @@ class Map:
         self.points["positions_w"].mul_(factor)
         self.points["reach"].mul_(factor)
         self.keyframes["T_cw"][:, :3, 3].mul_(factor)
+
+
+def without_repetitions(ids: Tensor, preferred: Tensor) -> Tensor:
+    """Rows (k, n) of ids in which every id but NO_POINT stands once; of several, a preferred place (k, n) stays."""
+    order = torch.sort(
+        ids * 2 - preferred.to(ids.dtype), dim=1, stable=True
+    )  # equal ids together, preferred first
+    in_order = ids.gather(1, order.indices)
+    repeated = torch.zeros_like(preferred)
+    repeated[:, 1:] = in_order[:, 1:] == in_order[:, :-1]
+    return ids.masked_fill(torch.zeros_like(preferred).scatter(1, order.indices, repeated), NO_POINT)

@@ -68,18 +68,21 @@ class Mapper:
         is_rarely_found = (
             points["times_found"] < self.config.mapping.min_found_share * points["times_visible"]
         )
-        is_lonely = (age >= 2) & (self.map.observation_counts() < 3) & (points["born"] > 1)
+        is_lonely = (age >= 2) & (points["times_observed"] < 3) & (points["born"] > 1)
         self.map.kill(torch.nonzero(is_young & (is_rarely_found | is_lonely))[:, 0])
 
     def fuse(self, keyframe: int, neighbours: Tensor) -> None:
         """Find the points of this keyframe in its neighbours and theirs in it; merge what turns out to be one point."""
         own = self.map.points_seen_by(torch.tensor([keyframe]))
-        for neighbour in neighbours.tolist():
-            self._fuse_into(neighbour, own[self.map.points["alive"][own]])
-        self._fuse_into(keyframe, self.map.points_seen_by(neighbours))
+        self._merge([self._find_in(neighbour, own) for neighbour in neighbours.tolist()])
+        self._merge([self._find_in(keyframe, self.map.points_seen_by(neighbours))])
 
-    def _fuse_into(self, keyframe: int, point_ids: Tensor) -> None:
-        """Match points (n,) that a keyframe does not see yet to its keypoints, free or not."""
+    def _find_in(self, keyframe: int, point_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Match points (n,) that a keyframe does not see yet to its keypoints.
+
+        Free keypoints see them from now on. Returns pairs (m,), (m,) of points that are one: found at a keypoint that
+        sees another point already.
+        """
         seen = self.map.keyframes["point_ids"][keyframe]
         new = point_ids[~torch.isin(point_ids, seen)]
         view, T_cw = self.map.view(keyframe), self.map.T_cw[keyframe]
@@ -95,13 +98,27 @@ class Mapper:
         taken = seen[keypoints]
         is_free = taken < 0
         self.map.observe(keyframe, keypoints[is_free], ids[is_free])
-        self._merge(ids[~is_free], taken[~is_free])
+        return ids[~is_free], taken[~is_free]
 
-    def _merge(self, one: Tensor, other: Tensor) -> None:
-        """Merge pairs of points (n,): the one with more observations stays."""
-        counts = self.map.observation_counts()
-        is_one_better = counts[one] > counts[other]
-        self.map.replace(torch.where(is_one_better, other, one), torch.where(is_one_better, one, other))
+    def _merge(self, pairs: list[tuple[Tensor, Tensor]]) -> None:
+        """Merge pairs of points (m,), (m,): of those that are one, the one with most observations stays."""
+        observed = self.map.points["times_observed"]
+        heir: dict[int, int] = {}
+
+        def last_heir(point: int) -> int:
+            while point in heir:
+                point = heir[point]
+            return point
+
+        for one, other in zip(*(torch.cat(side).tolist() for side in zip(*pairs, strict=True)), strict=True):
+            one, other = last_heir(one), last_heir(other)
+            if one != other:
+                old, new = (one, other) if observed[one] <= observed[other] else (other, one)
+                heir[old] = new
+        if heir:
+            device = observed.device
+            new = torch.tensor([last_heir(point) for point in heir.values()], device=device)
+            self.map.replace(torch.tensor(list(heir), device=device), new)
 
 
 def world_scale(start: Start, kind: str) -> float:

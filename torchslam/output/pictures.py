@@ -112,7 +112,7 @@ def _example(slam_map: Map, image: Tensor) -> Figure:
         before = columns["point_ids"][keyframe - 1]
         previous[before[before >= 0]] = columns["keypoints"][keyframe - 1][before >= 0]
     counts = torch.cat(
-        (slam_map.observation_counts(), torch.zeros(1, dtype=torch.int64))
+        (slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64))
     )  # NO_POINT reads the end
     return plots.plot_features(
         image,

@@ -105,7 +105,7 @@ def _write_point_cloud(path: Path, run: Run) -> None:
         return
     alive = run.map.living_points()
     normals_w = -run.map.points["normals_w"][alive]
-    counts = run.map.observation_counts()[alive]
+    counts = run.map.points["times_observed"][alive]
     write_ply(path, run.map.positions_w[alive], normals_w, counts, run.keyframes.positions_w)
 
 
