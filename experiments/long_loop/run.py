@@ -25,19 +25,8 @@ def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:
     centres = torch.stack([10 * torch.cos(s), drift, 6 * torch.sin(s)], -1)
     heading = -(s + 0.4)
     zero = torch.zeros_like(s)
-    # x right, y down, z forward; the camera turns about the world's y axis.
-    rows = [
-        torch.cos(heading),
-        zero,
-        torch.sin(heading),
-        zero,
-        one,
-        zero,
-        -torch.sin(heading),
-        zero,
-        torch.cos(heading),
-    ]
-    return se3_inverse(rigid(torch.stack(rows, -1).reshape(-1, 3, 3), centres))
+    about_y = torch.stack([zero, heading, zero], -1)
+    return se3_inverse(rigid(so3_exp(about_y), centres))
 
 
 def main() -> None:
