@@ -70,6 +70,11 @@ def estimate_absolute_pose(
     if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
         shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
         raise ValueError(f"points_w and pixels must be (B, N, 3) and (B, N, 2), not {shapes}")
+    B, N = pixels.shape[:2]
+    if B == 0 or N < 3:
+        nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
+        T_cw = torch.eye(4, dtype=points_w.dtype, device=points_w.device).expand(B, 4, 4)
+        return AbsolutePose(T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw[:, 0, 1])
     finite = torch.isfinite(points_w).all(-1) & torch.isfinite(pixels).all(-1)
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)

@@ -205,14 +205,14 @@ class Camera:
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
     def pixel_scale(self, normalized: Tensor) -> Tensor:
-        """Pixels per unit of undistorted image coordinates, along x and y, locally, without gradient.
+        """Pixels per unit of undistorted image coordinates, along x and y, locally.
 
         (..., N, 2) -> (..., N, 2). Exact without distortion; with it, the mean over all directions.
         """
-        scale = self.params.detach()[..., None, :2].expand(normalized.shape)
+        scale = self.params[..., None, :2].expand(normalized.shape)
         if self.model == "pinhole":
             return scale
-        J = self._distortion.slope(normalized.detach(), self.params.detach()[..., None, 4:])
+        J = self._distortion.slope(normalized, self.params[..., None, 4:])
         return scale * torch.linalg.det(J).abs().sqrt()[..., None]
 
     def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:

@@ -66,9 +66,9 @@ def decompose_homography(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         H = H * middle.rsqrt()[..., None, None]
         low, high = squares[..., 0] / middle, squares[..., 2] / middle
         v_3, v_2, v_1 = V.unbind(-1)
-        spread = (high - low).clamp_min(torch.finfo(H.dtype).eps ** 2)
-        a = ((1 - low).clamp_min(0.0) / spread).sqrt()[..., None]
-        b = ((high - 1).clamp_min(0.0) / spread).sqrt()[..., None]
+        # u = a v_1 + b v_3 keeps its length under H; without spread, of a pure rotation, any direction does.
+        share = ((1 - low) / (high - low).clamp_min(torch.finfo(H.dtype).eps)).clamp(0.0, 1.0)[..., None]
+        a, b = share.sqrt(), (1 - share).sqrt()
         motions = [_motion(H, v_2, a * v_1 + sign * b * v_3) for sign in (1, -1)]
         R, t, n = (
             torch.stack(part, dim=-3 if i == 0 else -2) for i, part in enumerate(zip(*motions, strict=True))

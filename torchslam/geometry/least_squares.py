@@ -24,7 +24,7 @@ def minimize(
     state:    tensors with one leading dimension (P), the problems
     evaluate: state -> (A, cost): A (P, D + 1, D + 1) is [J r]^T W [J r], and cost (P,) what must not grow
     retract:  state, step (P, D) -> state
-    Stops once no problem can gain more than 1e-9 of its cost. Returns the state and its cost; problems that become
+    Stops once no problem can gain more than 1e-11 of its cost. Returns the state and its cost; problems that become
     singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
@@ -35,7 +35,7 @@ def minimize(
         step = torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0].neg_()
         moved = retract(state, step)
         gain = (g * step).sum(-1).abs()
-        if bool((gain <= 1e-9 * cost).all()):  # too little to be worth a check
+        if bool((gain <= 1e-11 * cost).all()):  # too little to be worth a check
             return tuple(
                 _select(gain < torch.inf, new, old) for new, old in zip(moved, state, strict=True)
             ), cost

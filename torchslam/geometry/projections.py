@@ -111,7 +111,7 @@ def fit_projections(
 
     def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
         rows = torch.addmm(tangent.constant, P.reshape(B * K, 3 * D), tangent.linear)
-        mapped = torch.bmm(rows.view(B, -1, D), homogeneous).view(B, K, 3, T + 1, N)
+        mapped = torch.bmm(rows.view(B, K * 3 * (T + 1), D), homogeneous).view(B, K, 3, T + 1, N)
         inverse = mapped[:, :, 2:, :1].clamp_min(1e-9).reciprocal()
         image = mapped[:, :, :2, :1] * inverse
         # d(u / w) = (du - (u / w) dw) / w; the row of the mapping itself becomes the residual

@@ -25,7 +25,7 @@ def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generat
     B, N = mask.shape
     available = mask.sum(-1)
     per_permutation = (available // size).clamp_min(1)
-    permutations = math.ceil(count / max(1, int(per_permutation.min()))) if B else 1
+    permutations = math.ceil(count / int(per_permutation.min()))
     # Many permutations of few rows are cheap; of many rows few are needed.
     keys = torch.rand(B, permutations, N, generator=generator).to(mask.device)
     order = torch.where(mask[:, None], keys, 2.0).argsort(-1).flatten(1)

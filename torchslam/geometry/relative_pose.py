@@ -41,6 +41,7 @@ _FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
 _CLEARLY_OFF = (
     2.0  # thresholds of the transfer error, three standard deviations of noise as large as the threshold
 )
+_LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
 
@@ -97,6 +98,8 @@ def estimate_relative_pose(
     if pixels_1.dim() != 3 or pixels_1.shape != pixels_2.shape or pixels_1.shape[-1] != 2:
         shapes = f"{tuple(pixels_1.shape)} and {tuple(pixels_2.shape)}"
         raise ValueError(f"pixels_1 and pixels_2 must both be (B, N, 2), not {shapes}")
+    if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
+        return _nothing(pixels_1)
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     mask = finite if mask is None else mask & finite
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
@@ -113,6 +116,7 @@ def estimate_relative_pose(
         squared = fits.squared[model, torch.arange(len(model), device=model.device)]
         inliers = (squared < 1) & mask
         significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, torch.full_like(t[:, 0], chance), 10)
+        significant = significant & _is_spread(views, inliers)
         found = significant[:, None]
         eye = torch.eye(4, dtype=R.dtype, device=R.device)
         T_21 = torch.where(found[..., None], rigid(R, t), eye)
@@ -148,9 +152,18 @@ class _Fits:
 
     def finished(self, views: TwoViews) -> _Fits:
         """The same with homography and rotation at their minimum."""
-        H, _ = fit_homography(views, self.H[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
-        R_only, _ = fit_rotation(views, self.R_only[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
+        (H,), _ = fit_homography(views, self.H[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
+        (R_only,), _ = fit_rotation(views, self.R_only[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)
         return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
+
+
+def _nothing(pixels: Tensor) -> RelativePose:
+    """The answer where there is nothing to sample from."""
+    B, N = pixels.shape[:2]
+    T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).expand(B, 4, 4)
+    score = torch.zeros(B, dtype=pixels.dtype, device=pixels.device)
+    no = torch.zeros(B, N + 1, dtype=torch.bool, device=pixels.device)
+    return RelativePose(T_21, no[:, :N], no[:, N], B * (MODELS[_ROTATION],), no[:, N], score, score, score)
 
 
 def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int) -> _Fits:
@@ -167,11 +180,11 @@ def _fit_models(views: TwoViews, seed: int, confidence: float, max_samples: int)
     essential = sampson_squared(views, R, t)
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
     near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
-    H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
     R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
-    H, H_cost = fit_homography(views, H, _TRIAL_ITERATIONS, _FINAL_WIDTH)
-    R_only, R_cost = fit_rotation(views, R_only, _TRIAL_ITERATIONS, _FINAL_WIDTH)
-    ((H,), _), ((R_only,), _) = best_of((H,), H_cost), best_of((R_only,), R_cost)
+    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, _FINAL_WIDTH))
+    H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
+    H = torch.cat((H, (R_only / R_only[:, 2:, 2:])[:, None]), dim=1)
+    (H,), _ = best_of(*fit_homography(views, H, _TRIAL_ITERATIONS, _FINAL_WIDTH))
     fits = _Fits(R[:, 0], t[:, 0], H, R_only, essential[:, 0].expand(3, -1, -1))
     return fits.with_mappings(views)
 
@@ -193,7 +206,7 @@ def _choose(fits: _Fits, mask: Tensor, chance: float) -> Tensor:
         return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
 
     plane = ~contradicted(homography, essential)
-    still = ~contradicted(rotation, essential) & ~contradicted(rotation, homography)
+    still = ~contradicted(rotation, essential)
     return torch.where(still, _ROTATION, torch.where(plane, _HOMOGRAPHY, _ESSENTIAL))
 
 
@@ -225,6 +238,19 @@ def _pose(views: TwoViews, fits: _Fits, model: Tensor) -> tuple[Tensor, Tensor, 
     return R, t, (normals * length)[index, best], flat & ambiguous & apart
 
 
+def _is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
+    """Whether the inliers leave a line in both images, by some thresholds. (B,)"""
+    weights = inliers[..., None].to(views.x_1.dtype)
+    weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
+    spread = torch.ones_like(inliers[:, 0])
+    for x, scale in ((views.x_1, views.scale_1), (views.x_2, views.scale_2)):
+        centred = (x - (weights * x).sum(1, keepdim=True)) * scale[..., None]
+        xx, xy, _, yy = ((weights * centred).mT @ centred).flatten(1).unbind(-1)
+        smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy).square() + xy.square()).sqrt()
+        spread = spread & (smaller > _LEAST_SPREAD**2)
+    return spread
+
+
 def _twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """The four poses of one essential matrix. (B, 3, 3), (B, 3) -> (B, 4, 3, 3), (B, 4, 3)."""
     turn = 2 * t[..., :, None] * t[..., None, :] - torch.eye(3, dtype=t.dtype, device=t.device)
@@ -253,6 +279,10 @@ def _in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[T
 def _with_gradient(T_21: Tensor, normal: Tensor, views: TwoViews, used: Tensor, model: Tensor) -> Tensor:
     """The same poses, with the gradient of the minimiser of the chosen model's squared errors over the rows in use."""
     R, t = T_21[:, :3, :3], T_21[:, :3, 3]
+    # Parameters that the chosen model does not have must not bring NaN.
+    forward = t.new_tensor((0.0, 0.0, 1.0))
+    t = torch.where((model == _ROTATION)[:, None] | (t == 0).all(-1, keepdim=True), forward, t)
+    normal = torch.where((model == _HOMOGRAPHY)[:, None], normal, forward)
     basis_t, basis_n = tangent_basis(t), tangent_basis(normal)
     variance_1, variance_2 = views.scale_1.square().reciprocal(), views.scale_2.square().reciprocal()
     weight = (variance_1 + variance_2).rsqrt()
@@ -284,5 +314,5 @@ def _with_gradient(T_21: Tensor, normal: Tensor, views: TwoViews, used: Tensor, 
         torch.nn.functional.pad(implicit_step(rotation, R.new_zeros(len(R), 3)), (0, 2)),
     )
     step = steps[0] + steps[1] + steps[2]
-    moving = (t != 0).any(-1, keepdim=True)
+    moving = (T_21[:, :3, 3] != 0).any(-1, keepdim=True)
     return rigid(so3_exp(step[:, :3]) @ R, torch.where(moving, direction(step[:, 3:]), 0.0))

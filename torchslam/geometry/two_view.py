@@ -175,15 +175,15 @@ def fit_essential(
         left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
         E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
         form = torch.bmm(E, (E[:, 0] @ variance_table).view(B * K, 9, 18))
-        value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, -1)
-        spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, -1)
+        value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, constraint.shape[-1])
+        spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, constraint.shape[-1])
         inverse = spread[:, :, :1].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt()
         # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
         rows = value * inverse
         residual = rows[:, :, :1]
         J = torch.addcmul(rows[:, :, 1:], residual * inverse * inverse, spread[:, :, 1:], value=-1)
         used, cost = truncated_rows(residual.squeeze(2).square(), views.mask, width)
-        rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, -1)
+        rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, constraint.shape[-1])
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
@@ -232,14 +232,18 @@ def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
     return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
-def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
+def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
     """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
-    return fit_projections(H, homography_tangent(H.dtype, H.device), *_transfer(views), iterations, width)
+    tangent = homography_tangent(H.dtype, H.device)
+    H, cost = fit_projections(H, tangent, *_transfer(views), iterations, width)
+    return (H,), cost
 
 
-def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
+def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
     """Optimises pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
-    return fit_projections(R, rotation_tangent(R.dtype, R.device), *_transfer(views), iterations, width)
+    tangent = rotation_tangent(R.dtype, R.device)
+    R, cost = fit_projections(R, tangent, *_transfer(views), iterations, width)
+    return (R,), cost
 
 
 def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -249,9 +253,8 @@ def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
     """Truncated scores of homographies or rotations, in float32. (B, M, 3, 3) -> (B, M)."""
-    return score_projections(
-        H.float(), views.h_1.mT.float(), views.x_2.float(), views.transfer_scale, views.mask
-    )
+    h_1, x_2, scale, mask = _transfer(views)
+    return score_projections(H.float(), h_1.float(), x_2.float(), scale, mask)
 
 
 def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,108 @@
+import math
+
+import pytest
+import torch
+
+from torchslam.geometry.implicit import implicit_step
+from torchslam.geometry.least_squares import minimize, small_rotation
+from torchslam.geometry.lie import so3_exp
+from torchslam.geometry.ransac import (
+    is_significant,
+    pad_groups,
+    sample_minimal,
+    samples_needed,
+    truncated_score,
+)
+
+
+def test_samples_are_distinct_rows_of_the_mask_and_repeatable() -> None:
+    mask = (
+        torch.rand(3, 40, generator=torch.Generator().manual_seed(0)) < torch.tensor((0.9, 0.5, 0.2))[:, None]
+    )
+    sample, again = (sample_minimal(mask, 5, 100, torch.Generator().manual_seed(1)) for _ in range(2))
+    assert torch.equal(sample, again)
+    assert sample.shape == (3, 100, 5)
+    for rows, allowed in zip(sample, mask, strict=True):
+        assert allowed[rows].all()
+        assert all(len(set(row)) == 5 for row in rows.tolist())
+        assert set(rows.flatten().tolist()) == set(allowed.nonzero().flatten().tolist())
+
+
+@pytest.mark.parametrize("available", [0, 1, 2])
+def test_too_few_rows_repeat(available: int) -> None:
+    mask = torch.arange(6)[None] < available
+    sample = sample_minimal(mask, 3, 10, torch.Generator().manual_seed(0))
+    assert sample.shape == (1, 10, 3)
+    assert int(sample.max()) < 6
+
+
+def test_samples_needed() -> None:
+    needed = samples_needed(torch.tensor((50, 100, 0)), torch.tensor((100, 100, 0)), 3, 0.99)
+    assert float(needed[0]) == pytest.approx(math.log(0.01) / math.log(1 - 0.125))
+    assert float(needed[1]) < 1
+    assert float(needed[2]) > 1e6
+
+
+def test_truncated_score_ignores_masked_rows_and_nan() -> None:
+    squared = torch.tensor((((0.0, 0.5, 2.0, torch.nan, 0.0),),))
+    mask = torch.tensor(((True, True, True, True, False),))
+    assert truncated_score(squared, mask).item() == pytest.approx(1.5)
+
+
+def test_significance_grows_with_inliers_and_falls_with_chance() -> None:
+    inliers, available = torch.tensor((5, 10, 60, 60)), torch.tensor((100, 100, 100, 100))
+    chance = torch.tensor((0.005, 0.005, 0.005, 0.6))
+    assert is_significant(inliers, available, 5, chance, 10).tolist() == [False, False, True, False]
+
+
+def test_pad_groups() -> None:
+    values = torch.arange(5.0)[:, None]
+    padded, valid = pad_groups(values, torch.tensor((0, 0, 2, 2, 2)), 3, least=2)
+    assert padded.squeeze(-1).tolist() == [[0, 1, 0], [0, 0, 0], [2, 3, 4]]
+    assert valid.tolist() == [[True, True, False], [False] * 3, [True] * 3]
+
+
+def test_minimize_reaches_the_minimum_of_each_problem_and_survives_nan() -> None:
+    target = torch.tensor((2.0, 8.0, torch.nan), dtype=torch.float64)
+
+    def evaluate(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        residual, J = x.pow(3) - target[:, None], 3 * x.square()
+        rows = torch.stack((J, residual), dim=-1)
+        return rows.mT @ rows, residual.squeeze(-1).square()
+
+    (x,), cost = minimize(
+        (torch.ones(3, 1, dtype=torch.float64),), evaluate, lambda x, step: (x[0] + step,), 60
+    )
+    torch.testing.assert_close(x[:2, 0], torch.tensor((2 ** (1 / 3), 2.0), dtype=torch.float64))
+    assert float(cost[:2].max()) < 1e-10
+    assert float(x[2]) == 1.0
+
+
+def test_small_rotation_is_a_rotation_close_to_exp() -> None:
+    omega = 0.01 * torch.randn(10, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    R = small_rotation(omega)
+    torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand(10, 3, 3))
+    torch.testing.assert_close(R, so3_exp(omega), atol=1e-5, rtol=0)
+
+
+def test_implicit_step_has_the_gradient_of_the_minimiser() -> None:
+    data = torch.tensor((0.3, -0.7), dtype=torch.float64, requires_grad=True)
+    minimiser = torch.stack((data, data.exp()), dim=-1).detach()  # of the function below
+
+    def objective(step: torch.Tensor) -> torch.Tensor:
+        x = minimiser + step
+        return (x[:, 0] - data).square() + (x[:, 1] - x[:, 0].exp()).square()
+
+    step = implicit_step(objective, minimiser)
+    assert float(step.detach().abs().max()) == 0
+    (gradient,) = torch.autograd.grad(step[:, 1].sum(), data)
+    torch.testing.assert_close(gradient, data.detach().exp())
+
+
+def test_implicit_step_without_a_minimum_has_zero_gradient() -> None:
+    data = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    step = implicit_step(
+        lambda x: torch.stack((0 * x[0].sum(), (x[1] - data[1]).sum() ** 2)) * data, torch.zeros(2, 2)
+    )
+    step.sum().backward()
+    assert torch.isfinite(data.grad).all()

@@ -1,0 +1,205 @@
+import numpy as np
+import poselib
+import pytest
+import torch
+from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_views
+from torch import Tensor
+
+from torchslam.geometry import Camera, RelativePose, estimate_relative_pose
+
+RADIAL = Camera.radial_tangential(500.0, 520.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
+FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
+
+
+def estimate(scene: Scene, camera: Camera = CAMERA, **options: float) -> RelativePose:
+    return estimate_relative_pose(scene.pixels_1, scene.pixels_2, camera, camera, **options)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.5])
+def test_finds_the_pose_among_wrong_matches(camera: Camera, outliers: float) -> None:
+    for seed in range(4):
+        scene = two_views(seed, outliers=outliers, camera=camera)
+        result = estimate(scene, camera)
+        assert result.success.all()
+        assert result.model == ("essential",)
+        assert rotation_error(result.T_21[:, :3, :3], scene.T_21[:, :3, :3]) < 1
+        assert direction_error(result.T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 5
+        torch.testing.assert_close(result.T_21[:, :3, 3].norm(dim=-1), torch.ones(1, dtype=torch.float64))
+        assert float((result.inliers == scene.mask).double().mean()) > 0.9
+        assert float(result.score_essential) > float(result.score_homography) > float(result.score_rotation)
+
+
+def test_is_as_good_as_poselib() -> None:
+    ours, theirs = [], []
+    model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
+    for seed in range(8):
+        scene = two_views(seed, count=400, outliers=0.4, noise=1.0)
+        pose, _ = poselib.estimate_relative_pose(
+            scene.pixels_1[0].numpy(),
+            scene.pixels_2[0].numpy(),
+            model,
+            model,
+            {"max_epipolar_error": 1.0},
+            {},
+        )
+        for errors, R in ((ours, estimate(scene).T_21[:, :3, :3]), (theirs, torch.from_numpy(pose.R)[None])):
+            errors.append(rotation_error(R, scene.T_21[:, :3, :3]))
+    assert np.mean(ours) <= 1.1 * np.mean(theirs)
+
+
+def test_exact_data_give_the_exact_pose() -> None:
+    for camera in (CAMERA, RADIAL):
+        scene = two_views(0, noise=0.0, outliers=0.2, camera=camera)
+        T_21 = estimate(scene, camera).T_21
+        torch.testing.assert_close(T_21[:, :3, :3], scene.T_21[:, :3, :3], atol=1e-7, rtol=0)
+        assert direction_error(T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 1e-4
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0])
+def test_a_plane_is_called_a_plane_and_its_pose_is_right_or_ambiguous(noise: float) -> None:
+    successes = 0
+    for seed in range(10):
+        scene = two_views(seed, plane=True, noise=noise)
+        result = estimate(scene)
+        assert result.model == ("homography",)
+        assert result.success.item() != result.ambiguous.item()
+        if result.success.item():
+            successes += 1
+            assert rotation_error(result.T_21[:, :3, :3], scene.T_21[:, :3, :3]) < 2
+            assert direction_error(result.T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 12
+    assert successes >= 3
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 2.0])
+def test_a_pure_rotation_gets_no_translation(noise: float) -> None:
+    for seed in range(5):
+        scene = two_views(seed, baseline=0.0, noise=noise)
+        result = estimate(scene)
+        assert result.model == ("rotation",)
+        assert not result.success.any()
+        assert (result.T_21[:, :3, 3] == 0).all()
+        assert rotation_error(result.T_21[:, :3, :3], scene.T_21[:, :3, :3]) < 0.5
+
+
+def test_a_plane_with_some_points_off_it_is_no_plane() -> None:
+    plane, rest = two_views(3, plane=True, count=160, outliers=0.2), two_views(3, count=60, outliers=0.0)
+    scene = Scene(
+        torch.cat((plane.pixels_1, rest.pixels_1), dim=1),
+        torch.cat((plane.pixels_2, rest.pixels_2), dim=1),
+        plane.points_1,
+        plane.T_21,
+        plane.mask,
+    )
+    result = estimate(scene)
+    assert result.model == ("essential",)
+    assert direction_error(result.T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 8
+
+
+def test_a_batch_holds_independent_problems() -> None:
+    """Good, masked, with NaN rows, few but exact, too few, nothing, pure noise, all the same match, on a line."""
+    scene = two_views(1, noise=0.2)
+    pixels_1, pixels_2 = (x.repeat(9, 1, 1) for x in (scene.pixels_1, scene.pixels_2))
+    mask = torch.ones(9, 200, dtype=torch.bool)
+    mask[1, 80:120] = False
+    pixels_1[1, 80:120], pixels_2[1, 100:120] = 1e9, torch.nan
+    pixels_1[2, ::9], pixels_2[2, 1::9] = torch.nan, torch.inf
+    mask[3, :60], mask[3, 85:] = False, False
+    mask[4, :60], mask[4, 64:] = False, False
+    mask[5] = False
+    pixels_2[6] = torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 480
+    pixels_1[7], pixels_2[7] = 100.0, 120.0
+    pixels_1[8, :, 1], pixels_2[8, :, 1] = 200.0, 210.0
+    result = estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, mask=mask)
+    assert result.success.tolist() == [True, True, True, True, False, False, False, False, False]
+    assert all(
+        torch.isfinite(x).all() for x in (result.T_21, result.score_essential, result.score_homography)
+    )
+    assert not (result.inliers & ~mask).any()
+    assert rotation_error(result.T_21[:3, :3, :3], scene.T_21[:, :3, :3]) < 1
+    assert direction_error(result.T_21[:3, :3, 3], scene.T_21[:, :3, 3]) < 4
+
+
+def test_pure_noise_is_never_a_success() -> None:
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor((640.0, 480.0), dtype=torch.float64)
+    pixels = torch.rand(2, 8, 100, 2, generator=generator, dtype=torch.float64) * size
+    assert not estimate_relative_pose(*pixels, CAMERA, CAMERA, max_samples=500).success.any()
+
+
+def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
+    scenes = [two_views(seed, outliers=0.2) for seed in range(3)]
+    pixels_1, pixels_2 = (torch.cat([getattr(s, name) for s in scenes]) for name in ("pixels_1", "pixels_2"))
+    batch, again = (estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, seed=3) for _ in range(2))
+    assert torch.equal(batch.T_21, again.T_21)
+    single = torch.cat([estimate(scene).T_21 for scene in scenes])
+    torch.testing.assert_close(
+        batch.T_21, single, atol=0.05, rtol=0
+    )  # other samples, nearly the same inliers
+
+
+@pytest.mark.parametrize("kind", ["essential", "homography", "rotation"])
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
+def test_gradient_is_that_of_the_estimate(camera: Camera, kind: str) -> None:
+    """Against central differences of the whole estimator; the set of inliers stays the same."""
+    options = {"essential": {}, "homography": {"plane": True}, "rotation": {"baseline": 0.0}}[kind]
+    scene = two_views(7, count=80, outliers=0.1, noise=0.1, camera=camera, **options)
+    inputs = {"pixels_1": scene.pixels_1, "pixels_2": scene.pixels_2, "params": camera.params}
+    size = torch.ones_like(camera.params)
+    size[4:] = 0.01
+    direction = {
+        name: torch.randn(x.shape, generator=torch.Generator().manual_seed(1)).double()
+        for name, x in inputs.items()
+    }
+    direction["params"] = direction["params"] * size
+
+    def run(pixels_1: Tensor, pixels_2: Tensor, params: Tensor) -> Tensor:
+        one = camera.with_params(params)
+        result = estimate_relative_pose(pixels_1, pixels_2, one, one, threshold=2.0)
+        assert result.model == (kind,)
+        return result.T_21
+
+    leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+    T_21 = run(**leaves)
+    weights = torch.linspace(-1, 1, 12, dtype=torch.float64).view(3, 4)
+    (T_21[0, :3] * weights).sum().backward()
+    torch.testing.assert_close(T_21.detach(), run(**inputs))
+    for name, x in inputs.items():
+        step = 1e-3 * direction[name]
+        high, low = (run(**{**inputs, name: x + sign * step})[0, :3] for sign in (1, -1))
+        expected = ((high - low) * weights).sum() / 2e-3
+        torch.testing.assert_close(
+            (leaves[name].grad * direction[name]).sum(), expected, rtol=1e-3, atol=1e-7
+        )
+
+
+def test_gradients_are_finite_in_float32_also_of_exact_data_and_failures() -> None:
+    scene, exact = two_views(1, outliers=0.1), two_views(1, outliers=0.1, noise=0.0)
+    pixels_1 = torch.cat((scene.pixels_1, exact.pixels_1, scene.pixels_1)).float()
+    pixels_2 = torch.cat((scene.pixels_2, exact.pixels_2, scene.pixels_2)).float()
+    pixels_1[2, 3:] = torch.nan
+    pixels_1, pixels_2 = pixels_1.requires_grad_(), pixels_2.requires_grad_()
+    camera = CAMERA.to(torch.float32)
+    result = estimate_relative_pose(pixels_1, pixels_2, camera, camera)
+    assert result.success.tolist() == [True, True, False]
+    result.T_21.square().sum().backward()
+    assert torch.isfinite(pixels_1.grad).all()
+    assert torch.isfinite(pixels_2.grad).all()
+
+
+def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
+    scene = two_views(2)
+    camera = CAMERA.to(device).to(dtype)
+    pixels_1, pixels_2 = (x.to(device, dtype) for x in (scene.pixels_1, scene.pixels_2))
+    result = estimate_relative_pose(pixels_1, pixels_2, camera, camera)
+    assert (result.T_21.dtype, result.T_21.device.type) == (dtype, device.type)
+    assert rotation_error(result.T_21[:, :3, :3].double().cpu(), scene.T_21[:, :3, :3]) < 1
+
+
+def test_wrong_shapes_and_empty_input() -> None:
+    with pytest.raises(ValueError, match=r"\(B, N, 2\)"):
+        estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), CAMERA, CAMERA)
+    for shape in ((0, 10, 2), (2, 0, 2), (2, 4, 2)):
+        result = estimate_relative_pose(torch.zeros(shape), torch.zeros(shape), CAMERA, CAMERA)
+        assert result.T_21.shape == (shape[0], 4, 4)
+        assert not result.success.any()
