@@ -28,10 +28,10 @@ def plot_features(
     """
     from matplotlib.ticker import MaxNLocator
 
-    grey = image.detach().cpu().float().numpy()
+    grey = style.to_numpy(image)
     height, width = grey.shape
     is_matched = matched.cpu().numpy()
-    x, y = keypoints.detach().cpu().double().numpy().T
+    x, y = style.to_numpy(keypoints).T
     with style.house_style():
         figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
         axes = figure.add_subplot()
@@ -75,6 +75,6 @@ def plot_features(
 def _draw_tails(axes: Axes, pixels: Tensor, previous: Tensor) -> None:
     from matplotlib.collections import LineCollection
 
-    tails = torch.stack([previous, pixels], dim=1).detach().cpu().double().numpy()
+    tails = style.to_numpy(torch.stack([previous, pixels], dim=1))
     known = np.isfinite(tails).all(axis=(1, 2))
     axes.add_collection(LineCollection(list(tails[known]), colors=style.ACCENT, lw=0.9, alpha=0.9, zorder=2))

@@ -54,9 +54,8 @@ def plot_scene(
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
     with style.house_style():
         figure = style.new_figure(11.0, 4.7)
-        figure.set_layout_engine(
-            "none"
-        )  # it would leave half of the picture to the invisible corners of the cubes
+        # The layout engine would leave half of the picture to the invisible corners of the cubes.
+        figure.set_layout_engine("none")
         for column, azimuth in enumerate((-62.0, 28.0)):
             axes = figure.add_axes((0.52 * column, 0.07, 0.48, 0.87), projection="3d", computed_zorder=False)
             _draw_3d(axes, scene, box, azimuth, style.length_label(unit))
@@ -94,12 +93,12 @@ def plot_top_view(
 def _scene(
     trajectory: Trajectory, points_w: Tensor, groundtruth: Trajectory | None, keyframes: Trajectory | None
 ) -> _Scene:
-    T_wc = trajectory.T_wc.detach().cpu().double().numpy()
+    T_wc = style.to_numpy(trajectory.T_wc)
     upright, labels = style.upright_axes(T_wc)
-    shown = T_wc if keyframes is None else keyframes.T_wc.detach().cpu().double().numpy()
+    shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
     shown = shown[style.thin(len(shown), MAX_CAMERAS)]
-    points = points_w.detach().cpu().double().numpy().reshape(-1, 3)
-    truth = np.zeros((0, 3)) if groundtruth is None else groundtruth.positions_w.cpu().double().numpy()
+    points = style.to_numpy(points_w).reshape(-1, 3)
+    truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
     return _Scene(
         path=T_wc[:, :3, 3] @ upright.T,
         rotations=upright @ shown[:, :3, :3],
@@ -107,7 +106,7 @@ def _scene(
         points=points[np.isfinite(points).all(axis=1)] @ upright.T,
         groundtruth=truth @ upright.T,
         labels=labels,
-        gaps=_gaps(trajectory.timestamps.cpu().numpy()),
+        gaps=_gaps(style.to_numpy(trajectory.timestamps)),
     )
 
 
@@ -177,13 +176,12 @@ def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     lines.set_label("viewing direction")
     axes.add_collection(lines)
     if len(scene.path):
-        axes.plot(
-            *scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, ls="", label="start"
-        )
-        axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, ls="", label="end")
+        axes.plot(*scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, label="start")
+        axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, label="end")
 
 
 def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """The points (L, 3) inside the picture, thinned where there are very many."""
     points = points[style.inside(points[:, : len(box)], box)]
     return points[style.thin(len(points), MAX_POINTS)]
 

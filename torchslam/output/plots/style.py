@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,6 +65,11 @@ def save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with house_style():
         figure.savefig(path, metadata={"Software": None})
+
+
+def to_numpy(values: Tensor) -> np.ndarray:
+    """A tensor of whatever device and dtype as float64 numpy, without its graph."""
+    return values.detach().cpu().double().numpy()
 
 
 def upright_axes(T_wc: np.ndarray) -> tuple[np.ndarray, tuple[str, str, str]]:

@@ -33,11 +33,11 @@ def plot_errors(
     errors_rad: (N,) radians between the aligned and the true orientation
     results:    of all frames, for the shading
     """
-    seconds = _numpy(timestamps)
+    seconds = style.to_numpy(timestamps)
     origin = _origin(seconds, results)
-    rows = [("position error (m)", _numpy(errors_m))]
+    rows = [("position error (m)", style.to_numpy(errors_m))]
     if errors_rad is not None:
-        rows.append(("rotation error (°)", np.degrees(_numpy(errors_rad))))
+        rows.append(("rotation error (°)", np.degrees(style.to_numpy(errors_rad))))
     with style.house_style():
         figure = style.new_figure(9.0, 1.4 + 1.8 * len(rows))
         panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
@@ -69,21 +69,11 @@ def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
         _shade(axes, results, origin)
         axes.fill_between(seconds, matches, color=style.ESTIMATE, alpha=0.16, lw=0, label="matched")
         axes.plot(seconds, inliers, color=style.ESTIMATE, lw=1.2, label="agree with the pose")
-        axes.plot(
-            seconds[keyframes],
-            inliers[keyframes],
-            ls="",
-            marker="o",
-            ms=3.0,
-            color=style.ACCENT,
-            label="keyframe",
-        )
+        axes.plot(seconds[keyframes], inliers[keyframes], "o", ms=3.0, color=style.ACCENT, label="keyframe")
         axes.set(xlabel="time (s)", ylabel="map points in the frame", ylim=(0.0, None))
         posed = inliers > 0
-        typical = (
-            f": {np.median(inliers[posed]):.0f} points agree with a pose (median)" if posed.any() else ""
-        )
-        axes.set_title((title or "Tracking") + typical)
+        median = np.median(inliers[posed]) if posed.any() else 0.0
+        axes.set_title(f"{title or 'Tracking'}: {median:.0f} points agree with a pose (median)")
         axes.margins(x=0.0)
         figure.legend(loc="outside lower center", ncols=5)
     return figure
@@ -113,10 +103,6 @@ def stage_names(results: Sequence[StepResult]) -> list[str]:
     """The stages that were timed, in the order they first ran; `total` is their frame and is left out."""
     names = dict.fromkeys(name for result in results for name in result.stage_ms)
     return [name for name in names if name != "total"]
-
-
-def _numpy(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().double().numpy()
 
 
 def _origin(seconds: np.ndarray, results: Sequence[StepResult]) -> float:
