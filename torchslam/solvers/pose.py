@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -19,7 +20,6 @@ from torchslam.solvers.residuals import (
     Observations,
     exact_expansion,
     linearize,
-    pull,
     usable,
     variance_factor,
 )
@@ -34,18 +34,25 @@ class RefinedPose:
     """Poses at the minimum of their robust reprojection error.
 
     T_cw:        (B, 4, 4) world to camera; the start, without gradient, where `success` is False
-    covariance:  (B, 6, 6) of the left perturbation (translation, rotation), detached; zero where `success` is False.
-                 Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
     cost:        (B,) half the sum of robustified squared whitened residuals, detached
     success:     (B,) bool, the usable points (at least three) or the prior determine the pose
     convergence: iterations and convergence per element
     """
 
     T_cw: Tensor
-    covariance: Tensor
     cost: Tensor
     success: Tensor
     convergence: Convergence
+    _problem: _PoseProblem = field(repr=False)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """(B, 6, 6) of the left perturbation (translation, rotation), detached; zero where `success` is False.
+
+        Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
+        """
+        with torch.no_grad():
+            return torch.where(self.success[:, None, None], self._problem.covariance(self.T_cw), 0.0)
 
 
 def refine_pose(
@@ -86,8 +93,7 @@ def refine_pose(
         problem = _PoseProblem(inputs)
         model, convergence = minimize(problem, start, iterations, tolerance)
     with torch.no_grad():
-        covariance, determined = problem.covariance(model.T_cw)
-    success = problem.solvable & determined
+        success = problem.solvable & factorize(model.hessian).definite
     good = success[:, None, None]
     refined = torch.where(good, model.T_cw, start.detach())
 
@@ -102,7 +108,7 @@ def refine_pose(
         problem = _PoseProblem(inputs)
         last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(convergence.cost))
         refined = torch.where(good, last, refined)
-    return RefinedPose(refined, torch.where(good, covariance, 0.0), convergence.cost, success, convergence)
+    return RefinedPose(refined, convergence.cost, success, convergence, problem)
 
 
 @dataclass(frozen=True)
@@ -156,12 +162,20 @@ class _Inputs:
 
 @dataclass(frozen=True)
 class _PoseModel:
-    """The Gauss-Newton model of the cost at poses: (B, 4, 4), (B,), (B, 6), (B, 6, 6)."""
+    """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6).
+
+    hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
+    bend:    (B, 6, 6) what the kernel's curvature adds to it, never positive; near the optimum it makes the steps
+             Newton's, several times as effective
+    near:    (B,) bool, whether to add it
+    """
 
     T_cw: Tensor
     cost: Tensor
     gradient: Tensor
     hessian: Tensor
+    bend: Tensor
+    near: Tensor
 
 
 class _PoseProblem:
@@ -178,7 +192,9 @@ class _PoseProblem:
         if self.prior is None:
             return model
         cost, gradient, hessian = prior_expansion(self.prior, T_cw)
-        return _PoseModel(T_cw, model.cost + cost, model.gradient + gradient, model.hessian + hessian)
+        return replace(
+            model, cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
+        )
 
     def _expand(self, T_cw: Tensor, near: Tensor) -> tuple[_PoseModel, Linearization]:
         """The model of the observations' part of the cost."""
@@ -186,36 +202,44 @@ class _PoseProblem:
         lin = linearize(self.observations, points_c)
         J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
         J = torch.cat((lin.J, J_rotation), dim=-1)
-        pulled = torch.cat((pull(lin, J, near[:, None]), lin.force[..., None]), dim=-1)
-        normal = pulled.flatten(-3, -2).mT @ J.flatten(-3, -2)
-        return _PoseModel(T_cw, lin.cost.sum(-1), normal[..., 6, :], normal[..., :6, :]), lin
+        pulls = (lin.residual[..., None, :] @ J).squeeze(-2)
+        hessian = (lin.weight[..., None, None] * J).flatten(1, 2).mT @ J.flatten(1, 2)
+        bend = (lin.bend[..., None] * pulls).mT @ pulls
+        gradient = (lin.weight[..., None, :] @ pulls).squeeze(-2)
+        return _PoseModel(T_cw, lin.cost.sum(-1), gradient, hessian, bend, near), lin
 
     def step(self, model: _PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
-        damped = model.hessian * (1 + damping[:, None, None] * self.eye)
         # Elements without any weight stay solvable: their step is zero.
-        damped = damped + torch.finfo(damped.dtype).tiny ** 0.5 * self.eye
-        factor, _ = torch.linalg.cholesky_ex(damped)
+        grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
+        damped = (model.hessian + model.near[:, None, None] * model.bend) * grow + floor
+        factor, failed = torch.linalg.cholesky_ex(damped)
+        if failed.any():
+            damped = torch.where((failed > 0)[:, None, None], model.hessian * grow + floor, damped)
+            factor, _ = torch.linalg.cholesky_ex(damped)
         xi = -torch.cholesky_solve(model.gradient[..., None], factor).squeeze(-1)
         return retract(model.T_cw, xi), -0.5 * (xi * model.gradient).sum(-1)
 
     def select(self, accept: Tensor, new: _PoseModel, old: _PoseModel) -> _PoseModel:
-        matrix = accept[:, None, None]
+        if accept.all():
+            return new
+        matrix, vector = accept[:, None, None], accept[:, None]
         return _PoseModel(
             torch.where(matrix, new.T_cw, old.T_cw),
             torch.where(accept, new.cost, old.cost),
-            torch.where(accept[:, None], new.gradient, old.gradient),
+            torch.where(vector, new.gradient, old.gradient),
             torch.where(matrix, new.hessian, old.hessian),
+            torch.where(matrix, new.bend, old.bend),
+            torch.where(accept, new.near, False),
         )
 
-    def covariance(self, T_cw: Tensor) -> tuple[Tensor, Tensor]:
-        """Covariances (B, 6, 6) at minima, and whether (B,) the poses are determined at all."""
-        model, lin = self._expand(T_cw, torch.zeros_like(self.solvable))
+    def covariance(self, T_cw: Tensor) -> Tensor:
+        """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
+        model, lin = self._expand(T_cw, self.solvable)
         factor = variance_factor(self.observations, lin, num_parameters=6)[:, None, None]
         information = model.hessian
         if self.prior is not None:  # in absolute units, which the residuals do not calibrate
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
-        factored = factorize(information)
-        return factor * factored.solve(self.eye.expand_as(information)), factored.definite
+        return factor * factorize(information).solve(self.eye.expand_as(information))
 
     def adjoint(self, T_cw: Tensor, grad_T_cw: Tensor, success: Tensor) -> Tensor:
         """g(T_cw, inputs) . lambda with H lambda = the loss's gradient in xi, for `implicit.attach`."""
