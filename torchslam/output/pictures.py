@@ -111,9 +111,8 @@ def _example(slam_map: Map, image: Tensor) -> Figure:
     if keyframe > 0:
         before = columns["point_ids"][keyframe - 1]
         previous[before[before >= 0]] = columns["keypoints"][keyframe - 1][before >= 0]
-    counts = torch.cat(
-        (slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64))
-    )  # NO_POINT reads the end
+    # NO_POINT, -1, reads the row at the end.
+    counts = torch.cat((slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64)))
     return plots.plot_features(
         image,
         columns["keypoints"][keyframe][mask],
