@@ -18,8 +18,8 @@ def pack_bits(bits: Tensor) -> Tensor:
     """
     if bits.shape[-1] % 8:
         raise ValueError(f"the number of bits must be a multiple of 8, got {bits.shape[-1]}")
-    words = bits.to(torch.bool).contiguous().view(torch.int64)
-    return ((words * _GATHER_BITS) >> 56).to(torch.uint8)
+    words = bits.to(torch.bool).reshape(-1).view(torch.int64)
+    return ((words * _GATHER_BITS) >> 56).to(torch.uint8).view(*bits.shape[:-1], bits.shape[-1] // 8)
 
 
 def unpack_bits(descriptors: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ def spread_bits(descriptors: Tensor, amplitude: int) -> Tensor:
     """Bits as -amplitude and +amplitude: (..., D) uint8 -> (..., 8 D) int8, one table row (a word) per byte."""
     words = bit_table(-amplitude, amplitude, descriptors.device).view(torch.int64).view(-1)
     rows = words.index_select(0, descriptors.reshape(-1).to(torch.int32))
-    return rows.view(torch.int8).view(*descriptors.shape[:-1], -1)
+    return rows.view(torch.int8).view(*descriptors.shape[:-1], 8 * descriptors.shape[-1])
 
 
 def popcount(words: Tensor) -> Tensor:

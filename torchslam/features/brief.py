@@ -35,7 +35,8 @@ def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
     patches = gather_patches(pixels, positions, stride, RADIUS)
     # This order of factors is much faster than (N, side^2) @ (side^2, 2) on the CPU.
     x, y = _moment_weights(pixels.device) @ patches.flatten(1).to(torch.float32).T
-    return torch.atan2(y, x)
+    # In float64, as vectorised float32 may differ in the last bit from one position in memory to another.
+    return torch.atan2(y.double(), x.double()).float()
 
 
 def blur(pixels: Tensor, stride: int) -> Tensor:

@@ -85,13 +85,11 @@ def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
 def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
     """Soft arg-max over a neighbourhood: offset (x, y) of its maximum from its centre, differentiable.
 
-    responses: (N, S, S), S odd. Responses are divided by the largest magnitude of their neighbourhood (held constant
-    for the gradient), so that `temperature` has no unit. Returns (N, 2) pixels.
+    responses: (N, S, S), S odd. They are divided by the largest magnitude of their neighbourhood, so that
+    `temperature` has no unit. Returns (N, 2) pixels.
     """
     side = responses.shape[-1]
-    scale = (
-        responses.detach().abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(responses.dtype).tiny)
-    )
+    scale = responses.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(responses.dtype).tiny)
     weights = torch.softmax((responses / scale / temperature).flatten(1), dim=-1)
     axis = torch.arange(side, device=responses.device, dtype=responses.dtype) - side // 2
     grid = torch.stack([axis.expand(side, side), axis[:, None].expand(side, side)], dim=-1).view(-1, 2)

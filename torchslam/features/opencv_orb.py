@@ -42,13 +42,15 @@ class OpenCVORB(nn.Module):
 
     def _extract(self, image: Tensor, dtype: torch.dtype) -> tuple[Tensor, ...]:
         """The fields of `Features` of one (H, W) uint8 image."""
-        found, described = self._orb.detectAndCompute(image.numpy(), None)
+        # cv2 fails on images that leave no room for a keypoint instead of finding none.
+        roomy = min(image.shape) > 2 * self._orb.getEdgeThreshold()
+        found, described = self._orb.detectAndCompute(image.numpy(), None) if roomy else ((), None)
         # cv2 may return a few more than asked for when responses tie.
         rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
         values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype).repeat(self.num_keypoints, 1)
         descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8)
         mask = torch.arange(self.num_keypoints) < len(rows)
-        if rows:
+        if described is not None:
             points = [found[row] for row in rows]
             values[: len(rows)] = torch.tensor([self._row(point) for point in points], dtype=dtype)
             descriptors[: len(rows)] = torch.from_numpy(described[rows])

@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+MIN_SIDE = 40  # of an atlas, so that every neighbourhood fits whatever the image
+
 
 @dataclass(frozen=True)
 class Atlas:
@@ -49,7 +51,7 @@ def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) ->
         corners.append((shelf[0], shelf[2]))
         shelf[2] += w
     scales = tuple((width / w, height / h) for h, w in sizes)
-    return Atlas(tuple(sizes), tuple(corners), scales, bottom, width)
+    return Atlas(tuple(sizes), tuple(corners), scales, max(bottom, MIN_SIDE), max(width, MIN_SIDE))
 
 
 def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchslam.features.fast import CIRCLE, fast_scores, find_peaks, patch_scores
+
+
+def noise(height: int, width: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+
+
+@given(st.integers(7, 30), st.integers(7, 30), st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_scores_are_the_best_arc_of_nine(height: int, width: int, seed: int) -> None:
+    image = noise(height, width, seed)
+    scores = fast_scores(torch.from_numpy(image).flatten(), width).view(height, width).numpy()
+    for y in range(3, height - 3):
+        for x in range(3, width - 3):
+            ring = [int(image[y + dy, x + dx]) - int(image[y, x]) for dx, dy in CIRCLE]
+            arcs = [[ring[(start + k) % 16] for k in range(9)] for start in range(16)]
+            expected = max(0, *(min(arc) for arc in arcs), *(-max(arc) for arc in arcs))
+            assert scores[y, x] == expected
+
+
+def test_corners_are_those_of_opencv() -> None:
+    image = cv2.GaussianBlur(noise(120, 160, 1), (0, 0), 1.5)
+    detector = cv2.FastFeatureDetector.create(20, nonmaxSuppression=False)
+    expected = {(round(p.pt[0]), round(p.pt[1])) for p in detector.detect(image)}
+    scores = fast_scores(torch.from_numpy(image).flatten(), 160).view(120, 160)
+    y, x = (scores[3:-3, 3:-3] > 20).nonzero().T + 3
+    assert set(zip(x.tolist(), y.tolist(), strict=True)) == expected
+    assert expected
+
+
+def test_a_strip_too_thin_for_the_circle_has_no_corners() -> None:
+    assert not fast_scores(torch.arange(60, dtype=torch.uint8), 10).any()
+    assert not find_peaks(torch.arange(20, dtype=torch.uint8), torch.zeros(20, dtype=torch.uint8), 10).any()
+
+
+def test_patch_scores_are_the_scores_of_the_image() -> None:
+    image = torch.from_numpy(noise(9, 9, 2))
+    scores = fast_scores(image.flatten(), 9).view(9, 9)[3:6, 3:6]
+    assert torch.equal(patch_scores(image[None].double())[0].clamp_min(0), scores.double())
+
+
+def test_patch_scores_gradcheck() -> None:
+    patches = torch.rand(2, 9, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(patch_scores, (patches.requires_grad_(),))
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_peaks_exceed_their_neighbours(seed: int) -> None:
+    scores = torch.from_numpy(noise(12, 14, seed) // 64)  # many ties
+    floor = torch.zeros(12 * 14, dtype=torch.uint8)
+    peaks = find_peaks(scores.flatten(), floor, 14).view(12, 14)
+    for y in range(1, 11):
+        for x in range(1, 13):
+            around = scores[y - 1 : y + 2, x - 1 : x + 2].flatten()
+            before, after = around[:4], around[5:]
+            best = bool(scores[y, x] > 0 and (scores[y, x] > before).all() and (scores[y, x] >= after).all())
+            assert bool(peaks[y, x]) == best
+
+
+def test_peaks_exceed_the_floor() -> None:
+    scores = torch.zeros(9, 9, dtype=torch.uint8)
+    scores[2, 2], scores[6, 6] = 10, 20
+    peaks = find_peaks(scores.flatten(), torch.full((81,), 10, dtype=torch.uint8), 9)
+    assert peaks.nonzero().flatten().tolist() == [6 * 9 + 6]

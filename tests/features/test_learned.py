@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from tests.features.test_orb import scene
+from torchslam.errors import ConfigError
+from torchslam.features import ALIKED, XFeat, extractor, match
+
+WEIGHTS_DIR = Path(os.environ.get("TORCHSLAM_WEIGHTS", Path(__file__).parents[3] / "shared" / "weights"))
+NETWORKS = pytest.mark.parametrize(
+    ("name", "file", "width"),
+    [("xfeat", "xfeat.safetensors", 64), ("aliked", "aliked-t16.safetensors", 64)],
+)
+
+
+def weights(file: str) -> Path:
+    path = WEIGHTS_DIR / file
+    if not path.is_file():
+        pytest.skip(f"no weights at {path}; set TORCHSLAM_WEIGHTS to the folder that has them")
+    return path
+
+
+@NETWORKS
+def test_fields_have_the_promised_shapes(name: str, file: str, width: int) -> None:
+    network = extractor(name, 100, weights(file))
+    with torch.no_grad():
+        features = network(torch.cat([scene(150, 200), torch.zeros(1, 1, 150, 200)]))
+    assert features.keypoints.shape == (2, 100, 2)
+    assert features.descriptors.shape == (2, 100, width)
+    found = features.mask[0]
+    assert found.sum() > 50
+    assert (features.keypoints[0][found] >= -0.5).all()
+    assert (features.keypoints[0][found] <= torch.tensor([199.5, 149.5])).all()
+    torch.testing.assert_close(features.descriptors[0][found].norm(dim=-1), torch.ones(int(found.sum())))
+    assert (features.scales == 1).all()
+    assert not features.angles.any()
+    assert all(values.isfinite().all() for values in vars(features).values())
+
+
+@NETWORKS
+def test_shifted_images_match(name: str, file: str, width: int) -> None:
+    network = extractor(name, 200, weights(file))
+    image = scene(192, 256, 1)
+    with torch.no_grad():
+        first, second = network(image[..., :224]), network(image[..., 32:])
+    matches = match(first, second, ratio=None, max_distance=0.3)
+    rows = matches.mask[0]
+    moved = second.keypoints[0][matches.indices_2[0][rows]] - first.keypoints[0][matches.indices_1[0][rows]]
+    assert len(moved) > 50
+    torch.testing.assert_close(moved.median(0).values, torch.tensor([-32.0, 0.0]), atol=0.1, rtol=0)
+
+
+@NETWORKS
+def test_gradients_reach_the_weights(name: str, file: str, width: int) -> None:
+    network = extractor(name, 20, weights(file))
+    features = network(scene(96, 128, 2))
+    (features.keypoints.sum() + features.descriptors.square().sum()).backward()
+    gradients = [p.grad for p in network.parameters() if p.grad is not None]
+    assert gradients
+    assert all(g.isfinite().all() for g in gradients)
+    assert any(g.any() for g in gradients)
+
+
+@pytest.mark.parametrize("kind", [XFeat, ALIKED])
+def test_weights_that_cannot_be_used_are_named(kind: type, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="absent"):
+        kind(tmp_path / "absent.safetensors")
+    (tmp_path / "broken.safetensors").write_bytes(b"no tensors here")
+    with pytest.raises(ConfigError, match="broken"):
+        kind(tmp_path / "broken.safetensors")
+    save_file({"block1.conv1.weight": torch.zeros(2, 2)}, tmp_path / "other.safetensors")
+    with pytest.raises(ConfigError, match="other"):
+        kind(tmp_path / "other.safetensors")
+
+
+@pytest.mark.parametrize("name", ["xfeat", "aliked"])
+def test_learned_features_need_weights(name: str) -> None:
+    with pytest.raises(ConfigError, match="weights"):
+        extractor(name)

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchslam.features.pyramid import plan_atlas
+from torchslam.features.selection import best_per_cell, plan_grid, ranks_within, spread, true_indices
+
+CPU = torch.device("cpu")
+
+
+@given(st.lists(st.booleans(), max_size=60))
+def test_true_indices_are_those_of_nonzero(values: list[bool]) -> None:
+    mask = torch.tensor(values, dtype=torch.bool)
+    assert torch.equal(true_indices(mask), mask.nonzero().squeeze(1))
+
+
+@given(st.lists(st.integers(0, 3), max_size=30))
+def test_ranks_count_within_groups(groups: list[int]) -> None:
+    ranks = ranks_within(torch.tensor(groups, dtype=torch.int64), 4).tolist()
+    assert ranks == [groups[:k].count(group) for k, group in enumerate(groups)]
+
+
+def test_best_per_cell_keeps_the_highest() -> None:
+    cells = torch.tensor([1, 0, 1, 1, 0])
+    scores = torch.tensor([5, 9, 7, 200, 9], dtype=torch.uint8)
+    assert best_per_cell(cells, scores, 1, 2).tolist() == [1, 3]
+    assert sorted(best_per_cell(cells, scores, 2, 2).tolist()) == [1, 2, 3, 4]
+
+
+def test_atlas_levels_do_not_overlap() -> None:
+    atlas = plan_atlas(123, 201, 1.2, 8)
+    taken = torch.zeros(atlas.rows, atlas.stride, dtype=torch.int64)
+    for (h, w), (top, left) in zip(atlas.sizes, atlas.corners, strict=True):
+        taken[top : top + h, left : left + w] += 1
+    assert taken.max() == 1
+    assert taken.sum() == sum(h * w for h, w in atlas.sizes)
+
+
+def test_grid_shares_the_budget_and_leaves_the_border() -> None:
+    atlas = plan_atlas(240, 320, 1.2, 8)
+    grid = plan_grid(atlas, 500, 8, 19, 7, CPU)
+    assert int(grid.budgets.sum()) == 500
+    assert (grid.budgets[:-1] >= grid.budgets[1:]).all()
+    inside = grid.table.view(atlas.rows, atlas.stride) >= 0
+    assert inside[19 : 240 - 19, 19 : 320 - 19].all()
+    assert not inside[:240, :19].any()
+    assert set(grid.floor.tolist()) == {7, 255}
+
+
+def test_levels_without_room_get_no_budget() -> None:
+    grid = plan_grid(plan_atlas(60, 60, 1.2, 8), 100, 8, 19, 7, CPU)
+    assert grid.budgets.tolist()[-1] == 0
+    assert int(grid.budgets.sum()) == 100
+    assert int(plan_grid(plan_atlas(20, 20, 1.2, 8), 100, 8, 19, 7, CPU).budgets.sum()) == 0
+
+
+def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
+    atlas = plan_atlas(100, 100, 1.2, 1)
+    grid = plan_grid(atlas, 4, 1, 19, 7, CPU)
+    assert len(grid.levels) == 4
+    scores = torch.tensor([9.0, 8.0, 7.0, 6.0, 1.0, 2.0, 3.0])
+    cells = torch.tensor([0, 0, 0, 0, 1, 2, 3])
+    everything = torch.ones(7, dtype=torch.bool)
+    image = torch.zeros(7, dtype=torch.int64)
+    rows, places = spread(scores, everything, cells, image, grid, 1, 1, 4)
+    assert rows[places.argsort()].tolist() == [0, 6, 5, 4]
+    rows, _ = spread(scores, everything, cells, image, grid, 0, 1, 4)
+    assert sorted(rows.tolist()) == [0, 1, 2, 3]
+    # Weak corners fill no more than their cell's first places.
+    rows, _ = spread(scores, ~everything, cells, image, grid, 1, 1, 7)
+    assert sorted(rows.tolist()) == [0, 4, 5, 6]
+
+
+def test_spread_gives_unused_budget_to_other_levels() -> None:
+    atlas = plan_atlas(100, 100, 1.2, 2)
+    grid = plan_grid(atlas, 10, 2, 19, 7, CPU)
+    level_1 = int((grid.levels == 1).nonzero()[0])
+    cells = torch.full((9,), level_1)
+    scores = torch.arange(9.0)
+    image = torch.zeros(9, dtype=torch.int64)
+    rows, _ = spread(scores, scores >= 0, cells, image, grid, 1, 1, 10)
+    assert len(rows) == 9
