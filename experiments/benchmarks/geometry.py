@@ -1,0 +1,237 @@
+"""How right and how fast the pose estimators are, beside poselib, in one run and on one thread.
+
+    python experiments/benchmarks/geometry.py [--peers FOLDER] [--output FILE] [--problems 60]
+
+FOLDER holds `problems.py`, which makes the fixed problems. Times are CPU time of the thread, so that other work on
+the machine counts as little as possible, taken in turns with the peer. Prints tables and writes them to FILE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import poselib
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose
+
+HERE = Path(__file__).parent
+CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
+POSELIB_CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
+RELATIVE_THRESHOLD, ABSOLUTE_THRESHOLD = 1.0, 2.0
+BATCH = 64
+
+
+class Errors(NamedTuple):
+    """Of one estimate: milliseconds, rotation in degrees, translation in degrees of direction or in length."""
+
+    ms: float
+    rotation: float
+    translation: float
+
+
+def load_problems(folder: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("problems", folder / "problems.py")
+    if spec is None or spec.loader is None or not (folder / "problems.py").is_file():
+        raise SystemExit(f"no problems.py in {folder}; name its folder with --peers")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def timed(task: Callable[[], Any]) -> tuple[float, Any]:
+    """CPU milliseconds of the thread, and the result."""
+    begin = time.thread_time()
+    result = task()
+    return 1e3 * (time.thread_time() - begin), result
+
+
+def batch_of_one(*arrays: NDArray) -> list[Tensor]:
+    return [torch.from_numpy(array)[None] for array in arrays]
+
+
+def relative(problems: ModuleType, outliers: float, count: int) -> tuple[list[Errors], list[Errors]]:
+    """Ours and poselib's, on 500 matches with noise of one pixel."""
+    ours, theirs = [], []
+    for seed in range(count):
+        x_1, x_2, R, t, _ = problems.two_view(seed, 500, outliers)
+        options = {"max_epipolar_error": RELATIVE_THRESHOLD}
+        ms, (pose, _) = timed(
+            lambda x_1=x_1, x_2=x_2, options=options: poselib.estimate_relative_pose(
+                x_1, x_2, POSELIB_CAMERA, POSELIB_CAMERA, options, {}
+            )
+        )
+        theirs.append(
+            Errors(ms, problems.rot_err_deg(R, pose.R), problems.dir_err_deg(t, pose.t, signed=True))
+        )
+        matches = batch_of_one(x_1, x_2)
+        ms, found = timed(
+            lambda matches=matches: estimate_relative_pose(*matches, CAMERA, CAMERA, RELATIVE_THRESHOLD)
+        )
+        T_21 = found.T_21[0].numpy()
+        rotation, direction = T_21[:3, :3], T_21[:3, 3]
+        ours.append(
+            Errors(ms, problems.rot_err_deg(R, rotation), problems.dir_err_deg(t, direction, signed=True))
+        )
+    return ours, theirs
+
+
+def absolute(problems: ModuleType, outliers: float, count: int) -> tuple[list[Errors], list[Errors]]:
+    """Ours and poselib's, on 300 pairs with noise of one pixel."""
+    ours, theirs = [], []
+    for seed in range(count):
+        points, pixels, R, t, _ = problems.pnp(seed, 300, outliers)
+        options = {"max_reproj_error": ABSOLUTE_THRESHOLD}
+        ms, (pose, _) = timed(
+            lambda points=points, pixels=pixels, options=options: poselib.estimate_absolute_pose(
+                pixels, points, POSELIB_CAMERA, options, {}
+            )
+        )
+        theirs.append(Errors(ms, problems.rot_err_deg(R, pose.R), float(np.linalg.norm(t - pose.t))))
+        pairs = batch_of_one(points, pixels)
+        ms, found = timed(lambda pairs=pairs: estimate_absolute_pose(*pairs, CAMERA, ABSOLUTE_THRESHOLD))
+        T_cw = found.T_cw[0].numpy()
+        ours.append(Errors(ms, problems.rot_err_deg(R, T_cw[:3, :3]), float(np.linalg.norm(t - T_cw[:3, 3]))))
+    return ours, theirs
+
+
+def plane(problems: ModuleType, seed: int, baseline: float, count: int = 300, outliers: float = 0.3) -> Any:
+    """Matches of a slanted plane, noise of one pixel: x_1, x_2, R, t. A baseline of zero is a pure rotation."""
+    random = np.random.default_rng(3000 + seed)
+    R, t = problems.expm(random.normal(0, 0.08, 3)), random.normal(0, 1, 3) * (1, 1, 0.5)
+    t /= np.linalg.norm(t)
+    normal, distance = np.array((*random.normal(0, 0.4, 2), 1.0)), random.uniform(3, 5)
+    normal /= np.linalg.norm(normal)
+    K_inverse, size = np.linalg.inv(problems.K), np.array((problems.W, problems.H))
+    x_1: list[NDArray] = []
+    x_2: list[NDArray] = []
+    while len(x_1) < count:
+        pixel = random.uniform((0, 0), size)
+        ray = K_inverse @ (*pixel, 1)
+        point = ray * distance / (normal @ ray)
+        if not 0.5 < point[2] < 30:
+            continue
+        projected, depth = problems.proj(R, baseline * t, point[None])
+        if depth[0] > 0.3 and (projected[0] >= 0).all() and (projected[0] < size).all():
+            x_1.append(pixel)
+            x_2.append(projected[0])
+    noisy_1 = np.array(x_1) + random.normal(0, 1, (count, 2))
+    noisy_2 = np.array(x_2) + random.normal(0, 1, (count, 2))
+    wrong = int(outliers * count)
+    noisy_2[:wrong] = random.uniform((0, 0), size, (wrong, 2))
+    return noisy_1, noisy_2, R, t
+
+
+def models(problems: ModuleType, baseline: float, expected: str, count: int = 50) -> tuple[str, str]:
+    """How often the model is right, and what becomes of the poses."""
+    seen, ambiguous, errors = Counter[str](), 0, []
+    for seed in range(count):
+        x_1, x_2, _, t = plane(problems, seed, baseline)
+        found = estimate_relative_pose(*batch_of_one(x_1, x_2), CAMERA, CAMERA, RELATIVE_THRESHOLD)
+        seen[found.model[0]] += 1
+        ambiguous += int(found.ambiguous.item())
+        if found.success.item():
+            errors.append(problems.dir_err_deg(t, found.T_21[0, :3, 3].numpy(), signed=True))
+    poses = (
+        f"{len(errors)} poses, direction off by {np.median(errors):.1f}° (worst {max(errors):.1f}°)"
+        if errors
+        else "no pose"
+    )
+    return f"{100 * seen[expected] / count:.0f} %", f"{poses}, {ambiguous} ambiguous"
+
+
+def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, NDArray]]) -> str:
+    """One row: milliseconds per problem in a loop and in one call."""
+    stacked = [torch.from_numpy(np.stack(part)) for part in zip(*cases, strict=True)]
+
+    def loop() -> None:
+        for case in cases:
+            estimate(*batch_of_one(*case))
+
+    def batch() -> None:
+        estimate(*stacked)
+
+    times = [(timed(loop)[0], timed(batch)[0]) for _ in range(3)]
+    one, many = (statistics.median(part) / len(cases) for part in zip(*times, strict=True))
+    return f"| {what} | {one:.1f} | {many:.1f} | {one / many:.1f} |"
+
+
+def throughput(problems: ModuleType) -> list[str]:
+    def absolute_of(points: Tensor, pixels: Tensor) -> Any:
+        return estimate_absolute_pose(points, pixels, CAMERA, ABSOLUTE_THRESHOLD)
+
+    def relative_of(pixels_1: Tensor, pixels_2: Tensor) -> Any:
+        return estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, RELATIVE_THRESHOLD)
+
+    seeds = range(BATCH)
+    return [
+        speedup("absolute pose, 30 % outliers", absolute_of, [problems.pnp(s, 300, 0.3)[:2] for s in seeds]),
+        speedup("absolute pose, 60 % outliers", absolute_of, [problems.pnp(s, 300, 0.6)[:2] for s in seeds]),
+        speedup(
+            "relative pose, 40 % outliers", relative_of, [problems.two_view(s, 500, 0.4)[:2] for s in seeds]
+        ),
+    ]
+
+
+def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> str:
+    """One row: medians and means of ours beside the peer's, and their ratios."""
+    cells = [f"{len(ours)}"]
+    for field, digits in (("rotation", 3), ("translation", 4)):
+        mine, peer = ([getattr(errors, field) for errors in group] for group in (ours, theirs))
+        ratio = statistics.mean(mine) / statistics.mean(peer)
+        cells.append(f"{statistics.mean(mine):.{digits}f} / {statistics.mean(peer):.{digits}f} ({ratio:.2f})")
+    cells.append(f"{max(errors.rotation for errors in ours):.2f}")
+    mine, peer = (statistics.median(errors.ms for errors in group) for group in (ours, theirs))
+    cells.append(f"{mine:.1f} / {peer:.1f} ({mine / peer:.2f})")
+    return f"| {what} | " + " | ".join(cells) + " |"
+
+
+def report(problems: ModuleType, count: int) -> str:
+    header = "| problems | count | rotation, degrees | translation | worst rotation | ms |\n|---|---|---|---|---|---|"
+    lines = ["Mean errors and median times, torchslam / poselib (ratio). One thread.", "", header]
+    lines += [
+        compared(f"relative pose, {outliers:.0%} outliers", *relative(problems, outliers, count))
+        for outliers in (0.1, 0.4, 0.6)
+    ]
+    lines += [
+        compared(f"absolute pose, {outliers:.0%} outliers", *absolute(problems, outliers, count))
+        for outliers in (0.1, 0.3, 0.6)
+    ]
+    lines += ["", "| scene, 50 of each, 30 % outliers | right model | poses |", "|---|---|---|"]
+    for name, baseline, expected in (("plane", 0.35, "homography"), ("pure rotation", 0.0, "rotation")):
+        lines.append(f"| {name} | " + " | ".join(models(problems, baseline, expected)) + " |")
+    lines += [
+        "",
+        f"| {BATCH} problems | ms each in a loop | ms each in one call | times faster |",
+        "|---|---|---|---|",
+    ]
+    return "\n".join([*lines, *throughput(problems)])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peers", type=Path, default=HERE.parents[2] / "shared" / "peers")
+    parser.add_argument("--output", type=Path, default=HERE / "geometry.md")
+    parser.add_argument("--problems", type=int, default=60, help="how many of each kind")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    text = report(load_problems(arguments.peers), arguments.problems)
+    print(text)
+    arguments.output.write_text(f"# Pose estimation beside poselib\n\n{text}\n")
+
+
+if __name__ == "__main__":
+    main()
