@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -190,6 +194,25 @@ def test_bad_frames_are_skipped_counted_and_named(tmp_path: Path, capsys: pytest
     figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert figures["frames"] == 6
     assert len(figures["skipped"]) == 3
+
+
+def test_download_fetches_what_run_can_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_tum_folder(tmp_path / "made" / "desk_1", frames=4)
+    (tmp_path / "served").mkdir()
+    shutil.make_archive(str(tmp_path / "served" / "desk_1_mono"), "zip", folder.parent)
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path / "served"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        status, out, _ = run_and_read(capsys, "download", "eth3d/desk_1", "--to", str(tmp_path), "--url", url)
+        missing, _, err = run_and_read(
+            capsys, "download", "eth3d/desk_2", "--to", str(tmp_path), "--url", url
+        )
+        server.shutdown()
+    assert (status, missing) == (0, 2)
+    assert "desk_2_mono.zip: 404" in err
+    status, out, _ = run_and_read(capsys, "info", out.strip())
+    assert "640x480" in out
 
 
 BAD_ARGUMENTS = [
