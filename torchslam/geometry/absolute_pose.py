@@ -17,6 +17,7 @@ from torchslam.geometry.p3p import p3p
 from torchslam.geometry.projections import fit_projections, pose_tangent, score_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
+    best_models,
     gather_rows,
     is_significant,
     sample_minimal,
@@ -162,21 +163,24 @@ class _Problem:
         R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
         first = valid_first(valid)
-        P = torch.cat((R, t[..., None]), dim=-1).flatten(2)
-        P, valid = gather_rows(P, first).unflatten(-1, (3, 4)), valid.gather(1, first)
-        score = torch.where(valid, self.score(P), -1.0)
-        best = score.topk(min(_CANDIDATES, score.shape[1]), dim=1).indices
-        P = gather_rows(P.flatten(2), best).unflatten(-1, (3, 4))
+        P = gather_rows(torch.cat((R, t[..., None]), dim=-1).flatten(2), first)
+        count = min(_CANDIDATES, P.shape[1])
+        best = best_models(self.score, P, valid.gather(1, first), self.mask, count, generator)
+        P = gather_rows(P, best).unflatten(-1, (3, 4))
         P, cost = self.fit(P, _LOCAL_ITERATIONS, 1.0)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         P = P[torch.arange(len(best), device=best.device), best]
         near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
-    def score(self, P: Tensor) -> Tensor:
-        """Truncated scores of many poses, in float32. (B, M, 3, 4) -> (B, M)."""
-        homogeneous, normalized = self.homogeneous.float(), self.normalized.float()
-        return score_projections(P.float(), homogeneous, normalized, self.scale, self.mask)
+    def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
+        """Truncated scores of many poses on some of the points, or all, in float32. (B, M, 12) -> (B, M)."""
+        homogeneous, x, scale, mask = self.homogeneous.mT, self.normalized, self.scale, self.mask
+        if rows is not None:
+            homogeneous, x, scale = (gather_rows(values, rows) for values in (homogeneous, x, scale))
+            mask = mask.gather(1, rows)
+        P = P.float().unflatten(-1, (3, 4))
+        return score_projections(P, homogeneous.mT.float(), x.float(), scale, mask)
 
     def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
         """Poses (B, K, 3, 4) of least truncated error in undistorted coordinates, and their costs (B, K)."""

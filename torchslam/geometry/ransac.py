@@ -13,6 +13,8 @@ from torchslam.geometry.least_squares import State
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
 _SAMPLES_AT_ONCE = 1024
+# Many models are compared on this many rows first, and this many of them on all.
+_PREVIEW_ROWS, _PREVIEW_MODELS = 80, 32
 
 
 def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
@@ -35,6 +37,26 @@ def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generat
         start[..., None] + torch.arange(size, device=mask.device) % available.clamp_min(1)[:, None, None]
     )
     return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
+
+
+def best_models(
+    score: Callable[[Tensor, Tensor | None], Tensor],
+    models: Tensor,
+    valid: Tensor,
+    mask: Tensor,
+    count: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Indices (B, count) of the best of many models, which first have to do well on a random part of the rows.
+
+    score: (models (B, M, D), row numbers (B, n) or None for all) -> (B, M); valid: (B, M); mask: (B, N).
+    """
+    if mask.shape[1] < 2 * _PREVIEW_ROWS or models.shape[1] < 2 * _PREVIEW_MODELS:
+        return torch.where(valid, score(models, None), -1.0).topk(count, dim=1).indices
+    rows = sample_minimal(mask, _PREVIEW_ROWS, 1, generator)[:, 0]
+    preview = torch.where(valid, score(models, rows), -1.0).topk(_PREVIEW_MODELS, dim=1).indices
+    final = torch.where(valid.gather(1, preview), score(gather_rows(models, preview), None), -1.0)
+    return preview.gather(1, final.topk(count, dim=1).indices)
 
 
 def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: float) -> Tensor:
@@ -80,8 +102,15 @@ def search(
     as from `truncated_score`, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
     rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before.
     """
+
+    def propose_in_parts(rows: Tensor, count: int) -> tuple[State, Tensor, Tensor]:
+        """Few problems at a time, so that what they compute stays in the cache."""
+        parts = [propose(part, count) for part in rows.split(max(1, _SAMPLES_AT_ONCE // count))]
+        models, scores, supports = zip(*parts, strict=True)
+        return tuple(torch.cat(x) for x in zip(*models, strict=True)), torch.cat(scores), torch.cat(supports)
+
     rows = torch.arange(len(available), device=available.device)
-    models, best, support = propose(rows, first_round)
+    models, best, support = propose_in_parts(rows, first_round)
     drawn, count = first_round, first_round
     while drawn < max_samples:
         rows = (samples_needed(support, available, size, confidence) > drawn).nonzero().squeeze(-1)
@@ -89,14 +118,12 @@ def search(
             break
         count = min(2 * count, max_samples - drawn)
         drawn += count
-        # Few problems at a time: their scores stay in the cache.
-        for part in rows.split(max(1, _SAMPLES_AT_ONCE // count)):
-            new, score, new_support = propose(part, count)
-            better = score > best[part]
-            part = part[better]
-            models = tuple(old.index_copy(0, part, x[better]) for old, x in zip(models, new, strict=True))
-            best = best.index_copy(0, part, score[better])
-            support = support.index_copy(0, part, new_support[better])
+        new, score, new_support = propose_in_parts(rows, count)
+        better = score > best[rows]
+        rows = rows[better]
+        models = tuple(old.index_copy(0, rows, x[better]) for old, x in zip(models, new, strict=True))
+        best = best.index_copy(0, rows, score[better])
+        support = support.index_copy(0, rows, new_support[better])
     return models
 
 

@@ -25,6 +25,7 @@ from torchslam.geometry.projections import (
 )
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
+    best_models,
     gather_rows,
     pad_groups,
     sample_minimal,
@@ -68,6 +69,11 @@ class TwoViews:
         if len(rows) == len(self.mask):
             return self
         return TwoViews(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def rows(self, rows: Tensor) -> TwoViews:
+        """Some of the matches of each problem. (B, n) row numbers."""
+        x_1, x_2 = gather_rows(self.x_1, rows), gather_rows(self.x_2, rows)
+        return TwoViews(x_1, x_2, *(x.gather(1, rows) for x in (self.scale_1, self.scale_2, self.mask)))
 
     @cached_property
     def h_1(self) -> Tensor:
@@ -209,8 +215,11 @@ def propose_essential(
     x_1, x_2 = gather_rows(views.x_1, sample), gather_rows(views.x_2, sample)
     E, row = five_point(x_1.flatten(0, 1), x_2.flatten(0, 1))
     E, valid = pad_groups(E.flatten(1), row // count, B, _CANDIDATES)
-    score = torch.where(valid, score_essential(views, E.unflatten(-1, (3, 3))), -1.0)
-    best = score.topk(_CANDIDATES, dim=1).indices
+
+    def score(E: Tensor, rows: Tensor | None) -> Tensor:
+        return score_essential(views if rows is None else views.rows(rows), E.unflatten(-1, (3, 3)))
+
+    best = best_models(score, E, valid, views.mask, _CANDIDATES, generator)
     R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
     # Padding has no pose; start it from the identity.
     R = torch.where(
