@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 
+from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, turn
-from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence
+from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
 from torchslam.errors import ConfigError, FrameError
+from torchslam.evaluation import ate
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -172,3 +175,39 @@ def test_a_real_standstill_starts_no_map(data_dir: object) -> None:
     run = SLAM(sequence.camera).run(sequence)
     assert run.map.num_keyframes == 0
     assert "stands still" in run.failure
+
+
+def test_the_trajectory_of_a_run_is_the_minimiser_of_its_graph() -> None:
+    walk = Walk(arc(40))
+    run = run_walk(walk, "simulated.noise_px=0.5")
+    graph = run.graph
+    assert int(graph.is_keyframe.sum()) == run.map.num_keyframes
+    assert len(graph.timestamps) == 40
+    solution = solve(graph, backward="detached")
+    assert torch.allclose(solution.trajectory.timestamps, run.trajectory.timestamps)
+    assert torch.allclose(solution.trajectory.T_wc, run.trajectory.T_wc, atol=1e-5)
+
+
+def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
+    walk = Walk(arc(30))
+    graph = run_walk(walk, "simulated.noise_px=0.5").graph
+
+    def error(fx: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        params = torch.cat([fx[None], graph.camera.params[1:]])
+        moved = replace(graph, camera=graph.camera.with_params(params), pixels=pixels)
+        solution = solve(moved, tolerance=1e-14, iterations=60)
+        return ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids])
+
+    fx = graph.camera.params[0].clone().requires_grad_()
+    pixels = graph.pixels.clone().requires_grad_()
+    error(fx, pixels).backward()
+    assert fx.grad is not None
+    assert pixels.grad is not None
+    with torch.no_grad():
+        h = 1e-3
+        numeric = (error(fx + h, pixels) - error(fx - h, pixels)) / (2 * h)
+        assert float(fx.grad) == pytest.approx(float(numeric), rel=1e-3)
+        direction = pixels.grad / pixels.grad.norm()
+        h = 1e-2
+        numeric = (error(fx, pixels + h * direction) - error(fx, pixels - h * direction)) / (2 * h)
+        assert float(pixels.grad.norm()) == pytest.approx(float(numeric), rel=1e-3)

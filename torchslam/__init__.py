@@ -11,6 +11,7 @@ from torchslam.errors import TorchslamError
 from torchslam.evaluation import evaluate
 from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, triangulate, umeyama
+from torchslam.graph import GraphSolution, ObservationGraph, solve
 from torchslam.run import Run
 from torchslam.slam import SLAM
 from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
@@ -27,7 +28,9 @@ __all__ = [
     "Config",
     "Features",
     "Frame",
+    "GraphSolution",
     "Matches",
+    "ObservationGraph",
     "OpenCVORB",
     "Run",
     "State",
@@ -44,6 +47,7 @@ __all__ = [
     "match_projected",
     "open_sequence",
     "refine_pose",
+    "solve",
     "triangulate",
     "umeyama",
 ]

@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.graph import GraphSolution, ObservationGraph
 from torchslam.map import Map
-from torchslam.solvers import refine_pose
 from torchslam.table import Table
 from torchslam.tracking import Tracked
 from torchslam.types import Trajectory, View
+
+
+@dataclass(frozen=True)
+class RunGraph(ObservationGraph):
+    """The graph of a run, which knows where its rows come from.
+
+    frame_ids:      (F,) frames of the sequence
+    point_ids:      (P,) rows of the map's points
+    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end
+    """
+
+    frame_ids: Tensor
+    point_ids: Tensor
+    keypoint_index: Tensor
 
 
 class History:
@@ -52,36 +68,43 @@ class History:
         order = torch.argsort(timestamps, stable=True)
         return Trajectory(timestamps[order].clone(), se3_inverse(self.T_cw(slam_map)[order]))
 
-    def repose(self, slam_map: Map, camera: Camera, frames_at_once: int = 128) -> None:
-        """Refine every frame against the map as it is now, in batches: the map moved after the frame was tracked.
+    def graph(self, slam_map: Map, camera: Camera) -> RunGraph:
+        """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
 
-        A frame that sees fewer than ten points that are still alive keeps its pose relative to its keyframe.
+        Keyframes bring all their observations, the other frames those of points that keyframes see.
         """
-        seen = self.observations
-        ids = slam_map.resolve(seen["point_ids"])
-        alive = slam_map.points["alive"][ids]
-        counts = torch.bincount(seen["row"], minlength=len(self))
-        starts = counts.cumsum(0) - counts
-        T_cw = self.T_cw(slam_map)
-        for first in range(0, len(self), frames_at_once):
-            rows = slice(first, min(first + frames_at_once, len(self)))
-            slot = torch.arange(int(counts[rows].max()), device=ids.device)
-            mask = slot < counts[rows, None]
-            index = torch.where(mask, starts[rows, None] + slot, 0)
-            mask &= alive[index]
-            refined = refine_pose(
-                T_cw[rows],
-                slam_map.positions_w[ids[index]],
-                seen["pixels"][index],
-                camera,
-                weights=seen["scales"][index] ** -2,
-                mask=mask,
-                kernel="huber",
-                scale=2.0,
-                backward="detached",
-            )
-            is_better = refined.success & (mask.sum(1) >= 10)
-            moved = refined.T_cw @ se3_inverse(slam_map.T_cw[self.frames["reference"][rows]])
-            self.frames["T_cr"][rows] = torch.where(
-                is_better[:, None, None], moved, self.frames["T_cr"][rows]
-            )
+        seen = slam_map.observations()
+        point_ids = torch.unique(seen.point_index)
+        between = torch.nonzero(~torch.isin(self.frames["frame_index"], slam_map.keyframes["frame_index"]))[
+            :, 0
+        ]
+        slot = torch.full((len(self),), -1, device=point_ids.device)
+        slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
+        heirs = slam_map.resolve(self.observations["point_ids"])
+        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & torch.isin(heirs, point_ids))[:, 0]
+        own = {name: self.observations[name][rows] for name in ("row", "keypoints", "pixels", "scales")}
+        keyframes = slam_map.keyframes
+        return RunGraph(
+            timestamps=torch.cat([keyframes["timestamp"], self.frames["timestamp"][between]]),
+            T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
+            points_w=slam_map.positions_w[point_ids],
+            frame_index=torch.cat([seen.keyframe_index, slot[own["row"]]]),
+            point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
+            pixels=torch.cat([seen.pixels, own["pixels"]]),
+            weights=torch.cat([seen.scales, own["scales"]]) ** -2,
+            camera=camera,
+            is_keyframe=torch.arange(slam_map.num_keyframes + len(between)) < slam_map.num_keyframes,
+            frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),
+            point_ids=point_ids,
+            keypoint_index=torch.cat([seen.keypoint_index, own["keypoints"]]),
+        )
+
+    def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
+        """Move the map and the frames to the solution of their graph."""
+        count = slam_map.num_keyframes
+        slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
+        slam_map.points["positions_w"][graph.point_ids] = solution.points_w
+        order = torch.argsort(graph.frame_ids)
+        solved = order[torch.searchsorted(graph.frame_ids[order], self.frames["frame_index"])]
+        T_rw = slam_map.T_cw[self.frames["reference"]]
+        self.frames["T_cr"][:] = solution.T_cw[solved] @ se3_inverse(T_rw)

@@ -110,15 +110,15 @@ class Mapper:
                 point = heir[point]
             return point
 
-        for one, other in zip(*(torch.cat(side).tolist() for side in zip(*pairs, strict=True)), strict=True):
-            one, other = last_heir(one), last_heir(other)
-            if one != other:
-                old, new = (one, other) if observed[one] <= observed[other] else (other, one)
-                heir[old] = new
+        for found, there in pairs:
+            for pair in zip(found.tolist(), there.tolist(), strict=True):
+                one, other = (last_heir(point) for point in pair)
+                if one != other:
+                    old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
+                    heir[old] = kept
         if heir:
-            device = observed.device
-            new = torch.tensor([last_heir(point) for point in heir.values()], device=device)
-            self.map.replace(torch.tensor(list(heir), device=device), new)
+            last = [last_heir(point) for point in heir.values()]
+            self.map.replace(observed.new_tensor(list(heir)), observed.new_tensor(last))
 
 
 def world_scale(start: Start, kind: str) -> float:

@@ -12,9 +12,11 @@ import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import ConfigError, FrameError
+from torchslam.errors import ConfigError, FrameError, InitializationError
 from torchslam.extraction import simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.graph import solve
+from torchslam.history import History, RunGraph
 from torchslam.local_bundle import adjust_all
 from torchslam.map import Map
 from torchslam.types import State, StepResult, Trajectory
@@ -28,6 +30,7 @@ class Run:
     """The result of a run.
 
     trajectory:  every posed frame; keyframes: the keyframes alone
+    history:     poses and observations of the frames, from which `graph` is made
     results:     one per processed frame
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
@@ -37,12 +40,23 @@ class Run:
     trajectory: Trajectory
     keyframes: Trajectory
     map: Map
+    history: History
     camera: Camera
     config: Config
     results: list[StepResult]
     skipped: list[str]
     interrupted: bool
     failure: str
+
+    @property
+    def graph(self) -> RunGraph:
+        """Everything the run saw, as one differentiable problem: `torchslam.solve(run.graph)` gives its trajectory.
+
+        Raises InitializationError where there is no map.
+        """
+        if self.failure:
+            raise InitializationError(self.failure)
+        return self.history.graph(self.map, self.camera)
 
 
 def run_sequence(slam: SLAM, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
@@ -77,11 +91,13 @@ def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupte
     has_map = slam.map.num_keyframes > 0
     if has_map and slam.config.bundle.enabled and slam.config.bundle.final:
         adjust_all(slam.map, slam.camera, slam.config.bundle)
-        slam.history.repose(slam.map, slam.camera)
+        graph = slam.history.graph(slam.map, slam.camera)
+        slam.history.take(solve(graph, backward="detached"), graph, slam.map)
     return Run(
         slam.trajectory(),
         keyframe_trajectory(slam.map),
         slam.map,
+        slam.history,
         slam.camera,
         slam.config,
         results,
