@@ -120,7 +120,7 @@ def test_an_open_gauge_keeps_the_scale_and_has_covariances(bundle_scene):
     solution = bundle_adjust(replace(scene.problem, fixed_frames=(0,)))
     assert solution.success
     s, _, _ = umeyama(solution.points_w, scene.problem.points_w)
-    assert s.item() == pytest.approx(1, abs=0.01)
+    assert s.item() == pytest.approx(1, abs=0.02)
     assert (torch.linalg.eigvalsh(solution.covariance().points) > 0).all()
 
 

@@ -53,6 +53,8 @@ class BundleSolution:
     cost:       () half the sum of robustified squared whitened residuals, detached
     success:    () bool, all that moves is determined, up to the gauge. If not, the estimate is still the best that was
                 found, but it has no gradient.
+    moved_frames, moved_points: (F,), (P,) bool. What is fixed, or seen too little (points by two frames, frames with
+                three points at least), stayed at its start; in the latter case its observations did not count.
     convergence: of the one element
     """
 
@@ -61,6 +63,8 @@ class BundleSolution:
     camera: Camera
     cost: Tensor
     success: Tensor
+    moved_frames: Tensor
+    moved_points: Tensor
     convergence: Convergence
     _marginals: Callable[[], Marginals] = field(repr=False)
 
@@ -140,6 +144,8 @@ def bundle_adjust(
         problem.camera.with_params(solution.params),
         convergence.cost[0],
         success,
+        _as_mask(layout.free_frames, len(problem.T_cw), problem.T_cw.device),
+        layout.free_points[layout.point_rank],
         convergence,
         lambda: bundle.marginals(minimum),
     )

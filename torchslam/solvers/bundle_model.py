@@ -145,7 +145,7 @@ class Bundle:
 
     def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
         equations, estimate = model.equations, model.estimate
-        factorized = equations.factorized(damping)
+        factorized = equations.factorized(damping, self._gauge(estimate.T_cw))
         step = factorized.solve(equations.gradient)
         decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
@@ -166,14 +166,17 @@ class Bundle:
     def _gauge(self, T_cw: Tensor) -> Tensor | None:
         """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is."""
         layout = self.layout
-        if not layout.free_points.all() or len(layout.free_frames) < len(T_cw) - 1:
+        is_anchor = torch.zeros(len(T_cw), dtype=torch.bool, device=T_cw.device)
+        is_anchor[layout.frame_index] = True
+        is_anchor[layout.free_frames] = False
+        anchors = T_cw[is_anchor]
+        fixed_points = ~layout.free_points & (layout.structure.point_counts > 0)
+        if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
             return None
-        fixed = torch.ones(len(T_cw), dtype=torch.bool, device=T_cw.device)
-        fixed[layout.free_frames] = False
         T_free = T_cw[layout.free_frames]
-        origin = se3_inverse(T_cw[fixed][0] if fixed.any() else T_free[0])[:3, 3]
+        origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
         scaling = torch.nn.functional.pad(transform(T_free, origin[None]).squeeze(-2), (0, 3))[..., None]
-        motions = scaling if fixed.any() else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
+        motions = scaling if len(anchors) else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
         return torch.linalg.qr(motions.flatten(0, 1)).Q.view_as(motions)
 
     def marginals(self, estimate: Estimate) -> Marginals:

@@ -83,7 +83,7 @@ def minimize(
     initial_cost = model.cost.detach()
     # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
     rounding = torch.finfo(initial_cost.dtype).eps
-    slack = 1 + 8 * rounding
+    slack = 1 + 100 * rounding
     damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
     for _ in range(iterations):

@@ -1,0 +1,356 @@
+"""How fast and how right the solvers are, beside pycolmap (Ceres), in one run and on one thread.
+
+    python experiments/benchmarks/solvers.py [--peers FOLDER] [--output FILE]
+
+FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and writes it to FILE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry import Camera, rigid, so3_exp, transform
+from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
+from torchslam.solvers.robust import Kernel
+
+HERE = Path(__file__).parent
+FOCAL, CENTRE, SIZE = 525.0, (319.5, 239.5), (640, 480)
+
+
+def load_problems(folder: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("problems", folder / "problems.py")
+    if spec is None or spec.loader is None or not (folder / "problems.py").is_file():
+        raise SystemExit(f"no problems.py in {folder}; name its folder with --peers")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Row(NamedTuple):
+    what: str
+    reached: str
+    reference: str
+
+
+class Peer(NamedTuple):
+    """Time around pycolmap's solve and inside Ceres, and the RMSE it reached, px."""
+
+    solve_ms: float
+    ceres_ms: float
+    rmse: float
+
+
+def camera() -> Camera:
+    return Camera.pinhole(FOCAL, FOCAL, *CENTRE, size=SIZE)
+
+
+def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
+    """Median time of each task, taken in turns so that a busy machine slows all of them alike.
+
+    A task may return a number: the milliseconds that count.
+    """
+    times: list[list[float]] = [[] for _ in tasks]
+    for repeat in range(repeats + 2):
+        for task, record in zip(tasks, times, strict=True):
+            begin = time.perf_counter()
+            counted = task()
+            elapsed = 1e3 * (time.perf_counter() - begin)
+            if repeat >= 2:
+                record.append(counted if isinstance(counted, float) else elapsed)
+    return [statistics.median(record) for record in times]
+
+
+def central_difference(
+    solve: Callable[[Tensor], Tensor], at: Tensor, direction: Tensor, step: float
+) -> Tensor:
+    with torch.no_grad():
+        return (solve(at + step * direction) - solve(at - step * direction)) / (2 * step)
+
+
+def gradient_error(
+    solve: Callable[..., Tensor], inputs: dict[str, Tensor], steps: dict[str, float], exactly: dict[str, Any]
+) -> float:
+    """Largest relative error of the gradient to any input, along one random direction each."""
+    generator = torch.Generator().manual_seed(0)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    solve(**leaves, **exactly).backward()
+    worst = 0.0
+    for name, step in steps.items():
+        direction = torch.randn(inputs[name].shape, generator=generator, dtype=torch.float64)
+
+        def along(tensor: Tensor, name: str = name) -> Tensor:
+            return solve(**(inputs | {name: tensor}), **exactly)
+
+        expected = central_difference(along, inputs[name], direction, step)
+        found = (leaves[name].grad * direction).sum()
+        worst = max(worst, float((found - expected).abs() / expected.abs()))
+    return worst
+
+
+# --- poses -----------------------------------------------------------------------------------------------------
+
+
+def pose_inputs(problems: ModuleType, batch: int) -> tuple[Tensor, dict[str, Tensor]]:
+    """Starts (B, 4, 4) and the inputs of B problems of 300 points, 20 % of them outliers."""
+    generator = torch.Generator().manual_seed(0)
+    starts, points, pixels = [], [], []
+    for seed in range(batch):
+        X, x, R, t, _ = problems.pnp(seed, n=300, outliers=0.2)
+        offset = rigid(
+            so3_exp(0.02 * torch.randn(3, generator=generator, dtype=torch.float64)),
+            0.05 * torch.randn(3, generator=generator, dtype=torch.float64),
+        )
+        starts.append(offset @ rigid(torch.tensor(R), torch.tensor(t)))
+        points.append(torch.tensor(X))
+        pixels.append(torch.tensor(x))
+    weights = 0.5 + torch.rand(batch, 300, generator=generator, dtype=torch.float64)
+    return torch.stack(starts), {
+        "points_w": torch.stack(points),
+        "pixels": torch.stack(pixels),
+        "weights": weights,
+        "params": camera().params,
+        "scale": torch.tensor(1.0, dtype=torch.float64),
+    }
+
+
+def pose_loss(start: Tensor, points_w, pixels, weights, params, scale, **options) -> Tensor:  # type: ignore[no-untyped-def]
+    refined = refine_pose(
+        start,
+        points_w,
+        pixels,
+        camera().with_params(params),
+        weights,
+        kernel="cauchy",
+        scale=scale,
+        **options,
+    )
+    return (refined.T_cw[:, :3].flatten(1) @ torch.linspace(-1, 1, 12, dtype=torch.float64)).sum()
+
+
+def benchmark_pose(problems: ModuleType) -> list[Row]:
+    start, inputs = pose_inputs(problems, 1)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+
+    def forward() -> None:
+        with torch.no_grad():
+            pose_loss(start, **inputs)
+
+    def backward() -> float:
+        loss = pose_loss(start, **leaves)
+        begin = time.perf_counter()
+        loss.backward()
+        return 1e3 * (time.perf_counter() - begin)
+
+    starts, many = pose_inputs(problems, 64)
+
+    def together() -> None:
+        with torch.no_grad():
+            pose_loss(starts, **many)
+
+    def loop() -> None:
+        with torch.no_grad():
+            for row in range(64):
+                one = {name: many[name][row : row + 1] for name in ("points_w", "pixels", "weights")}
+                pose_loss(starts[row : row + 1], **(many | one))
+
+    forward_ms, backward_ms = milliseconds(forward, backward, repeats=101)
+    together_ms, loop_ms = milliseconds(together, loop, repeats=5)
+    error = gradient_error(
+        lambda **tensors: pose_loss(start, **tensors),
+        inputs,
+        {"points_w": 1e-6, "pixels": 1e-4, "weights": 1e-5, "params": 1e-4, "scale": 1e-5},
+        {"iterations": 100, "tolerance": 0.0},
+    )
+    iterations = refine_pose(
+        start, inputs["points_w"], inputs["pixels"], camera(), inputs["weights"]
+    ).convergence.iterations.item()
+    return [
+        Row(
+            f"`refine_pose`, 300 points, 20 % outliers, cauchy: forward ({iterations} iterations)",
+            f"{forward_ms:.1f} ms",
+            "4 ms",
+        ),
+        Row("its backward / forward", f"{backward_ms / forward_ms:.2f}", "2"),
+        Row("its gradient to all inputs against central differences", f"{error:.0e}", "1e-05"),
+        Row(
+            "64 problems in one call: throughput against a loop", f"{loop_ms / together_ms:.1f}", "at least 5"
+        ),
+    ]
+
+
+# --- bundles ---------------------------------------------------------------------------------------------------
+
+
+def bundle_problem(problems: ModuleType) -> BundleProblem:
+    data = problems.ba()
+    poses = torch.tensor(data["poses0"])
+    return BundleProblem(
+        rigid(so3_exp(poses[:, :3]), poses[:, 3:]),
+        torch.tensor(data["pts0"]),
+        torch.tensor(data["cam"]),
+        torch.tensor(data["pt"]),
+        torch.tensor(data["uv"]),
+        camera(),
+        fixed_frames=(0, 1),
+    )
+
+
+def colmap_solve(problem: BundleProblem) -> Peer:
+    """The same problem by pycolmap. Fixed intrinsics, no robust loss, one thread."""
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    model = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[FOCAL, FOCAL, *CENTRE])
+    model.camera_id = 1
+    reconstruction.add_camera_with_trivial_rig(model)
+    rows = [[] for _ in problem.T_cw]  # type: list[list[int]]
+    for row, frame in enumerate(problem.frame_index.tolist()):
+        rows[frame].append(row)
+    place = {}
+    for frame, T_cw in enumerate(problem.T_cw):
+        image = pycolmap.Image(
+            name=str(frame), keypoints=problem.pixels[rows[frame]].numpy(), camera_id=1, image_id=frame + 1
+        )
+        place.update({row: (frame + 1, position) for position, row in enumerate(rows[frame])})
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T_cw[:3].numpy()))
+    tracks = [pycolmap.Track() for _ in problem.points_w]
+    for row, point in enumerate(problem.point_index.tolist()):
+        tracks[point].add_element(*place[row])
+    for point, track in zip(problem.points_w, tracks, strict=True):
+        reconstruction.add_point3D(point.numpy(), track)
+
+    config = pycolmap.BundleAdjustmentConfig()
+    for frame in range(len(problem.T_cw)):
+        config.add_image(frame + 1)
+    for frame in (1, 2):
+        config.set_constant_rig_from_world_pose(frame)
+    config.set_constant_cam_intrinsics(1)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    begin = time.perf_counter()
+    summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    elapsed = 1e3 * (time.perf_counter() - begin)
+    ceres_ms = 1e3 * summary.ceres_summary.total_time_in_seconds
+
+    T_cw = torch.eye(4, dtype=torch.float64).repeat(len(problem.T_cw), 1, 1)
+    for frame in range(len(T_cw)):
+        T_cw[frame, :3] = torch.from_numpy(reconstruction.images[frame + 1].cam_from_world().matrix())
+    points_w = torch.tensor(
+        [reconstruction.points3D[point + 1].xyz.tolist() for point in range(len(problem.points_w))]
+    )
+    return Peer(elapsed, ceres_ms, rmse(replace(problem, T_cw=T_cw, points_w=points_w.double())))
+
+
+def rmse(problem: BundleProblem) -> float:
+    """Root mean square of the reprojection errors, px."""
+    T_cw, points_w = problem.T_cw[problem.frame_index], problem.points_w[problem.point_index]
+    pixels, _ = problem.camera.project(transform(T_cw, points_w[:, None])[:, 0])
+    return float((pixels - problem.pixels).square().sum(-1).mean().sqrt())
+
+
+def bundle_loss(
+    problem: BundleProblem, pixels: Tensor, weights: Tensor, params: Tensor, **options: Any
+) -> Tensor:
+    problem = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
+    solution = bundle_adjust(problem, **options)
+    poses, points = solution.T_cw[:, :3].flatten(), solution.points_w.flatten()
+    return sum(x @ torch.linspace(-1, 1, len(x), dtype=torch.float64) for x in (poses, points))  # type: ignore[return-value]
+
+
+def benchmark_bundle(problems: ModuleType) -> list[Row]:
+    problem = bundle_problem(problems)
+    generator = torch.Generator().manual_seed(0)
+    inputs = {
+        "pixels": problem.pixels,
+        "weights": 0.5 + torch.rand(len(problem.pixels), generator=generator, dtype=torch.float64),
+        "params": problem.camera.params,
+    }
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+
+    def solve() -> None:
+        with torch.no_grad():
+            bundle_adjust(problem, kernel="none")
+
+    def backward(kernel: Kernel) -> float:
+        loss = bundle_loss(problem, **leaves, kernel=kernel, scale=2.0)
+        begin = time.perf_counter()
+        loss.backward()
+        return 1e3 * (time.perf_counter() - begin)
+
+    ours, colmap, ceres, back = milliseconds(
+        solve,
+        lambda: colmap_solve(problem).solve_ms,
+        lambda: colmap_solve(problem).ceres_ms,
+        lambda: backward("none"),
+    )
+    with torch.no_grad():
+        solution = bundle_adjust(problem, kernel="none")
+    reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
+    steps = {"pixels": 1e-4, "weights": 1e-5, "params": 1e-4}
+    errors = {
+        kernel: gradient_error(
+            lambda kernel=kernel, **tensors: bundle_loss(problem, **tensors, kernel=kernel, scale=2.0),
+            inputs,
+            steps,
+            {"iterations": 60, "tolerance": 1e-28},
+        )
+        for kernel in ("none", "cauchy")
+    }
+    return [
+        Row(
+            "`bundle_adjust`, 10 cameras, 1940 points, 11120 observations: RMSE at the optimum",
+            f"{reached:.4f} px",
+            f"{colmap_solve(problem).rmse:.4f} px (pycolmap)",
+        ),
+        Row(
+            f"its time ({solution.convergence.iterations.item()} iterations)",
+            f"{ours:.0f} ms",
+            f"{colmap:.0f} ms (pycolmap; of these Ceres {ceres:.0f} ms)",
+        ),
+        Row("its time / pycolmap's", f"{ours / colmap:.2f}", "1.3"),
+        Row("its backward / its time", f"{back / ours:.2f}", "1"),
+        Row(
+            "its gradient to pixels, weights, camera against central differences, least squares",
+            f"{errors['none']:.0e}",
+            "1e-05",
+        ),
+        Row("the same, cauchy", f"{errors['cauchy']:.0e}", "1e-05"),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peers", type=Path, default=HERE.parents[2] / "shared" / "peers")
+    parser.add_argument("--output", type=Path, default=HERE / "solvers.md")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    problems = load_problems(arguments.peers)
+    rows = benchmark_pose(problems) + benchmark_bundle(problems)
+    lines = [
+        "| what | reached | asked for, or the peer |",
+        "|---|---|---|",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
+    print("\n".join(lines))
+    arguments.output.write_text(
+        "# Solvers\n\nOne thread, float64, medians, peers measured in turns with ours: "
+        "`python experiments/benchmarks/solvers.py`.\n\n" + "\n".join(lines) + "\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
