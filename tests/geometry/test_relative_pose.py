@@ -27,7 +27,9 @@ def test_finds_the_pose_among_wrong_matches(camera: Camera, outliers: float) -> 
         assert direction_error(result.T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 5
         torch.testing.assert_close(result.T_21[:, :3, 3].norm(dim=-1), torch.ones(1, dtype=torch.float64))
         assert float((result.inliers == scene.mask).double().mean()) > 0.9
-        assert float(result.score_essential) > float(result.score_homography) > float(result.score_rotation)
+        assert float(result.score_essential) > max(
+            float(result.score_homography), float(result.score_rotation)
+        )
 
 
 def test_is_as_good_as_poselib() -> None:

@@ -29,7 +29,7 @@ from torchslam.geometry.ransac import (
 _FIRST_ROUND = 160  # samples
 _CANDIDATES = 4  # hypotheses of each round that are optimised
 _LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
-_FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
+_FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ _TRIAL_ITERATIONS, _FINAL_ITERATIONS = (
     5,
     12,
 )  # of a homography or rotation that may not be needed; of the result
-_FINAL_WIDTH = 1.25  # thresholds; the refinement uses the tail of the noise too
+_FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
 _CLEARLY_OFF = (
     2.0  # thresholds of the transfer error, three standard deviations of noise as large as the threshold
 )
