@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchslam.features.pyramid import plan_atlas
-from torchslam.features.selection import best_per_cell, plan_grid, ranks_within, spread, true_indices
+from torchslam.features.selection import best_of_cells, plan_grid, ranks_within, spread, true_indices
 
 CPU = torch.device("cpu")
 
@@ -22,11 +22,10 @@ def test_ranks_count_within_groups(groups: list[int]) -> None:
     assert ranks == [groups[:k].count(group) for k, group in enumerate(groups)]
 
 
-def test_best_per_cell_keeps_the_highest() -> None:
+def test_best_of_cells_are_the_highest() -> None:
     cells = torch.tensor([1, 0, 1, 1, 0])
     scores = torch.tensor([5, 9, 7, 200, 9], dtype=torch.uint8)
-    assert best_per_cell(cells, scores, 1, 2).tolist() == [1, 3]
-    assert sorted(best_per_cell(cells, scores, 2, 2).tolist()) == [1, 2, 3, 4]
+    assert best_of_cells(cells, scores, 3).tolist() == [False, True, False, True, True]
 
 
 def test_atlas_levels_do_not_overlap() -> None:
@@ -64,12 +63,10 @@ def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
     cells = torch.tensor([0, 0, 0, 0, 1, 2, 3])
     everything = torch.ones(7, dtype=torch.bool)
     image = torch.zeros(7, dtype=torch.int64)
-    rows, places = spread(scores, everything, cells, image, grid, 1, 1, 4)
+    rows, places = spread(scores, everything, cells, image, grid, 1, 4)
     assert rows[places.argsort()].tolist() == [0, 6, 5, 4]
-    rows, _ = spread(scores, everything, cells, image, grid, 0, 1, 4)
-    assert sorted(rows.tolist()) == [0, 1, 2, 3]
-    # Weak corners fill no more than their cell's first places.
-    rows, _ = spread(scores, ~everything, cells, image, grid, 1, 1, 7)
+    # Weak corners are taken only as the best of their cell.
+    rows, _ = spread(scores, ~everything, cells, image, grid, 1, 7)
     assert sorted(rows.tolist()) == [0, 4, 5, 6]
 
 
@@ -80,5 +77,5 @@ def test_spread_gives_unused_budget_to_other_levels() -> None:
     cells = torch.full((9,), level_1)
     scores = torch.arange(9.0)
     image = torch.zeros(9, dtype=torch.int64)
-    rows, _ = spread(scores, scores >= 0, cells, image, grid, 1, 1, 10)
+    rows, _ = spread(scores, scores >= 0, cells, image, grid, 1, 10)
     assert len(rows) == 9

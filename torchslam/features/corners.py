@@ -62,21 +62,29 @@ def harris_responses(patches: Tensor) -> Tensor:
     return responses.unflatten(-1, (side - 8, side - 8))
 
 
+@lru_cache(maxsize=8)
+def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """(9, 5): 3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the centre."""
+    slope, bend, ones = torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([1.0, -2.0, 1.0]), torch.ones(3)
+    fits = [
+        torch.outer(ones, slope) / 6,
+        torch.outer(slope, ones) / 6,
+        torch.outer(ones, bend) / 3,
+        torch.outer(bend, ones) / 3,
+        torch.outer(slope, slope) / 4,
+    ]
+    return torch.stack(fits, dim=-1).view(9, 5).to(device=device, dtype=dtype)
+
+
 def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
-    """Offset (x, y) of the maximum of the paraboloid through the 3x3 responses, in pixels from the centre.
+    """Offset (x, y) of the maximum of the paraboloid fitted to 3x3 responses, in pixels from the centre.
 
     responses: (N, 3, 3). Returns (N, 2), within +-limit; zero where the fit has no maximum.
     """
-    r = responses / responses.abs().amax(dim=(1, 2), keepdim=True).clamp_min(
-        torch.finfo(responses.dtype).tiny
-    )
-    columns, rows = r.sum(1), r.sum(2)
-    gx, gy = (columns[:, 2] - columns[:, 0]) / 6, (rows[:, 2] - rows[:, 0]) / 6
-    gxx = (columns[:, 2] + columns[:, 0] - 2 * columns[:, 1]) / 3
-    gyy = (rows[:, 2] + rows[:, 0] - 2 * rows[:, 1]) / 3
-    gxy = (r[:, 0, 0] + r[:, 2, 2] - r[:, 0, 2] - r[:, 2, 0]) / 4
-    determinant = gxx * gyy - gxy * gxy
-    peaked = (gxx + gyy < 0) & (determinant > 1e-9)
+    fit = responses.flatten(1) @ _paraboloid_fit(responses.device, responses.dtype)
+    gx, gy, gxx, gyy, gxy = fit.unbind(-1)
+    determinant, trace = gxx * gyy - gxy * gxy, gxx + gyy
+    peaked = (trace < 0) & (determinant > 1e-6 * trace * trace)
     determinant = torch.where(peaked, determinant, torch.ones_like(determinant))
     offset = torch.stack([gxy * gy - gyy * gx, gxy * gx - gxx * gy], dim=-1) / determinant[:, None]
     return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-limit, limit)

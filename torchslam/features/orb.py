@@ -14,7 +14,7 @@ from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
 from torchslam.features.fast import fast_scores, find_peaks, patch_scores
 from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
-from torchslam.features.selection import Grid, best_per_cell, plan_grid, spread, true_indices
+from torchslam.features.selection import Grid, best_of_cells, plan_grid, spread, true_indices
 from torchslam.types import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
@@ -22,15 +22,13 @@ HARRIS_RADIUS = 4  # of the patch that a Harris response needs
 FAST_RADIUS = 3  # of the circle
 SOFT_RADIUS = 1  # of the soft arg-max
 PER_CELL = 8  # keypoints of a cell if they were spread evenly
-GUARANTEED = 1  # of them, those a cell gives whatever its contrast; the others must beat those of other cells
-CANDIDATES = 5 * PER_CELL  # corners of a cell that are ranked
 
 
 @dataclass(frozen=True)
 class Corners:
     """The chosen corners of a batch of images, K in all, and the pyramid they were found in.
 
-    levels:    (B, 1, h, w) floats per level
+    levels:    (B, 1, h, w) floats per level, grey values of 0 to 255 plus a half
     pixels:    (B * rows * stride,) uint8, the flattened atlases
     positions: (K,) int64 into pixels
     slots:     (K,) int64, row in the flattened (B, num_keypoints) table
@@ -148,15 +146,18 @@ class ORB(nn.Module):
         area, num_cells = grid.table.shape[0], grid.levels.shape[0]
         batch = pixels.shape[0] // area
         image, cell = positions // area, grid.table[positions % area].to(torch.int64)
-        kept = best_per_cell(image * num_cells + cell, scores[positions], CANDIDATES, batch * num_cells)
-        positions, image, cell = positions[kept], image[kept], cell[kept]
-        strong = scores[positions] > self.threshold
+        fast = scores.index_select(0, positions)
+        strong = fast > self.threshold
+        kept = (
+            (strong | best_of_cells(image * num_cells + cell, fast, batch * num_cells)).nonzero().squeeze(1)
+        )
+        positions, image, cell, strong = positions[kept], image[kept], cell[kept], strong[kept]
         if self.ranking == "harris":
             patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)
             strengths = harris_responses(patches.to(torch.float32)).flatten()
         else:
             strengths = _stand_out(gather_patches(scores, positions, stride, 1).to(torch.float32))
-        rows, places = spread(strengths, strong, cell, image, grid, GUARANTEED, batch, self.num_keypoints)
+        rows, places = spread(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
 
     def _refine(self, corners: Corners) -> tuple[Tensor, Tensor]:
@@ -168,7 +169,7 @@ class ORB(nn.Module):
         if not self.differentiable:
             return quadratic_peak(corners.fast.to(torch.float32)), corners.strengths
         radius = FAST_RADIUS + SOFT_RADIUS  # just what the Harris response of the centre needs
-        patches = 255 * gather_level_patches(corners.levels, corners.image, corners.level, corners.xy, radius)
+        patches = gather_level_patches(corners.levels, corners.image, corners.level, corners.xy, radius)
         fast = patch_scores(patches)
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
@@ -180,7 +181,7 @@ def _stand_out(fast: Tensor) -> Tensor:
 
     fast: (K, 3, 3) scores, below 256. Returns (K,).
     """
-    return fast[:, 1, 1] + (fast[:, 1, 1] - fast.mean(dim=(1, 2))) / 256
+    return fast[:, 1, 1] + (fast[:, 1, 1] - fast.flatten(1).mean(1)) / 256
 
 
 def check_images(images: Tensor) -> None:

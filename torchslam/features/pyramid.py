@@ -55,22 +55,24 @@ def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) ->
 
 
 def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:
-    """The pyramid: (B, 1, H, W) -> one (B, 1, h, w) per level, each resized bilinearly from the one before."""
-    levels = [images]
+    """The pyramid in grey values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
+
+    images: (B, 1, H, W) in [0, 1]. Returns one (B, 1, h, w) per level; cutting off what follows the point rounds.
+    """
+    levels = [images * 255 + 0.5]
     for size in atlas.sizes[1:]:
         levels.append(F.interpolate(levels[-1], size=size, mode="bilinear", align_corners=False))
     return levels
 
 
 def fill_atlas(levels: list[Tensor], atlas: Atlas) -> Tensor:
-    """Levels with values in [0, 1] quantised to bytes at their places: (B, rows, stride) uint8."""
+    """Levels rounded to bytes at their places: (B, rows, stride) uint8."""
     filled = torch.zeros(
         levels[0].shape[0], atlas.rows, atlas.stride, dtype=torch.uint8, device=levels[0].device
     )
     for level, (top, left), (h, w) in zip(levels, atlas.corners, atlas.sizes, strict=True):
         # Through int16: torch converts float to int16 and int16 to bytes with vector instructions.
-        quantised = level[:, 0].mul(255).add_(0.5).to(torch.int16)
-        filled[:, top : top + h, left : left + w] = quantised
+        filled[:, top : top + h, left : left + w] = level[:, 0].to(torch.int16)
     return filled
 
 

@@ -77,9 +77,9 @@ def true_indices(mask: Tensor) -> Tensor:
     """Positions where a flat boolean mask is true, ascending: eight entries are looked at together, as few are true."""
     whole = mask.shape[0] // 8 * 8
     words = mask[:whole].view(torch.int64).nonzero().squeeze(1)
-    hits = mask[:whole].view(-1, 8).index_select(0, words).nonzero()
+    hits = mask[:whole].view(-1, 8).index_select(0, words).view(-1).nonzero().squeeze(1)
     tail = mask[whole:].nonzero().squeeze(1) + whole
-    return torch.cat([words[hits[:, 0]] * 8 + hits[:, 1], tail])
+    return torch.cat([words[hits >> 3] * 8 + (hits & 7), tail])
 
 
 def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
@@ -92,28 +92,18 @@ def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
     return ranks
 
 
-def best_per_cell(cells: Tensor, scores: Tensor, count: int, num_cells: int) -> Tensor:
-    """Rows that are among the `count` best of their cell: (N,) int64, (N,) uint8 -> (K,) int64, by cell."""
-    order = torch.argsort(cells * 256 + (255 - scores.to(torch.int64)), stable=True)
-    sizes = torch.bincount(cells, minlength=num_cells)
-    starts = sizes.cumsum(0) - sizes
-    ranks = torch.arange(order.shape[0], device=order.device) - starts[cells[order]]
-    return order[ranks < count]
+def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
+    """Whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
+    best = scores.new_zeros(num_cells).scatter_reduce(0, cells, scores, "amax")
+    return scores == best[cells]
 
 
 def spread(
-    scores: Tensor,
-    strong: Tensor,
-    cells: Tensor,
-    images: Tensor,
-    grid: Grid,
-    per_cell: int,
-    num_images: int,
-    count: int,
+    scores: Tensor, strong: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
 ) -> tuple[Tensor, Tensor]:
-    """Choose up to `count` corners per image: the best `per_cell` of every cell first, then the strongest elsewhere.
+    """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
 
-    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen beyond its cell's first ones;
+    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen beside the best of its cell;
     cells: (N,) cell within its image; images: (N,) its image. Every level first takes its budget; what levels leave
     unused goes to the best remaining corners of any level.
     Returns the chosen rows (K,) and the place (K,) of each in its image's list, 0 ... count - 1, by falling score.
@@ -121,11 +111,11 @@ def spread(
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
     rows = torch.argsort(scores, descending=True, stable=True)  # every rank below follows this order
     cells, images = cells[rows], images[rows]
-    extra = ranks_within(images * num_cells + cells, num_images * num_cells) >= per_cell
+    extra = ranks_within(images * num_cells + cells, num_images * num_cells) > 0
 
     kept = (strong[rows] | ~extra).nonzero().squeeze(1)
     rows, extra, images, levels = rows[kept], extra[kept], images[kept], grid.levels[cells[kept]]
-    # A level counts its cells' first corners, then the others; so does an image with what the levels' budgets hold.
+    # A level counts its cells' best first, then the others; so does an image with what the levels' budgets hold.
     within_level = _ranks_in_turn(images * num_levels + levels, extra, num_images * num_levels)
     within_image = _ranks_in_turn(images, within_level >= grid.budgets[levels], num_images)
     chosen = (within_image < count).nonzero().squeeze(1)
