@@ -90,14 +90,12 @@ def _constraints(basis: Tensor) -> Tensor:
     stacked = E.flatten(1, 2)  # (S, 4 * 3, 3)
     gram = (stacked @ stacked.mT).unflatten(1, (4, 3)).unflatten(3, (4, 3)).transpose(2, 3)  # E_i E_j^T
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    cubic = 2 * (gram.reshape(S, 48, 3) @ E.transpose(1, 2).flatten(2)).unflatten(1, (16, 3)).unflatten(
-        3, (4, 3)
-    )
-    cubic = cubic.transpose(2, 3) - trace.reshape(S, 16, 1, 1, 1) * E[:, None]  # (S, ij, k, 3, 3)
+    traceless = 2 * gram - trace[..., None, None] * torch.eye(3, dtype=E.dtype, device=E.device)
+    cubic = (traceless.reshape(S, 48, 3) @ E.transpose(1, 2).reshape(S, 3, 12)).unflatten(1, (16, 3))
+    cubic = cubic.unflatten(3, (4, 3)).permute(0, 2, 4, 1, 3).reshape(S, 9, 64)
     normals = torch.linalg.cross(E[:, :, None, 1], E[:, None, :, 2].expand(S, 4, 4, 3), dim=-1)
-    determinant = normals.flatten(1, 2) @ E[:, :, 0].mT
-    products = torch.cat((cubic.reshape(S, 64, 9), determinant.reshape(S, 64, 1)), dim=-1)
-    return products.mT @ _monomials(basis.dtype, basis.device)
+    determinant = (normals.flatten(1, 2) @ E[:, :, 0].mT).reshape(S, 1, 64)
+    return torch.cat((cubic, determinant), dim=1) @ _monomials(basis.dtype, basis.device)
 
 
 def _elimination(constraints: Tensor) -> Tensor:

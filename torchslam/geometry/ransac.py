@@ -13,8 +13,8 @@ from torchslam.geometry.least_squares import State
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
 _SAMPLES_AT_ONCE = 1024
-# Many models are compared on this many rows first, and this many of them on all.
-_PREVIEW_ROWS, _PREVIEW_MODELS = 80, 32
+# From this many residuals on, models are compared on some rows first, and some models then on all.
+_PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 
 
 def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
@@ -51,7 +51,8 @@ def best_models(
 
     score: (models (B, M, D), row numbers (B, n) or None for all) -> (B, M); valid: (B, M); mask: (B, N).
     """
-    if mask.shape[1] < 2 * _PREVIEW_ROWS or models.shape[1] < 2 * _PREVIEW_MODELS:
+    few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
+    if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
         return torch.where(valid, score(models, None), -1.0).topk(count, dim=1).indices
     rows = sample_minimal(mask, _PREVIEW_ROWS, 1, generator)[:, 0]
     preview = torch.where(valid, score(models, rows), -1.0).topk(_PREVIEW_MODELS, dim=1).indices
