@@ -46,8 +46,7 @@ def test_robust_kernel_survives_outliers(bundle_scene, generator):
 def test_tiles_do_not_change_the_answer(bundle_scene, monkeypatch):
     scene = bundle_scene(frames=8, points=40, visible=0.3)
     one = bundle_adjust(scene.problem)
-    monkeypatch.setattr(schur, "_SINGLE_TILE_FRAMES", 1)
-    monkeypatch.setattr(schur, "_MIN_TILE_POINTS", 5)
+    monkeypatch.setattr(schur, "_TILE_POINTS", 5)
     many = bundle_adjust(scene.problem)
     torch.testing.assert_close(one.T_cw, many.T_cw)
     torch.testing.assert_close(one.points_w, many.points_w)

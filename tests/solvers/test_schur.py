@@ -52,9 +52,7 @@ def random_system(generator, num_frames=5, num_points=12, num_camera=2):
 @pytest.fixture(params=["one tile", "many tiles"])
 def system(request, generator, monkeypatch):
     if request.param == "many tiles":
-        monkeypatch.setattr(schur, "_SINGLE_TILE_FRAMES", 1)
-        monkeypatch.setattr(schur, "_MIN_TILE_POINTS", 2)
-        monkeypatch.setattr(schur, "_FRAMES_PER_TILE", 1)
+        monkeypatch.setattr(schur, "_TILE_POINTS", 2)
     return random_system(generator)
 
 

@@ -18,10 +18,8 @@ from torch import Tensor
 
 from torchslam.solvers.linear import DefiniteFactor, factorize
 
-# One tile up to this many free frames; above, about this many frames begin in each.
-_FRAMES_PER_TILE = 8
-_SINGLE_TILE_FRAMES = 24
-_MIN_TILE_POINTS = 256
+# Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call.
+_TILE_POINTS = 512
 
 
 @dataclass(frozen=True)
@@ -80,22 +78,18 @@ def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, n
     linked = frame_ends[-1] if frame_ends else 0
     slots, points = frame_slots[:linked], point_index[:linked]
 
-    if num_frames <= _SINGLE_TILE_FRAMES:
-        tile_points = max(num_points, 1)
-    else:
-        tile_points = max(_MIN_TILE_POINTS, -(-num_points * _FRAMES_PER_TILE // num_frames))
-    tile_of = points // tile_points
+    tile_of = points // _TILE_POINTS
     keys, positions = torch.unique(tile_of * max(num_frames, 1) + slots, return_inverse=True)
-    num_tiles = -(-num_points // tile_points)
+    num_tiles = -(-num_points // _TILE_POINTS)
     sizes = torch.bincount(keys // max(num_frames, 1), minlength=num_tiles)  # frames per tile
     first = sizes.cumsum(0) - sizes
-    starts = torch.arange(num_tiles, device=points.device) * tile_points
-    lengths = (num_points - starts).clamp_max(tile_points)
+    starts = torch.arange(num_tiles, device=points.device) * _TILE_POINTS
+    lengths = (num_points - starts).clamp_max(_TILE_POINTS)
     storage = 3 * sizes * lengths
     offsets = storage.cumsum(0) - storage
 
     axis = torch.arange(3, device=points.device)
-    row_in_tile = (points % tile_points)[:, None] * 3 + axis
+    row_in_tile = (points % _TILE_POINTS)[:, None] * 3 + axis
     coupling = offsets[tile_of][:, None] + row_in_tile * sizes[tile_of][:, None]
     coupling = coupling + (positions - first[tile_of])[:, None]
 
