@@ -42,19 +42,19 @@ def spread_bits(descriptors: Tensor, amplitude: int) -> Tensor:
     return rows.view(torch.int8).view(*descriptors.shape[:-1], 8 * descriptors.shape[-1])
 
 
-def popcount(words: Tensor) -> Tensor:
-    """Number of set bits of each int64 word, by summing neighbouring bit fields (Warren: Hacker's Delight, 2002)."""
-    words = words - ((words >> 1) & 0x5555555555555555)
-    words = (words & 0x3333333333333333) + ((words >> 2) & 0x3333333333333333)
-    words = (words + (words >> 4)) & 0x0F0F0F0F0F0F0F0F
-    return (words * 0x0101010101010101) >> 56
-
-
 def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """Hamming distance row by row: (..., D) uint8 twice, D a multiple of 8 -> (...) int64."""
+    """Hamming distance row by row: (..., D) uint8 twice, D a multiple of 8 up to 248 -> (...) int64.
+
+    Counts set bits by summing neighbouring bit fields of whole words (Warren: Hacker's Delight, 2002).
+    """
     words_1 = descriptors_1.contiguous().view(torch.int64)
     words_2 = descriptors_2.contiguous().view(torch.int64)
-    return popcount(words_1 ^ words_2).sum(-1)
+    words = words_1 ^ words_2
+    words = words - ((words >> 1) & 0x5555555555555555)
+    words = (words & 0x3333333333333333) + ((words >> 2) & 0x3333333333333333)
+    in_bytes = ((words + (words >> 4)) & 0x0F0F0F0F0F0F0F0F).sum(-1)
+    in_pairs = (in_bytes & 0x00FF00FF00FF00FF) + ((in_bytes >> 8) & 0x00FF00FF00FF00FF)
+    return ((in_pairs * 0x0001000100010001) >> 48) & 0xFFFF
 
 
 def hamming(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:

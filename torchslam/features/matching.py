@@ -123,15 +123,14 @@ def match_projected(
 
     keypoint_scales = features.scales.detach().flatten()
     if scales is not None:
-        factor = keypoint_scales[column] / scales.detach().flatten()[row]
-        near = (factor <= scale_tolerance) & (factor * scale_tolerance >= 1)
-        row, column = row[near], column[near]
+        factor = _take(keypoint_scales, column) / _take(scales.detach().flatten(), row)
+        row, column = _where((factor <= scale_tolerance) & (factor * scale_tolerance >= 1), row, column)
     if angles is not None:
-        turn = features.angles.detach().flatten()[column] - angles.detach().flatten()[row]
-        near = torch.cos(turn) >= math.cos(angle_tolerance)
-        row, column = row[near], column[near]
+        turn = _take(features.angles.detach().flatten(), column) - _take(angles.detach().flatten(), row)
+        row, column = _where(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
 
-    distances = _pair_distances(descriptors.flatten(0, 1)[row], features.descriptors.flatten(0, 1)[column])
+    rows_1, rows_2 = _take(descriptors.flatten(0, 1), row), _take(features.descriptors.flatten(0, 1), column)
+    distances = _pair_distances(rows_1, rows_2)
     best, accepted, distance = _best_of_pairs(row, column, distances, keypoint_scales, batch * rows, ratio)
     if max_distance is not None:
         accepted = accepted & (distance <= max_distance)
@@ -214,10 +213,21 @@ def _window_pairs(
     counts = torch.where(used, right - left, 0).flatten()
     run = torch.repeat_interleave(counts)
     starts = left.flatten() - (counts.cumsum(0) - counts)
-    row, column = run // spans, order[torch.arange(run.shape[0], device=run.device) + starts[run]]
-    offset = keypoints.flatten(0, 1)[column] - pixels.flatten(0, 1)[row]
-    inside = offset.square().sum(-1) <= radius.flatten()[row] ** 2
-    return row[inside], column[inside]
+    row = torch.div(run, spans, rounding_mode="floor")
+    column = _take(order, torch.arange(run.shape[0], device=run.device) + _take(starts, run))
+    offset = _take(keypoints.flatten(0, 1), column) - _take(pixels.flatten(0, 1), row)
+    return _where(offset.square().sum(-1) <= _take(radius.flatten() ** 2, row), row, column)
+
+
+def _take(values: Tensor, rows: Tensor) -> Tensor:
+    """values[rows], several times faster on the CPU."""
+    return values.index_select(0, rows)
+
+
+def _where(mask: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """The masked rows of two columns."""
+    rows = mask.nonzero().squeeze(1)
+    return _take(first, rows), _take(second, rows)
 
 
 def _pair_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
@@ -237,11 +247,12 @@ def _best_of_pairs(
     values = distances.detach()
     nearest = _lowest(row, values, rows)
     pair = torch.arange(row.shape[0], device=row.device)
-    winner = values == nearest[row]
+    winner = values == _take(nearest, row)
     # Lowest column among equals, then the pair that holds it.
     unset = torch.iinfo(torch.int64).max
-    best = row.new_full((rows,), unset).scatter_reduce(0, row[winner], column[winner], "amin")
-    chosen = column == best[row]
+    winner_row, winner_column = _where(winner, row, column)
+    best = row.new_full((rows,), unset).scatter_reduce(0, winner_row, winner_column, "amin")
+    chosen = column == _take(best, row)
     best_pair = row.new_zeros(rows).scatter(0, row[chosen], pair[chosen])
     found = best != unset
     best = torch.where(found, best, 0)
@@ -249,8 +260,9 @@ def _best_of_pairs(
     if distances.requires_grad:
         distance = torch.where(found, distances[best_pair], torch.inf)
     if ratio is not None:
-        rival = ~chosen & (scales[column] / scales[best][row] - 1).abs().lt(0.05)
-        second = _lowest(row[rival], values[rival], rows)
+        same = (_take(scales, column) / _take(scales[best], row) - 1).abs() < 0.05
+        rival_row, rival_value = _where(same & ~chosen, row, values)
+        second = _lowest(rival_row, rival_value, rows)
         found = found & (nearest < ratio * second)
     return best, found, distance
 
