@@ -1,0 +1,119 @@
+"""Errors of poses, and the methods that learned weights compete with."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from experiments.match_weights.problems import RANSAC_PX, Problems
+from experiments.match_weights.weighting import MatchWeights, propagated_variances, refine, refine_learned
+from torchslam.solvers.robust import Kernel
+
+KERNELS: tuple[Kernel, ...] = ("huber", "cauchy", "geman_mcclure", "truncated")
+SCALES = (1.0, 2.0, 4.0)
+_CHUNK = 64
+
+
+def pose_errors(T: Tensor, problems: Problems) -> Tensor:
+    """(P, 2) distance of the camera centres in metres and angle in radians; gradients are zero at zero."""
+    difference = T @ torch.linalg.inv(problems.T_true)
+    eye = torch.eye(4, dtype=T.dtype, device=T.device)
+    squared = (difference - eye)[:, :3].square()
+    # |R - I|_F = 2 sqrt(2) sin(angle / 2)
+    half_sine = (squared[..., :3].sum((-2, -1)) / 8).clamp(1e-20, 1.0).sqrt()
+    return torch.stack([squared[..., 3].sum(-1).clamp_min(1e-20).sqrt(), 2 * half_sine.asin()], -1)
+
+
+def relative_errors(errors: Tensor, problems: Problems) -> Tensor:
+    """(P,) one number for (P, 2): root of the squares of distance over the scene's depth, and angle."""
+    return torch.hypot(errors[:, 0] / problems.depths, errors[:, 1])
+
+
+@dataclass(frozen=True)
+class FixedKernel:
+    """Refinement with one kernel for all; weights are one, or 1 / scale^2 of the keypoint's level."""
+
+    kernel: Kernel
+    scale: float
+    by_level: bool = False
+
+    def __call__(self, problems: Problems) -> Tensor:
+        weights = 1 / problems.cues.scales_query.square() if self.by_level else None
+        return refine(problems, weights, self.kernel, self.scale).T_cw
+
+    def __str__(self) -> str:
+        weights = "1/scale² of the pyramid level" if self.by_level else "one"
+        return f"{self.kernel}, scale {self.scale:g}, weights {weights}"
+
+
+@dataclass(frozen=True)
+class Propagated(FixedKernel):
+    """Refinement with the inverse of the variance that follows from the triangulation: weights by hand."""
+
+    def __call__(self, problems: Problems) -> Tensor:
+        return refine(problems, 1 / propagated_variances(problems), self.kernel, self.scale).T_cw
+
+    def __str__(self) -> str:
+        return f"{self.kernel}, scale {self.scale:g}, weights from propagated variances"
+
+
+@dataclass(frozen=True)
+class Ransac:
+    """RANSAC alone, which ends in least squares over its inliers."""
+
+    threshold: float
+
+    def __call__(self, problems: Problems) -> Tensor:
+        return problems.T_ransac[:, RANSAC_PX.index(self.threshold)]
+
+    def __str__(self) -> str:
+        return f"threshold {self.threshold:g} px"
+
+
+@dataclass(frozen=True)
+class Learned:
+    network: MatchWeights
+
+    def __call__(self, problems: Problems) -> Tensor:
+        return refine_learned(self.network, problems).T_cw
+
+
+Method = FixedKernel | Ransac | Learned
+UNIFORM = FixedKernel("cauchy", 1.0)
+
+
+def candidates() -> dict[str, list[Method]]:
+    """Per competitor, all its settings; the training part chooses."""
+    grid = list(itertools.product(KERNELS, SCALES))
+    return {
+        "uniform weights": [UNIFORM],
+        "best kernel": [FixedKernel(*choice, by_level=level) for choice in grid for level in (False, True)],
+        "RANSAC": [Ransac(threshold) for threshold in RANSAC_PX],
+        "by hand": [Propagated(*choice) for choice in grid],
+    }
+
+
+@torch.no_grad()
+def errors_of(method: Method, problems: Problems) -> Tensor:
+    """(P, 2) metres and radians."""
+    parts = [problems[start : start + _CHUNK] for start in range(0, len(problems), _CHUNK)]
+    return torch.cat([pose_errors(method(part), part) for part in parts])
+
+
+def choose(methods: list[Method], parts: dict[str, Problems], at_most: int = 64) -> Method:
+    """The method whose median relative error is lowest, as a geometric mean over parts.
+
+    Takes `at_most` problems of each part, evenly spaced.
+    """
+    if len(methods) == 1:
+        return methods[0]
+    thin = [problems[:: -(-len(problems) // at_most)] for problems in parts.values()]
+
+    def score(method: Method) -> float:
+        medians = [relative_errors(errors_of(method, part), part).median() for part in thin]
+        return float(torch.stack(medians).log().mean())
+
+    return min(methods, key=score)

@@ -1,0 +1,162 @@
+"""Match weights: training through the solver learns, and does not depend on the number of processes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+from torch import Tensor
+
+from experiments.match_weights.evaluation import (
+    FixedKernel,
+    Learned,
+    Ransac,
+    choose,
+    errors_of,
+    pose_errors,
+    relative_errors,
+)
+from experiments.match_weights.problems import Cues, Problems, with_ransac
+from experiments.match_weights.training import Settings, losses, train
+from experiments.match_weights.weighting import MatchWeights, describe, propagated_variances
+from torchslam.geometry import Camera, se3_exp, transform
+
+FOCAL = 500.0
+SETTINGS = Settings(steps=20, batch=8, matches=40, learning_rate=1e-2)
+
+
+def simulated(count: int = 24, matches: int = 60, seed: int = 0) -> Problems:
+    """Problems in which the distance of descriptors tells how noisy a match is, and nothing else does."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    rays = normal(count, matches, 2).clamp(-2, 2) * 0.25
+    depths = 2 + 4 * torch.rand(count, matches, 1, generator=generator, dtype=torch.float64)
+    points = torch.cat([rays * depths, depths], -1)
+    T_true = se3_exp(0.05 * normal(count, 6))
+    camera = Camera.pinhole(FOCAL, FOCAL, 0.0, 0.0, size=(640, 480))
+    pixels, _ = camera.project(transform(T_true, points))
+    is_noisy = torch.rand(count, matches, generator=generator) < 0.6
+    pixels = pixels + torch.where(is_noisy[..., None], 2.5, 0.1) * normal(count, matches, 2)
+    one = torch.ones(count, matches, dtype=torch.float64)
+    cues = Cues(
+        distances=torch.where(is_noisy, 60.0, 10.0).double(),
+        seconds=80 * one,
+        scales_query=one,
+        scales_base=one,
+        turns=0 * one,
+        parallaxes=0.05 * one,
+        views=3 * one,
+        errors=0.5 * one,
+    )
+    problems = Problems(
+        points=points,
+        covariances=1e-8 * torch.eye(3, dtype=torch.float64).expand(count, matches, 3, 3),
+        pixels=pixels,
+        mask=torch.arange(matches).expand(count, matches) < matches - torch.arange(count)[:, None] % 7,
+        cues=cues,
+        focals=torch.full((count,), FOCAL, dtype=torch.float64),
+        T_true=T_true,
+        T_ransac=torch.empty(count, 0, 4, 4, dtype=torch.float64),
+    )
+    return with_ransac(problems)
+
+
+@pytest.fixture(scope="module")
+def problems() -> Problems:
+    return simulated()
+
+
+def test_training_lowers_the_loss_and_the_error_on_unseen_problems(problems: Problems) -> None:
+    network, unseen = MatchWeights(width=8), simulated(seed=1)
+    before = errors_of(Learned(network), unseen)
+    history = train(network, problems, SETTINGS)
+    after = errors_of(Learned(network), unseen)
+    assert sum(history[-5:]) < sum(history[:5])
+    assert relative_errors(after, unseen).median() < 0.8 * relative_errors(before, unseen).median()
+
+
+def test_the_gradient_of_the_loss_is_that_of_finite_differences(problems: Problems) -> None:
+    network, few = MatchWeights(width=4), problems[:3]
+    units = torch.full((3, 2), 1e-3, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad(losses(network, few, units).sum(), network.last.weight)
+    step = 1e-4
+    for column in range(4):
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                network.last.weight[0, column] += sign * step
+                values.append(float(losses(network, few, units).sum()))
+                network.last.weight[0, column] -= sign * step
+        assert math.isclose(
+            gradient[0, column], (values[0] - values[1]) / (2 * step), rel_tol=1e-2, abs_tol=1e-3
+        )
+
+
+def test_padding_changes_nothing(problems: Problems) -> None:
+    network = MatchWeights(width=4)
+    torch.nn.init.normal_(network.last.weight, generator=torch.Generator().manual_seed(0))
+    one = problems[1:2]
+    count = int(one.mask.sum())
+    short = one.thinned(torch.arange(one.mask.shape[1])[None].float(), count)
+    assert not one.mask.all()
+    assert short.mask.all()
+    weights = [network(describe(x), propagated_variances(x), x.mask) for x in (one, short)]
+    torch.testing.assert_close(weights[0][:, :count], weights[1])
+    assert (weights[0][:, count:] == 0).all()
+
+
+def test_errors_of_known_poses(problems: Problems) -> None:
+    xi = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64)
+    turned = pose_errors(se3_exp(xi) @ problems.T_true, problems)
+    torch.testing.assert_close(turned[:, 1], torch.full_like(turned[:, 1], 0.3))
+    moved = pose_errors(problems.T_true @ se3_exp(torch.tensor([0, 0.2, 0, 0, 0, 0.0]).double()), problems)
+    torch.testing.assert_close(moved[:, 0], torch.full_like(moved[:, 0], 0.2))
+
+
+def test_the_best_setting_is_chosen(problems: Problems) -> None:
+    options = [Ransac(1.5), FixedKernel("truncated", 0.01), FixedKernel("cauchy", 0.5)]
+    chosen = choose(options, {"all": problems})
+    scores = [relative_errors(errors_of(option, problems), problems).median() for option in options]
+    assert chosen == options[int(torch.stack(scores).argmin())]
+
+
+def test_problems_survive_saving(problems: Problems, tmp_path: Path) -> None:
+    problems.save(tmp_path / "folder" / "problems.pt")
+    loaded = Problems.load(tmp_path / "folder" / "problems.pt")
+    assert torch.equal(loaded.points, problems.points)
+    assert torch.equal(loaded.cues.distances, problems.cues.distances)
+
+
+def _train_as(rank: int, ranks: int, store: str, out: str) -> None:
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=ranks)
+    network = MatchWeights(width=8)
+    history = train(network, simulated(), Settings(steps=3, batch=8, matches=40))
+    torch.save((history, network.state_dict()), f"{out}.{rank}")
+    dist.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_one_and_two_processes_give_the_same_bytes(problems: Problems, tmp_path: Path) -> None:
+    network = MatchWeights(width=8)
+    history = train(network, problems, Settings(steps=3, batch=8, matches=40))
+    mp.start_processes(
+        _train_as, (2, str(tmp_path / "store"), str(tmp_path / "out")), nprocs=2, start_method="spawn"
+    )
+    for rank in range(2):
+        other_history, other_state = torch.load(tmp_path / f"out.{rank}", weights_only=True)
+        assert other_history == history
+        for name, value in network.state_dict().items():
+            assert torch.equal(other_state[name], value), name
+
+
+def test_shards_must_divide_among_processes(problems: Problems) -> None:
+    with pytest.raises(ValueError, match="does not divide"):
+        train(MatchWeights(width=4), problems, Settings(steps=1, batch=6))
