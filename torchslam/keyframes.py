@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from torchslam.config import KeyframesConfig
@@ -18,22 +16,24 @@ def why_keyframe(
 ) -> str:
     """Why a tracked frame should become a keyframe, in words; empty when it should not.
 
-    It is compared with its reference keyframe, the one that shares most points with it: by translation as a share
-    of the depth of the scene, by rotation, and by the points that both see.
+    Because no keyframe around is near it, in translation (as a share of the depth of the scene) and in rotation; or
+    because it sees few of the points of its reference keyframe, the one that shares most points with it.
     """
-    newest = int(slam_map.keyframes["frame_index"][-1])
-    age = view.index - newest
+    newest = slam_map.num_keyframes - 1
+    age = view.index - int(slam_map.keyframes["frame_index"][newest])
     if age < max(1, settings.min_interval):
         return ""
-    T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[tracker.reference])
+    around = torch.cat([tracker.local_keyframes, tracker.local_keyframes.new_tensor([newest])])
+    T_ck = tracked.T_cw @ se3_inverse(slam_map.T_cw[around])
     depth = transform(tracked.T_cw, slam_map.positions_w[tracked.point_ids])[:, 2].median()
-    translation = float(torch.linalg.vector_norm(T_cr[:3, 3]) / depth)
-    rotation = math.degrees(float(torch.linalg.vector_norm(so3_log(T_cr[:3, :3]))))
+    translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
+    rotation = torch.rad2deg(torch.linalg.vector_norm(so3_log(T_ck[:, :3, :3]), dim=-1))
+    has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
     overlap = tracked.inliers / max(tracker.reference_size, 1)
-    if translation > settings.max_translation:
-        return f"moved by {translation:.2f} of the depth of the scene"
-    if rotation > settings.max_rotation_deg:
-        return f"turned by {rotation:.1f} degrees"
+    if bool((has_moved | has_turned).all()):
+        if bool(has_moved.all()):
+            return f"moved by {float(translation.min()):.2f} of the depth of the scene"
+        return f"turned by {float(rotation[~has_moved].min()):.1f} degrees"
     if overlap < settings.min_overlap:
         return f"sees {overlap:.0%} of the points of its reference keyframe"
     return ""
