@@ -38,7 +38,9 @@ format: $(INSTALLED_DEV)  ## rewrite the sources in the house style
 	$(BIN)/ruff format .
 
 benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against the peers
-	$(BIN)/python experiments/benchmarks/run.py
+	$(BIN)/python -m experiments.benchmarks.features
+	$(BIN)/python -m experiments.benchmarks.geometry
+	$(BIN)/python -m experiments.benchmarks.solvers
 
 clean:  ## remove results and caches, keep the environment
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
