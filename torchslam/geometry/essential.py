@@ -38,8 +38,9 @@ def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
         B = _elimination(_constraints(basis))
         z, sample = _real_roots(_determinant(B))
         # B(z) [x, y, 1]^T = 0: the null vector is the largest cross product of two rows.
-        powers = torch.stack((torch.ones_like(z), z, z * z, z * z * z, z * z * z * z), dim=-1)
-        rows = (B[sample] @ powers[:, None, :, None]).squeeze(-1)
+        b_0, b_1, b_2, b_3, b_4 = B[sample].unbind(-1)
+        at = z[:, None, None]
+        rows = b_0 + at * (b_1 + at * (b_2 + at * (b_3 + at * b_4)))
         rows = rows / rows.norm(dim=-1, keepdim=True)
         normals = torch.linalg.cross(rows, rows.roll(1, dims=-2), dim=-1)
         largest = (normals * normals).sum(-1).argmax(-1)
@@ -88,11 +89,12 @@ def _constraints(basis: Tensor) -> Tensor:
     S = len(basis)
     E = basis.unflatten(-1, (3, 3))
     stacked = E.flatten(1, 2)  # (S, 4 * 3, 3)
-    gram = (stacked @ stacked.mT).unflatten(1, (4, 3)).unflatten(3, (4, 3)).transpose(2, 3)  # E_i E_j^T
-    trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    traceless = 2 * gram - trace[..., None, None] * torch.eye(3, dtype=E.dtype, device=E.device)
-    cubic = (traceless.reshape(S, 48, 3) @ E.transpose(1, 2).reshape(S, 3, 12)).unflatten(1, (16, 3))
-    cubic = cubic.unflatten(3, (4, 3)).permute(0, 2, 4, 1, 3).reshape(S, 9, 64)
+    gram = (stacked @ stacked.mT).view(S, 4, 3, 4, 3).transpose(2, 3).reshape(S, 16, 9)  # E_i E_j^T
+    trace = gram[..., 0] + gram[..., 4] + gram[..., 8]
+    eye = torch.eye(3, dtype=E.dtype, device=E.device).flatten()
+    traceless = torch.addcmul(2 * gram, trace[..., None], eye, value=-1).view(S, 48, 3)
+    cubic = (traceless @ E.transpose(1, 2).reshape(S, 3, 12)).view(S, 16, 3, 4, 3)
+    cubic = cubic.permute(0, 2, 4, 1, 3).reshape(S, 9, 64)
     normals = torch.linalg.cross(E[:, :, None, 1], E[:, None, :, 2].expand(S, 4, 4, 3), dim=-1)
     determinant = (normals.flatten(1, 2) @ E[:, :, 0].mT).reshape(S, 1, 64)
     return torch.cat((cubic, determinant), dim=1) @ _monomials(basis.dtype, basis.device)
