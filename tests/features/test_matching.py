@@ -242,7 +242,7 @@ def test_match_projected_equals_the_loop(floats: int | None, guided: bool, seed:
     second = disturbed(query, seed + 1)
     g = torch.Generator().manual_seed(seed + 2)
     pixels = query.keypoints + torch.randn(2, 25, 2, generator=g) * 4
-    pixels[0, 0] = -1e4  # far outside of the image
+    pixels[0, 0], pixels[1, 0], pixels[1, 1] = -1e4, 1e30, math.nan
     radius = size * torch.rand(2, 25, generator=g)
     limit = 60 if floats is None else 0.3
     extras = {"scales": query.scales, "angles": query.angles} if guided else {}

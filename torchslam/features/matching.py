@@ -20,6 +20,7 @@ _AMPLITUDE = 64
 _INDEX_BITS = 13
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
+_FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
 
 
@@ -190,6 +191,8 @@ def _window_pairs(
     Keypoints are sorted by band of _BAND rows, then by x: what a window takes of a band is one run in that order.
     """
     batch = mask.shape[0]
+    mask = mask & (pixels.abs().amax(-1) < _FAR)  # false for NaN as well
+    pixels = torch.where(mask[..., None], pixels, 0)
     low_band, high_band = (torch.floor((pixels[..., 1] + sign * radius) / _BAND) for sign in (-1, 1))
     keypoint_band = torch.floor(keypoints[..., 1] / _BAND)
     # A lone number per (image, band), with room between images for windows that leave the image.
