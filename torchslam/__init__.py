@@ -5,6 +5,7 @@ run = torchslam.SLAM(sequence.camera).run(sequence)
 torchslam.evaluate(run.trajectory, sequence.groundtruth).ate_m
 """
 
+from torchslam.clip import ClipPoses, ClipSLAM
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.errors import TorchslamError
@@ -25,6 +26,8 @@ __all__ = [
     "SLAM",
     "BundleProblem",
     "Camera",
+    "ClipPoses",
+    "ClipSLAM",
     "Config",
     "Features",
     "Frame",

@@ -1,0 +1,154 @@
+"""Training through short clips: right gradients to the front end, and an ordinary loop that learns."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc, still
+from torchslam import ORB, Camera, ClipSLAM, Features, load_config, open_sequence
+from torchslam.evaluation import ate, rpe
+from torchslam.features import SimulatedFeatures
+
+FRAMES = 10
+CONFIG = load_config(None, ["bundle.final_iterations=30"])
+
+
+class BentEyes(nn.Module):
+    """A front end that knows the scene, and sees it through a lens it does not know: a bend of 0 would be right."""
+
+    def __init__(self, walk: Walk, bend: float, noise_px: float = 0.2) -> None:
+        super().__init__()
+        self.bend = nn.Parameter(torch.tensor(bend, dtype=torch.float64))
+        poses = true_T_cw(walk)
+        scene = SimulatedFeatures(
+            poses,
+            walk.camera,
+            num_keypoints=300,
+            points_per_view=150,
+            depth_near=1.0,
+            depth_far=5.0,
+            noise_px=noise_px,
+        )
+        frames = [scene(pose, index) for index, pose in enumerate(poses)]
+        self.exact = Features(*(torch.cat([getattr(f, c.name) for f in frames]) for c in fields(Features)))
+
+    def forward(self, images: Tensor) -> Features:
+        away = self.exact.keypoints - self.exact.keypoints.new_tensor([159.5, 119.5])
+        squared_radius = (away / 200).square().sum(-1, keepdim=True)
+        return replace(self.exact, keypoints=self.exact.keypoints + self.bend * squared_radius * away)
+
+
+def clip_of(walk: Walk) -> tuple[Tensor, Tensor]:
+    """Images (T, 1, H, W) and true poses (T, 4, 4)."""
+    return torch.cat([walk.image(index) for index in range(len(walk))]), true_T_cw(walk)
+
+
+def derivative(loss: object, value: float, h: float) -> float:
+    """Central difference of a function of one number."""
+    assert callable(loss)
+    with torch.no_grad():
+        return float(loss(value + h) - loss(value - h)) / (2 * h)
+
+
+def test_the_gradient_to_a_front_end_is_that_of_finite_differences() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.01)
+    clip_slam = ClipSLAM(eyes, config=CONFIG)
+
+    def loss(bend: float) -> Tensor:
+        with torch.no_grad():
+            eyes.bend.fill_(bend)
+        poses = clip_slam(images, walk.camera)
+        return ate(poses.T_cw, truth, poses.posed) + rpe(poses.T_cw, truth, mask=poses.posed)[1]
+
+    loss(0.01).backward()
+    assert eyes.bend.grad is not None
+    assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
+
+
+def test_the_gradient_to_weights_and_camera_is_that_of_finite_differences() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.01)
+
+    def loss(falloff: Tensor | float, focal: Tensor | float) -> Tensor:
+        def weigh(features: Features) -> Tensor:
+            away = features.keypoints.detach() - features.keypoints.new_tensor([159.5, 119.5])
+            return torch.exp(-falloff * (away / 200).square().sum(-1))
+
+        camera = Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
+        poses = ClipSLAM(eyes, weigh, CONFIG)(images, camera)
+        return ate(poses.T_cw, truth, poses.posed)
+
+    falloff = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
+    loss(falloff, focal).backward()
+    assert falloff.grad is not None
+    assert focal.grad is not None
+    assert float(falloff.grad) == pytest.approx(derivative(lambda x: loss(x, 400.0), 1.0, 1e-3), rel=1e-3)
+    assert float(focal.grad) == pytest.approx(derivative(lambda x: loss(1.0, x), 400.0, 1e-2), rel=1e-2)
+
+
+def test_a_training_loop_finds_the_lens() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.02, noise_px=0.05)
+    clip_slam = ClipSLAM(eyes)
+    optimizer = torch.optim.Adam(clip_slam.parameters(), 0.004)
+    losses = []
+    for _ in range(6):
+        optimizer.zero_grad()
+        poses = clip_slam(images, walk.camera)
+        assert poses.posed.all()
+        loss = ate(poses.T_cw, truth, poses.posed)
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.3 * losses[0]
+    assert abs(float(eyes.bend.detach())) < 0.01
+
+
+def test_the_gradient_reaches_the_images() -> None:
+    room = open_sequence("synthetic:room").part(0, 40, 8)
+    images = torch.cat([room.image(index) for index in range(len(room))]).requires_grad_()
+    truth = torch.stack([pose for index in range(len(room)) if (pose := room.pose(index)) is not None])
+    poses = ClipSLAM(ORB(400, differentiable=True))(images, room.camera)
+    assert poses.posed.all()
+    error = ate(poses.T_cw, truth, poses.posed)
+    assert float(error.detach()) < 0.05 * float((truth[1:] - truth[:-1])[:, :3, 3].norm(dim=-1).sum())
+    error.backward()
+    assert images.grad is not None
+    assert torch.isfinite(images.grad).all()
+    assert (images.grad.abs().sum((1, 2, 3)) > 0).all()
+
+
+def test_a_clip_without_a_map_has_no_pose_and_a_gradient_of_zero() -> None:
+    walk = Walk(still(4))
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.02)
+    poses = ClipSLAM(eyes)(images, walk.camera)
+    assert not poses.posed.any()
+    assert poses.graphs == poses.solutions == (None,)
+    assert torch.equal(poses.T_cw, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
+    loss = ate(poses.T_cw, truth, poses.posed) + rpe(poses.T_cw, truth, mask=poses.posed)[1]
+    loss.backward()
+    assert eyes.bend.grad == 0
+
+
+def test_a_batch_is_its_clips() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    one, two = clip_slam(images, walk.camera), clip_slam(torch.stack([images, images]), walk.camera)
+    assert two.T_cw.shape == (2, FRAMES, 4, 4)
+    assert torch.equal(two.T_cw, torch.stack([one.T_cw, one.T_cw]))
+    assert torch.equal(two.posed, torch.stack([one.posed, one.posed]))
+    assert len(two.graphs) == len(two.solutions) == 2
+    with pytest.raises(ValueError, match="images must be"):
+        clip_slam(images[0], walk.camera)
