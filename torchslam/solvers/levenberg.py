@@ -90,7 +90,7 @@ def minimize(
         estimate, decrease = problem.step(model, damping)
         share = decrease.detach() / model.cost.detach()
         trial = problem.evaluate(estimate, share < _NEAR)
-        accept = active & share.isfinite() & (trial.cost <= slack * model.cost)
+        accept = active & (share < torch.inf) & (trial.cost <= slack * model.cost)
         steps = steps + active
         active = active & (share > tolerance) & (model.cost.detach() > rounding**1.5 * initial_cost)
         model = problem.select(accept, trial, model)

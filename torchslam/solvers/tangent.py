@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry.lie import rigid, skew
+from torchslam.geometry.lie import skew
 
 
 def retract(T: Tensor, xi: Tensor) -> Tensor:
@@ -14,10 +14,12 @@ def retract(T: Tensor, xi: Tensor) -> Tensor:
     C agrees with the exponential to second order, is a rotation to rounding for any omega, and is rational: no
     trigonometry, no special case at zero, a fraction of the operations.
     """
-    half = skew(0.5 * xi[..., 3:])
-    twice = 2 / (1 + 0.25 * xi[..., 3:].square().sum(-1))
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
-    return rigid(eye + twice[..., None, None] * (half + half @ half), xi[..., :3]) @ T
+    half, columns = 0.5 * xi[..., 3:, None], T[..., :3, :]
+    twice = 2 / (1 + half.square().sum((-2, -1), keepdim=True))
+    once = torch.linalg.cross(half.expand_as(columns), columns, dim=-2)
+    turned = columns + twice * (once + torch.linalg.cross(half.expand_as(columns), once, dim=-2))
+    moved = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    return torch.cat((moved, T[..., 3:, :]), dim=-2)
 
 
 def pull_back(T: Tensor, grad_T: Tensor) -> Tensor:
