@@ -38,7 +38,7 @@ SEQUENCES = (
 )
 FEATURES = ("simulated", "orb")
 HEADER = ["sequence", "features", "posed", "start", "keyframes", "points", "ATE (m)", "path (m)", "ATE / path",
-          "RPE (m)", "RPE (°)", "frames/s"]  # fmt: skip
+          "RPE (m)", "RPE (°)"]  # fmt: skip
 
 
 def main() -> None:
@@ -49,18 +49,20 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("results/paper"), metavar="DIR")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows, pictures = [], []
+    rows, failures, pictures = [], [], []
     for sequence in find(options.names or SEQUENCES):
         shown = []
         for kind in FEATURES:
             directory = options.output / f"{sequence.name}_{kind}"
             figures = run(sequence, load_config(CONFIG, [f"features.kind={kind}"]), directory)
             rows.append(row(sequence.name, kind, figures))
-            print(*rows[-1], sep="\t", flush=True)
+            if figures["failure"]:
+                failures.append(f"\n{sequence.name}, {kind}: {figures['failure']}.\n")
+            print(*rows[-1], figures["failure"], sep="\t", flush=True)
             shown.append(directory / PLOTS / "scene.png")
         pictures.append([sequence.name, *(picture(scene) for scene in shown)])
     if not options.names:
-        text = table(HEADER, rows) + "\n" + table(["sequence", *FEATURES], pictures)
+        text = table(HEADER, rows) + "".join(failures) + "\n" + table(["sequence", *FEATURES], pictures)
         write_between(HERE / "README.md", text)
 
 
@@ -95,7 +97,7 @@ def row(name: str, kind: str, figures: dict[str, Any]) -> list[str]:
     """One line of the table."""
     cells = [name, kind, f"{figures['posed']} of {figures['frames']}"]
     if "ate_m" not in figures:
-        return [*cells, figures["failure"] or "too few poses", *[""] * (len(HEADER) - len(cells) - 1)]
+        return [*cells, "none", *["–"] * (len(HEADER) - len(cells) - 1)]
     return [
         *cells,
         str(figures["initialised_at"]),
@@ -106,7 +108,6 @@ def row(name: str, kind: str, figures: dict[str, Any]) -> list[str]:
         f"{figures['ate_m'] / figures['path_length_m']:.1e}",
         f"{figures['rpe']['translation_m']:.2g}",
         f"{figures['rpe']['rotation_deg']:.2g}",
-        f"{figures['fps']:.1f}",
     ]
 
 
