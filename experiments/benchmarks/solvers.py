@@ -345,7 +345,7 @@ def main() -> None:
     ]
     print("\n".join(lines))
     arguments.output.write_text(
-        "# Solvers\n\nOne thread, float64, medians, peers measured in turns with ours: "
+        "# Solvers\n\nOne thread, float64, median CPU time of the process, peers measured in turns with ours: "
         "`python experiments/benchmarks/solvers.py`.\n\n" + "\n".join(lines) + "\n"
     )
 
