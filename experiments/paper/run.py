@@ -119,7 +119,7 @@ def picture(scene: Path) -> str:
     target = HERE / "pictures" / f"{name}.png"
     target.parent.mkdir(exist_ok=True)
     with Image.open(scene) as image:
-        image.convert("RGB").resize((1000, round(1000 * image.height / image.width))).quantize(64).save(
+        image.convert("RGB").resize((1000, round(1000 * image.height / image.width))).quantize(256).save(
             target
         )
     return f"![{name}](pictures/{target.name})"
