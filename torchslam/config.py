@@ -53,6 +53,8 @@ class InitializationConfig:
         0.1  # uncertainty: a point counts when its relative depth is known better than this
     )
     min_good_share: float = 0.15  # ... and this share of the matches must count
+    planar_patience: int = 10  # frames that look planar before a plane is believed
+    min_planar_share: float = 0.5  # uncertainty: ... of the matches on a plane
     min_parallax_deg: float = 3.0  # parallax: a point counts from this angle on
     min_mean_parallax_deg: float = 5.0
     min_explained: float = 0.8  # share of the frames since the reference that the start must explain

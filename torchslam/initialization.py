@@ -39,6 +39,7 @@ class Initializer:
         self.camera = camera
         self.config = config
         self.views: list[View] = []  # the reference and what came after it
+        self.planar_views = 0  # in which a plane explained the matches
 
     @property
     def reference(self) -> View:
@@ -72,12 +73,22 @@ class Initializer:
             threshold=settings.threshold_px,
             seed=self.config.seed,
         )
+        model = relative.model[0]
+        if model == "rotation":
+            return None, "the camera only turns: a rotation explains the matches"
+        self.planar_views += model == "homography"
+        if model == "homography" and self.planar_views < settings.planar_patience:
+            # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
+            return None, "the scene looks planar: a homography explains the matches"
         if not bool(relative.success[0]):
-            return None, f"no translation between the frames: {relative.model[0]} explains the matches"
+            return None, f"ambiguous motion: the {model} allows several"
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
-        return self._judge(view, relative.T_21[0], first[inliers], second[inliers])
+        least_share = settings.min_planar_share if model == "homography" else settings.min_good_share
+        return self._judge(view, relative.T_21[0], first[inliers], second[inliers], least_share)
 
-    def _judge(self, view: View, T_cw: Tensor, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
+    def _judge(
+        self, view: View, T_cw: Tensor, first: Tensor, second: Tensor, least_share: float
+    ) -> tuple[Start | None, str]:
         """Triangulate, refine both together, and count the points that are worth something."""
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
@@ -85,7 +96,7 @@ class Initializer:
         scales = torch.maximum(self.reference.scales[first], view.scales[second])
         seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
         good = is_good(seen, scales, self.camera, settings)
-        reason = why_not(good, seen, len(first), settings)
+        reason = why_not(good, seen, len(first), settings, least_share)
         if reason:
             return None, reason
         keep = torch.nonzero(good)[:, 0]
@@ -115,7 +126,9 @@ def is_good(seen: Triangulation, scales: Tensor, camera: Camera, settings: Initi
     return seen.mask & is_close & (relative_std < settings.max_depth_std)
 
 
-def why_not(good: Tensor, seen: Triangulation, matches: int, settings: InitializationConfig) -> str:
+def why_not(
+    good: Tensor, seen: Triangulation, matches: int, settings: InitializationConfig, least_share: float
+) -> str:
     """Why these points are no start; empty when they are."""
     count = int(good.sum())
     in_front = float(seen.mask.float().mean())
@@ -128,10 +141,8 @@ def why_not(good: Tensor, seen: Triangulation, matches: int, settings: Initializ
         return (
             f"too little parallax: {mean:.1f} degrees in the mean, {least} are needed" if mean < least else ""
         )
-    if count < settings.min_good_share * matches:
-        return (
-            f"depths too uncertain: {count} of {matches} known well, {settings.min_good_share:.0%} are needed"
-        )
+    if count < least_share * matches:
+        return f"depths too uncertain: {count} of {matches} known well, {least_share:.0%} are needed"
     return ""
 
 
