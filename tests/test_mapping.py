@@ -182,7 +182,9 @@ def test_scale_consistency() -> None:
     T_2w = T_1w.clone()
     T_2w[2, 3] = -2.0  # two metres ahead: the point appears twice as large
     scales = torch.tensor([2.0, 1.0, 4.0], dtype=torch.float64)
-    consistent = has_consistent_scale(points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, 8.0)
+    consistent = has_consistent_scale(
+        points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (1.0, 8.0)
+    )
     assert consistent.tolist() == [True, False, False]
 
 

@@ -51,11 +51,16 @@ def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[T
 
 
 def project_points(
-    slam_map: Map, ids: Tensor, T_cw: Tensor, camera: Camera, max_view_angle_deg: float, max_scale: float
+    slam_map: Map,
+    ids: Tensor,
+    T_cw: Tensor,
+    camera: Camera,
+    max_view_angle_deg: float,
+    scale_range: tuple[float, float],
 ) -> Projected:
     """The points (n,) in front of the camera, inside the image and seen from a similar side as before.
 
-    Expected scales stay between 1 and `max_scale`, the coarsest that the detector has.
+    Expected scales stay in `scale_range`, those that the detector has.
     """
     points = slam_map.points
     positions_w = points["positions_w"][ids]
@@ -66,7 +71,7 @@ def project_points(
     least = math.cos(math.radians(max_view_angle_deg))
     kept = torch.nonzero(valid & camera.in_image(pixels) & (cosine > least))[:, 0]
     ids = ids[kept]
-    scales = (points["reach"][ids] / distance[kept].clamp(min=1e-12)).clamp(1.0, max_scale)
+    scales = (points["reach"][ids] / distance[kept].clamp(min=1e-12)).clamp(*scale_range)
     return Projected(ids, pixels[kept], scales, points["angles"][ids])
 
 

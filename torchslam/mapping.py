@@ -88,7 +88,7 @@ class Mapper:
         view, T_cw = self.map.view(keyframe), self.map.T_cw[keyframe]
         tracking = self.config.tracking
         projected = project_points(
-            self.map, new, T_cw, self.camera, tracking.max_view_angle_deg, view.max_scale
+            self.map, new, T_cw, self.camera, tracking.max_view_angle_deg, view.scale_range
         )
         ids, keypoints = match_near(self.map, projected, view, 3.0, self.config.matching, ratio=None)
         pixels, valid = self.camera.project(transform(T_cw, self.map.positions_w[ids]))

@@ -32,7 +32,7 @@ def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Ca
     limit = settings.max_error_chi_square
     good = seen.mask & (seen.errors_1**2 < limit * scale_1**2) & (seen.errors_2**2 < limit * scale_2**2)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
-    good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.max_scale)
+    good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.scale_range)
     keep = torch.nonzero(good)[:, 0]
     ids = slam_map.add_points(seen.points_w[keep], view_1.descriptors[first[keep]], keyframe)
     slam_map.observe(keyframe, first[keep], ids)
@@ -86,11 +86,11 @@ def has_consistent_scale(
     T_2w: Tensor,
     scale_1: Tensor,
     scale_2: Tensor,
-    max_scale: float,
+    scale_range: tuple[float, float],
     factor: float = 1.8,
 ) -> Tensor:
     """(n,) whether a point's size in the two images agrees with its distances: scale falls as distance grows."""
     distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
-    expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(1.0, max_scale)
+    expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(*scale_range)
     return (scale_2 < factor * expected) & (scale_2 * factor > expected)

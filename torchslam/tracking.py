@@ -168,7 +168,7 @@ class Tracker:
 
     def _project(self, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
         max_angle = self.config.tracking.max_view_angle_deg
-        return project_points(self.map, point_ids, T_cw, self.camera, max_angle, view.max_scale)
+        return project_points(self.map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
 
     def _local_points_with(self, point_ids: Tensor) -> Tensor:
         """The local points, and those that were just matched elsewhere in the map."""

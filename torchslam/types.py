@@ -111,9 +111,10 @@ class View:
         )
 
     @property
-    def max_scale(self) -> float:
-        """The coarsest scale among the keypoints; 1 for a detector with a single scale."""
-        return float(self.scales.where(self.mask, 1.0).max())
+    def scale_range(self) -> tuple[float, float]:
+        """The finest and the coarsest scale among the keypoints; the same for a detector with a single scale."""
+        used = self.scales[self.mask]
+        return (float(used.min()), float(used.max())) if len(used) else (1.0, 1.0)
 
     @property
     def features(self) -> Features:

@@ -37,7 +37,7 @@ def test_fields_have_the_promised_shapes(name: str, file: str, width: int) -> No
     assert (features.keypoints[0][found] >= -0.5).all()
     assert (features.keypoints[0][found] <= torch.tensor([199.5, 149.5])).all()
     torch.testing.assert_close(features.descriptors[0][found].norm(dim=-1), torch.ones(int(found.sum())))
-    assert (features.scales == 1).all()
+    assert (features.scales == 2).all()
     assert not features.angles.any()
     assert all(values.isfinite().all() for values in vars(features).values())
 

@@ -1,6 +1,7 @@
 """Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
 
-The networks are kornia's. Descriptors are floats of unit length, scales are 1 and angles 0: neither network has them.
+The networks are kornia's. Descriptors are floats of unit length, angles are 0. The networks have a single scale; it is
+given as 2 pixels, about the standard deviation of their keypoints, because that is what scales stand for in weights.
 Keypoints, scores and descriptors carry gradients to the weights.
 """
 
@@ -20,6 +21,8 @@ from torchslam.errors import ConfigError
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.types import Features
+
+_SCALE = 2.0
 
 
 class XFeat(nn.Module):
@@ -121,14 +124,14 @@ class ALIKED(nn.Module):
 
 
 def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int) -> Features:
-    """Features padded to `count` rows, zero where masked, with scale 1 and angle 0."""
+    """Features padded to `count` rows, zero where masked, with one scale and angle 0."""
     missing = count - mask.shape[1]
     mask = F.pad(mask, (0, missing))
     scores = F.pad(scores, (0, missing)) * mask
     keypoints, descriptors = (
         F.pad(t, (0, 0, 0, missing)) * mask[..., None] for t in (keypoints, descriptors)
     )
-    return Features(keypoints, scores, torch.ones_like(scores), torch.zeros_like(scores), descriptors, mask)
+    return Features(keypoints, scores, torch.full_like(scores, _SCALE), torch.zeros_like(scores), descriptors, mask)
 
 
 def _read(weights: str | Path) -> dict[str, Tensor]:
