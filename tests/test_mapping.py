@@ -80,7 +80,7 @@ def test_every_observation_reprojects(slam: SLAM) -> None:
 def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     view = view_of(slam, 20)
     near = project_points(
-        slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, 1.0
+        slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
     ids, keypoints = match_near(slam.map, near, view, 1.0, CONFIG.matching, ratio=0.9)
     assert len(ids) > 150
