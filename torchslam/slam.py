@@ -16,7 +16,7 @@ from torchslam.errors import ConfigError
 from torchslam.extraction import Extractor, image_extractor
 from torchslam.geometry import Camera
 from torchslam.history import History
-from torchslam.initialization import Initializer
+from torchslam.initialization import Initializer, Start
 from torchslam.keyframes import why_keyframe
 from torchslam.map import Map
 from torchslam.mapping import Mapper
@@ -88,17 +88,23 @@ class SLAM:
         """Try to start a map, and believe it if it explains the frames that were seen on the way to it."""
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
-            if start is None:
-                return self._result(view, reason)
-            first, second = self.mapper.start(start)
-            self.tracker.follow(first)
-            explained = [self._explain(earlier) for earlier in self.initializer.views]
-            self.tracker.follow(second)
-        if sum(explained) < self.config.initialization.min_explained * len(explained):
-            self._forget_map()
-            return self._result(view, f"bad start: it explains {sum(explained)} of {len(explained)} frames")
+            if start is not None:
+                reason = self._start(start)
+        if reason:
+            return self._result(view, reason)
         self.state = State.TRACKING
         return self._result(view, "started the map", self.tracker.T_cw, is_keyframe=True)
+
+    def _start(self, start: Start) -> str:
+        """Make the first map; why it is not believed after all, or nothing."""
+        first, second = self.mapper.start(start)
+        self.tracker.follow(first)
+        explained = [self._explain(earlier) for earlier in self.initializer.views]
+        self.tracker.follow(second)
+        if sum(explained) >= self.config.initialization.min_explained * len(explained):
+            return ""
+        self._forget_map()
+        return f"bad start: it explains {sum(explained)} of {len(explained)} frames"
 
     def _explain(self, view: View) -> bool:
         """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
