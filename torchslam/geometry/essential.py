@@ -75,29 +75,47 @@ def _outer(x_2: Tensor, x_1: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(64, 20) which monomial each product of three unknowns (x, y, z or 1) belongs to."""
-    names = ["".join(sorted(product)).strip() for product in itertools.product("xyz ", repeat=3)]
+def _monomials(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The pairs of unknowns (x, y, z or 1), (2, 10), and the monomial of each product of a pair and a third.
+
+    (20, 40), with one half for pairs of equals: the coefficients of the pairs are summed over both orders.
+    """
+    pairs = list(itertools.combinations_with_replacement(range(4), 2))
     columns = _ELIMINATED + _KEPT
-    return torch.tensor(
-        [[name == column for column in columns] for name in names], dtype=dtype, device=device
-    )
+    table = torch.zeros(len(columns), len(pairs), 4, dtype=dtype, device=device)
+    for p, (i, j) in enumerate(pairs):
+        for k in range(4):
+            monomial = "".join(sorted("xyz "[index] for index in (i, j, k))).strip()
+            table[columns.index(monomial), p, k] = 0.5 if i == j else 1.0
+    return torch.tensor(pairs, device=device).T, table.flatten(1)
 
 
 def _constraints(basis: Tensor) -> Tensor:
     """Ten cubic equations: 2 E E^T E = tr(E E^T) E and det E = 0. (S, 4, 9) -> (S, 10, 20)."""
-    S = len(basis)
-    E = basis.unflatten(-1, (3, 3))
-    stacked = E.flatten(1, 2)  # (S, 4 * 3, 3)
-    gram = (stacked @ stacked.mT).view(S, 4, 3, 4, 3).transpose(2, 3).reshape(S, 16, 9)  # E_i E_j^T
-    trace = gram[..., 0] + gram[..., 4] + gram[..., 8]
-    eye = torch.eye(3, dtype=E.dtype, device=E.device).flatten()
-    traceless = torch.addcmul(2 * gram, trace[..., None], eye, value=-1).view(S, 48, 3)
-    cubic = (traceless @ E.transpose(1, 2).reshape(S, 3, 12)).view(S, 16, 3, 4, 3)
-    cubic = cubic.permute(0, 2, 4, 1, 3).reshape(S, 9, 64)
-    normals = torch.linalg.cross(E[:, :, None, 1], E[:, None, :, 2].expand(S, 4, 4, 3), dim=-1)
-    determinant = (normals.flatten(1, 2) @ E[:, :, 0].mT).reshape(S, 1, 64)
-    return torch.cat((cubic, determinant), dim=1) @ _monomials(basis.dtype, basis.device)
+    (first, second), table = _monomials(basis.dtype, basis.device)
+    E = basis.permute(1, 2, 0).contiguous().view(4, 3, 3, -1)  # the samples last
+    E_1, E_2 = E[first], E[second]
+    gram = _matrix_product(E_1, E_2.transpose(1, 2))
+    traceless = gram + gram.transpose(1, 2)
+    traceless.diagonal(dim1=1, dim2=2).sub_(gram.diagonal(dim1=1, dim2=2).sum(-1, keepdim=True))
+    cubic = _matrix_product(traceless[:, None], E)
+    normals = torch.linalg.cross(E_1[:, 1], E_2[:, 2], dim=1) + torch.linalg.cross(
+        E_2[:, 1], E_1[:, 2], dim=1
+    )
+    determinant = (normals[:, None] * E[:, 0]).sum(2)
+    rows = (
+        (table @ part.reshape(table.shape[1], -1)).view(len(table), -1, len(basis))
+        for part in (cubic, determinant)
+    )
+    return torch.cat(tuple(rows), dim=1).permute(2, 1, 0)
+
+
+def _matrix_product(A: Tensor, B: Tensor) -> Tensor:
+    """Products of 3 x 3 matrices that lie in the dimensions before the last. (..., 3, 3, S) twice."""
+    product = A[..., :, :1, :] * B[..., :1, :, :]
+    for k in (1, 2):
+        product.addcmul_(A[..., :, k : k + 1, :], B[..., k : k + 1, :, :])
+    return product
 
 
 def _elimination(constraints: Tensor) -> Tensor:

@@ -12,6 +12,8 @@ from torchslam.geometry.lie import skew
 
 State = tuple[Tensor, ...]
 
+_NUMBERS_AT_ONCE = 300_000
+
 
 def minimize(
     state: State,
@@ -45,6 +47,20 @@ def minimize(
         A, cost = _select(better, A_moved, A), torch.where(better, cost_moved, cost)
         damping = (damping * torch.where(better, 0.1, 10.0)[:, None, None]).clamp(1e-9, 1e6)
     return state, cost
+
+
+def in_parts(
+    function: Callable[..., tuple[Tensor, ...]], numbers: int, *tensors: Tensor
+) -> tuple[Tensor, ...]:
+    """function(*tensors) for a few of the problems at a time, so that what it computes stays in the cache.
+
+    numbers: how many of them the function's largest intermediate result holds per problem.
+    """
+    size = max(1, _NUMBERS_AT_ONCE // numbers)
+    if len(tensors[0]) <= size:
+        return function(*tensors)
+    parts = [function(*part) for part in zip(*(x.split(size) for x in tensors), strict=True)]
+    return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
 
 def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:

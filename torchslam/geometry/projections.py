@@ -14,7 +14,14 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchslam.geometry.least_squares import State, generators, minimize, retract_pose, small_rotation
+from torchslam.geometry.least_squares import (
+    State,
+    generators,
+    in_parts,
+    minimize,
+    retract_pose,
+    small_rotation,
+)
 from torchslam.geometry.ransac import truncated_rows, truncated_score
 
 
@@ -104,6 +111,24 @@ def fit_projections(
 
     width: in thresholds, where the error is truncated.
     """
+    T, N = len(tangent.constant) // (3 * P.shape[-1]) - 1, x.shape[1]
+
+    def fit(*part: Tensor) -> tuple[Tensor, Tensor]:
+        return _fit_part(tangent, iterations, width, *part)
+
+    return in_parts(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale, mask)
+
+
+def _fit_part(
+    tangent: Tangent,
+    iterations: int,
+    width: float,
+    P: Tensor,
+    homogeneous: Tensor,
+    x: Tensor,
+    scale: Tensor,
+    mask: Tensor,
+) -> tuple[Tensor, Tensor]:
     B, K, _, D = P.shape
     T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]
     scale = scale.mT[:, None, :, None]

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
-from torchslam.geometry.least_squares import State, generators, minimize, small_rotation
+from torchslam.geometry.least_squares import State, generators, in_parts, minimize, small_rotation
 from torchslam.geometry.lie import skew
 from torchslam.geometry.projections import (
     fit_projections,
@@ -172,8 +172,17 @@ def fit_essential(
     views: TwoViews, R: Tensor, t: Tensor, iterations: int, width: float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their truncated costs (B, K)."""
+
+    def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _fit_essential_part(iterations, width, *part)
+
+    return in_parts(fit, t.shape[1] * 6 * views.mask.shape[1], R, t, *views.epipolar, views.mask)
+
+
+def _fit_essential_part(
+    iterations: int, width: float, R: Tensor, t: Tensor, constraint: Tensor, variance: Tensor, mask: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     B, K = t.shape[:2]
-    constraint, variance = views.epipolar
     left_table, variance_table = _essential_tables(R.dtype, R.device)
     frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
 
@@ -188,7 +197,7 @@ def fit_essential(
         rows = value * inverse
         residual = rows[:, :, :1]
         J = torch.addcmul(rows[:, :, 1:], residual * inverse * inverse, spread[:, :, 1:], value=-1)
-        used, cost = truncated_rows(residual.squeeze(2).square(), views.mask, width)
+        used, cost = truncated_rows(residual.squeeze(2).square(), mask, width)
         rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, constraint.shape[-1])
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
