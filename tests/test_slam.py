@@ -54,7 +54,7 @@ def test_unit_scale_puts_the_median_depth_of_the_start_at_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("poses", "message"), [(still(20), "stands still"), (turn(20), "translation|parallax")]
+    ("poses", "message"), [(still(20), "stands still"), (turn(20), "turns|parallax|planar")]
 )
 def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, message: str) -> None:
     run = run_walk(Walk(poses), "simulated.noise_px=0.3", "simulated.depth_near=2", "simulated.depth_far=6")
