@@ -51,7 +51,8 @@ class ClipSLAM(nn.Module):
             optimizer.step()
 
     extractor: module from images (B, 1, H, W) to Features with differentiable keypoints, such as
-               ORB(differentiable=True), XFeat or ALIKED
+               ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; `train` would have their
+               normalisation follow the clip.
     weigh:     module or function from Features to (B, N), what each keypoint counts (its score, for instance), not
                negative: a factor of the inverse variance that its scale suggests. All count alike if None.
     config:    of the system; its section on features is not read
