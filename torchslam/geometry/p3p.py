@@ -24,8 +24,8 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         f, X = (x.reshape(-1, 3, 3).permute(1, 2, 0).contiguous() for x in (rays, points))
         depths, valid = _depths(f, X)
         corners = depths[:, None] * f[:, :, None]
-        frame_c, frame_w = _frame(corners), _frame(X)
-        R = torch.matmul(frame_c.permute(3, 2, 1, 0), frame_w.permute(2, 0, 1)[:, None])
+        frames = _frame(torch.cat((corners, X[:, :, None]), dim=2)).permute(3, 2, 1, 0)
+        R = torch.matmul(frames[:, :4], frames[:, 4:].mT)
         t = (corners.sum(0).permute(2, 1, 0) - (R @ X.sum(0).T[:, None, :, None]).squeeze(-1)) / 3
         valid = valid.T & torch.isfinite(t.sum(-1))
         shape = rays.shape[:-2]
@@ -34,33 +34,39 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _frame(corners: Tensor) -> Tensor:
     """The orthonormal frames of triangles, one axis after the other. (3, 3, ...) -> (axis, coordinate, ...)."""
-    a, b = corners[1] - corners[0], corners[2] - corners[0]
-    z = _cross(a, b)
-    x, z = a * a.square().sum(0).rsqrt(), z * z.square().sum(0).rsqrt()
-    return torch.stack((x, _cross(z, x), z))
+    a, b = (corners[1:] - corners[:1]).unbind(0)
+    axes = torch.stack((a, torch.linalg.cross(a, b, dim=0)))
+    x, z = axes.mul_(axes.square().sum(1, keepdim=True).rsqrt_()).unbind(0)
+    return torch.stack((x, torch.linalg.cross(z, x, dim=0), z))
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """(3, ...) twice -> (3, ...)."""
-    return a.roll(-1, 0) * b.roll(-2, 0) - a.roll(-2, 0) * b.roll(-1, 0)
-
-
-# Of a symmetric matrix the entries 00, 01, 02, 11, 12, 22 are stored; where each entry of the full one lies.
-_FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-# The adjugate's entries are differences of products of two of them.
+# Of a symmetric matrix the entries 00, 01, 02, 11, 22, 12 are stored. The entries of its adjugate are differences
+# of products of two of them.
 _ADJUGATE_PLUS, _ADJUGATE_MINUS = (
-    ((3, 5), (2, 4), (1, 4), (0, 5), (1, 2), (0, 3)),
-    ((4, 4), (1, 5), (2, 3), (2, 2), (0, 4), (1, 1)),
+    ((3, 4), (2, 5), (1, 5), (0, 4), (0, 3), (1, 2)),
+    ((5, 5), (1, 4), (2, 3), (2, 2), (1, 1), (0, 5)),
+)
+# The two conics of the pencil in multiples of the squared distance of one pair of points (12, 23, 31), and of that
+# times the cosine of the rays of a pair: (entry, pair of the distance, 0 or the pair of the cosine, factor).
+_CONICS = (
+    ((0, 2, 0, 1), (1, 2, 1, -1), (3, 2, 0, 1), (3, 1, 0, -1), (5, 1, 2, 1), (4, 1, 0, -1)),
+    ((0, 2, 0, 1), (2, 2, 3, -1), (3, 3, 0, -1), (5, 3, 2, 1), (4, 2, 0, 1), (4, 3, 0, -1)),
 )
 
 
 @lru_cache(maxsize=4)
-def _tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices of the factors of the adjugate, (4, 6); of the full matrix, (9,); of the next two axes, (2, 3)."""
-    factors = torch.tensor(
-        (*zip(*_ADJUGATE_PLUS, strict=True), *zip(*_ADJUGATE_MINUS, strict=True)), device=device
-    )
-    return factors, torch.tensor(_FULL, device=device), torch.tensor(((1, 2, 0), (2, 0, 1)), device=device)
+def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the factors of the adjugate, (24,); how often each of its entries is in the full matrix, (6, 1);
+
+    the conics as a linear function of distances times one and the cosines, (12, 12).
+    """
+    pairs = (*zip(*_ADJUGATE_PLUS, strict=True), *zip(*_ADJUGATE_MINUS, strict=True))
+    conics = torch.zeros(2, 6, 3, 4, dtype=dtype, device=device)
+    for conic, terms in zip(conics, _CONICS, strict=True):
+        for entry, distance, cosine, factor in terms:
+            conic[entry, distance - 1, cosine] = factor
+    times = torch.tensor((1, 2, 2, 1, 1, 2), dtype=dtype, device=device)
+    return torch.tensor(pairs, device=device).flatten(), times[:, None], conics.view(12, 12)
 
 
 def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,105 +76,70 @@ def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     cosine = (rays * rays.roll(-1, 0)).sum(1)
     unit = distance.sum(0)
     distance = distance / unit
-    a12, a23, a13 = distance.unbind(0)
-    b12, b23, b13 = cosine.unbind(0)
-    zero = torch.zeros_like(a12)
-
+    _, _, table = _tables(rays.dtype, rays.device)
+    products = distance[:, None] * torch.nn.functional.pad(cosine, (0, 0, 1, 0), value=1.0)
     # depths^T D depths = 0 for both
-    D_1 = torch.stack((a23, -a23 * b12, zero, a23 - a12, a12 * b23, -a12))
-    D_2 = torch.stack((a23, zero, -a23 * b13, -a13, a13 * b23, a23 - a13))
-    lines, conic, real = _line_pair(torch.stack((D_1, D_2), dim=1))
-    depths, on_conic = _intersections(lines, conic)
+    D = (table @ products.flatten(0, 1)).unflatten(0, (2, 6))
+    lines, real = _line_pair(D)
+    depths, on_conic = _intersections(lines, D[1])
 
     # Their scale follows from the sum of the three equations.
     products = depths * depths.roll(-1, 0) * cosine[:, None]
     size = 2 * (depths * depths - products).sum(0)
-    depths = depths * torch.copysign(size.rsqrt(), depths.sum(0))
+    depths = depths * torch.copysign(size.rsqrt_(), depths[2])
     depths = _polish(depths, cosine[:, None], distance[:, None])
-    return depths * unit.sqrt(), real & on_conic & (depths > 0).all(0)
+    return depths * unit.sqrt(), (depths > 0).all(0) & real & on_conic
 
 
-def _adjugate(M: Tensor, factors: Tensor) -> Tensor:
-    """Adjugate of symmetric matrices. (6, ...) -> (6, ...)."""
-    a, b, c, d = (M.index_select(0, index) for index in factors)
-    return torch.addcmul(a * b, c, d, value=-1)
+def _line_pair(D: Tensor) -> tuple[Tensor, Tensor]:
+    """The two lines of a degenerate conic in the pencil of two. (2, 6, S) -> (2, 2, S), (S,).
 
-
-def _line_pair(D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The two lines of a degenerate conic in the pencil of two. (6, 2, S) -> (3, 2, S), (9, S), (S,).
-
-    Also returns the regular one of the two conics, to intersect with, and whether the lines are real.
+    Each line as p, q of depth_1 = p depth_2 + q depth_3, in the first dimension. Also, whether the lines are real.
     """
-    factors, full, _ = _tables(D.device)
-    adjugate = _adjugate(D, factors)
-    # tr(adj(D_i) D_j), whose diagonal is 3 det(D_i)
-    traces = (adjugate[:, :, None] * D[:, None])[full].sum(0)
-    # det(low + g high): make the leading coefficient, det(high), the larger one
-    swap = traces[0, 0].abs() > traces[1, 1].abs()
-    low, high = torch.where(swap, D.flip(1), D).unbind(1)
-    (t_00, t_01), (t_10, t_11) = torch.where(swap, traces.flip(0, 1), traces)
-    leading = 3 / t_11
-    g = _cubic_root(t_10 * leading, t_01 * leading, t_00 / t_11)
-    degenerate = torch.addcmul(low, g, high)
-
-    # Richter-Gebert, "Perspectives on projective geometry", 2011: adj = -p p^T with p where the lines meet, and
-    # degenerate + [p]x has rank one, with the lines as its row and its column.
-    adjugate = _adjugate(degenerate, factors)[full].unflatten(0, (3, 3))
-    diagonal = adjugate.diagonal().mT
-    largest = diagonal.abs().argmax(0, keepdim=True)
-    pivot = diagonal.gather(0, largest)
-    x, y, z = adjugate.gather(0, largest[:, None].expand(1, 3, -1))[0] * (-pivot).clamp_min(1e-300).rsqrt()
-    zero = torch.zeros_like(x)
-    pair = degenerate[full] + torch.stack((zero, -z, y, z, zero, -x, -y, x, zero))
-    pair = pair.unflatten(0, (3, 3))
-    size = pair.abs()
-    i, j = size.amax(1).argmax(0), size.amax(0).argmax(0)
-    row, column = pair.gather(0, i.expand(1, 3, -1))[0], pair.gather(1, j.expand(3, 1, -1))[:, 0]
-    return torch.stack((column, row), dim=1), high[full], pivot[0] <= 0
+    factors, times, _ = _tables(D.dtype, D.device)
+    a, b, c, d = D.index_select(1, factors).unflatten(1, (4, 6)).unbind(1)
+    adjugate = torch.addcmul(a * b, c, d, value=-1) * times
+    # tr(adj(D_i) D_j), whose diagonal is 3 det(D_i), gives det(D_0 + g D_1)
+    traces = (adjugate[:, None] * D).sum(2)
+    zeroth, first, second = (traces / traces[1, 1]).flatten(0, 1)[:3].unbind(0)
+    g = _cubic_root(3 * second, 3 * first, zeroth)
+    conic = torch.addcmul(D[0], g, D[1])
+    # The equation is quadratic in depth_1; its discriminant, a form in the other depths, is a square.
+    squares = torch.addcmul(conic[1:3].square(), conic[:1], conic[3:5], value=-1)
+    root = squares.clamp_min(0.0).sqrt_()
+    mixed = torch.addcmul(conic[1] * conic[2], conic[0], conic[5], value=-1)
+    root = torch.stack((root[0], torch.copysign(root[1], mixed)))
+    lines = (torch.stack((root, -root), dim=1) - conic[1:3, None]) / conic[0]
+    return lines, (squares >= 0).all(0)
 
 
 def _intersections(lines: Tensor, conic: Tensor) -> tuple[Tensor, Tensor]:
-    """Where two lines meet a conic, up to scale. (3, 2, S), (9, S) -> (3, 4, S), real (4, S).
-
-    Along each line two depths, a and b, are free; the one with the largest coefficient, c, follows.
-    """
-    _, _, following = _tables(lines.device)
-    c = lines.abs().argmax(0)
-    axes = torch.stack((c, *following[:, c]))
-    l_c, l_a, l_b = lines.gather(0, axes)
-    l_a, l_b = l_a / l_c, l_b / l_c
-    pairs = 3 * axes[[0, 0, 0, 1, 1, 2]] + axes[[0, 1, 2, 1, 2, 2]]
-    cc, ca, cb, aa, ab, bb = conic[:, None].expand(9, 2, -1).gather(0, pairs)
-    A = aa + l_a * (l_a * cc - 2 * ca)
-    B = ab + l_a * (l_b * cc - cb) - l_b * ca
-    C = bb + l_b * (l_b * cc - 2 * cb)
-    discriminant = B * B - A * C
-    root = -(B + torch.copysign(discriminant.clamp_min(0.0).sqrt(), B))
-    a, b = torch.stack((root, C)), torch.stack((A, root))
-    depths = torch.stack((-(l_a * a + l_b * b), a, b))
-    depths = torch.zeros_like(depths).scatter(0, axes[:, None].expand_as(depths), depths)
+    """Where two lines meet a conic without entry 01, up to scale. (2, 2, S), (6, S) -> (3, 4, S), real (4, S)."""
+    p, q = lines
+    xx, _, xz, yy, zz, yz = conic
+    part = torch.addcmul(xz, xx, q)
+    A = torch.addcmul(yy, xx * p, p)
+    B = torch.addcmul(yz, part, p)
+    C = torch.addcmul(zz, part + xz, q)
+    discriminant = torch.addcmul(B * B, A, C, value=-1)
+    root = B.add(torch.copysign(discriminant.clamp_min(0.0).sqrt_(), B)).neg_()
+    y, z = torch.stack((root, C)), torch.stack((A, root))
+    depths = torch.stack((torch.addcmul(p * y, q, z), y, z))
     return depths.flatten(1, 2), (discriminant >= 0).repeat(2, 1)
 
 
 def _cubic_root(b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     """The real root of x^3 + b x^2 + c x + d that lies farthest from the others."""
     shift = b / 3
-    p = c - b * shift
-    q = shift * (2 * shift * shift - c) + d
-    discriminant = 0.25 * q * q + p * p * p / 27
-    # one real root: Cardano, without cancellation
-    u = 0.5 * q.abs() + discriminant.clamp_min(0.0).sqrt()
-    u = u.clamp_min(torch.finfo(b.dtype).tiny) ** (1 / 3)
-    single = u - p / (3 * u)
-    # three real roots: the outermost one, by the cosine
-    radius = (-p / 3).clamp_min(torch.finfo(b.dtype).tiny).sqrt()
-    angle = torch.acos((0.5 * q.abs() / (radius * radius * radius)).clamp_max(1.0))
-    triple = 2 * radius * torch.cos(angle / 3)
-    x = torch.copysign(torch.where(discriminant > 0, single, triple), -q) - shift
-    for _ in range(2):
-        slope = (3 * x + 2 * b) * x + c
-        x = x - (((x + b) * x + c) * x + d) / torch.where(slope == 0, 1.0, slope)
-    return x
+    p = torch.addcmul(c, b, shift, value=-1) / 3
+    half = torch.addcmul(d, shift, torch.addcmul(c, shift, shift, value=-2), value=-1) / 2
+    discriminant = torch.addcmul(half * half, p * p, p)
+    # Cardano without cancellation; with three real roots the sum is complex, and its cube root's real part counts
+    u = half.abs() + torch.complex(discriminant, torch.zeros_like(p)).sqrt_()
+    u = u.pow(1 / 3)
+    x = (u - p / u).real.copysign(-half) - shift
+    slope = torch.addcmul(c, torch.add(2 * b, x, alpha=3), x)
+    return x - torch.addcmul(d, torch.addcmul(c, x + b, x), x) / slope
 
 
 def _polish(depths: Tensor, cosine: Tensor, distance: Tensor) -> Tensor:
@@ -180,8 +151,7 @@ def _polish(depths: Tensor, cosine: Tensor, distance: Tensor) -> Tensor:
         torch.addcmul(following, cosine, depths, value=-1),
     )
     residual = depths * a + following * b - distance
-    a_2 = a.roll(-2, 0)
-    determinant = 2 * (a[0] * a[1] * a[2] + b[0] * b[1] * b[2])
-    numerator = a_2 * (a.roll(-1, 0) * residual - b * residual.roll(-1, 0))
+    determinant = 2 * (a.prod(0) + b.prod(0))
+    numerator = a.roll(-2, 0) * (a.roll(-1, 0) * residual - b * residual.roll(-1, 0))
     numerator = torch.addcmul(numerator, b * b.roll(-1, 0), residual.roll(-2, 0))
-    return depths - numerator / torch.where(determinant == 0, 1.0, determinant)
+    return depths - numerator / determinant
