@@ -14,7 +14,12 @@ from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.least_squares import State, minimize, retract_pose
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
-from torchslam.geometry.projections import fit_projections, pose_tangent, score_projections
+from torchslam.geometry.projections import (
+    fit_projections,
+    pose_tangent,
+    score_projections,
+    squared_projections,
+)
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     best_models,
@@ -170,7 +175,8 @@ class _Problem:
         P, cost = self.fit(P, _LOCAL_ITERATIONS, 1.0)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         P = P[torch.arange(len(best), device=best.device), best]
-        near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
+        squared = squared_projections(P[:, None], self.homogeneous, self.normalized, self.scale)[:, 0]
+        near = (squared < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Tensor, rows: Tensor | None) -> Tensor:

@@ -13,6 +13,7 @@ from torchslam.geometry.lie import skew
 State = tuple[Tensor, ...]
 
 _NUMBERS_AT_ONCE = 300_000
+_LEAST_ITERATIONS = 2  # before it may stop
 
 
 def minimize(
@@ -31,21 +32,20 @@ def minimize(
     """
     A, cost = evaluate(*state)
     damping = torch.full_like(cost, 1e-4)[:, None, None]
-    eye = torch.eye(A.shape[-1] - 1, dtype=A.dtype, device=A.device)
-    for _ in range(iterations):
+    eye = identity(A.shape[-1] - 1, A.dtype, A.device)
+    for iteration in range(iterations):
         H, g = A[:, :-1, :-1], A[:, :-1, -1]
         step = torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0].neg_()
         moved = retract(state, step)
-        gain = (g * step).sum(-1).abs()
-        if bool((gain <= 1e-11 * cost).all()):  # too little to be worth a check
-            return tuple(
-                _select(gain < torch.inf, new, old) for new, old in zip(moved, state, strict=True)
-            ), cost
+        if iteration >= _LEAST_ITERATIONS:
+            gain = (g * step).sum(-1).abs()
+            if bool((gain <= 1e-11 * cost).all()):  # too little to be worth a check
+                return _select(gain < torch.inf, moved, state), cost
         A_moved, cost_moved = evaluate(*moved)
         better = cost_moved < cost
-        state = tuple(_select(better, new, old) for new, old in zip(moved, state, strict=True))
-        A, cost = _select(better, A_moved, A), torch.where(better, cost_moved, cost)
-        damping = (damping * torch.where(better, 0.1, 10.0)[:, None, None]).clamp(1e-9, 1e6)
+        A, cost, *rest = _select(better, (A_moved, cost_moved, *moved), (A, cost, *state))
+        state = tuple(rest)
+        damping = damping * torch.where(better, 0.1, 10.0)[:, None, None]
     return state, cost
 
 
@@ -63,8 +63,17 @@ def in_parts(
     return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
 
-def _select(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(condition.view(-1, *(1,) * (new.dim() - 1)), new, old)
+def _select(condition: Tensor, new: State, old: State) -> State:
+    """New values where the condition holds. All batched over the first dimension."""
+    return tuple(
+        torch.where(condition.view(-1, *(1,) * (x.dim() - 1)), x, y) for x, y in zip(new, old, strict=True)
+    )
+
+
+@lru_cache(maxsize=16)
+def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(size, size)."""
+    return torch.eye(size, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=16)
@@ -78,7 +87,7 @@ def small_rotation(omega: Tensor) -> Tensor:
     W = (omega @ generators(omega.dtype, omega.device).view(3, 9)).view(-1, 3, 3)
     factor = 1 / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
     turned = torch.baddbmm(W, W, W, alpha=0.5)  # W + W^2 / 2
-    return torch.addcmul(torch.eye(3, dtype=omega.dtype, device=omega.device), factor, turned)
+    return torch.addcmul(identity(3, omega.dtype, omega.device), factor, turned)
 
 
 def retract_pose(pose: State, step: Tensor) -> State:

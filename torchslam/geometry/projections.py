@@ -22,7 +22,7 @@ from torchslam.geometry.least_squares import (
     retract_pose,
     small_rotation,
 )
-from torchslam.geometry.ransac import truncated_rows, truncated_score
+from torchslam.geometry.ransac import truncated_score
 
 
 def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, mask: Tensor) -> Tensor:
@@ -30,22 +30,26 @@ def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, 
 
     A negative depth counts as an outlier.
     """
+    return truncated_score(squared_projections(P, homogeneous, x, scale), mask)
+
+
+def squared_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor) -> Tensor:
+    """Squared errors of many mappings, infinite or NaN where the depth is negative. (B, M, 3, D) -> (B, M, N)."""
     M = P.shape[1]
     u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, M)).unbind(1)
     du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
     dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
-    # Behind the camera the error becomes infinite, or NaN.
     inverse, scale = w.clamp_min_(0.0).reciprocal_(), scale.to(w.dtype)[:, None]
     du, dv = du.mul_(inverse).mul_(scale[..., 0]), dv.mul_(inverse).mul_(scale[..., -1])
-    return truncated_score(du.square_().addcmul_(dv, dv), mask)
+    return du.square_().addcmul_(dv, dv)
 
 
 @dataclass(frozen=True)
 class Tangent:
     """How a mapping P (3, D) depends on T local parameters.
 
-    constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of P and of its T derivatives, as an affine
-    function of the entries of P, ordered by row of P, parameter, column of P
+    constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of T derivatives of P and of itself, as an affine
+    function of the entries of P
     retract: (P,), step (problems, T) -> (P,)
     """
 
@@ -64,7 +68,7 @@ class Tangent:
         """From the derivatives, an affine function of P: (3, D) -> (T, 3, D)."""
 
         def entries(P: Tensor) -> Tensor:
-            return torch.cat((P[None], derivatives(P))).transpose(0, 1).flatten()
+            return torch.cat((derivatives(P), P[None])).flatten()
 
         constant = entries(torch.zeros(3, columns, dtype=dtype, device=device))
         units = torch.eye(3 * columns, dtype=dtype, device=device).unflatten(-1, (3, columns))
@@ -116,7 +120,8 @@ def fit_projections(
     def fit(*part: Tensor) -> tuple[Tensor, Tensor]:
         return _fit_part(tangent, iterations, width, *part)
 
-    return in_parts(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale, mask)
+    P, cost = in_parts(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale * mask[..., None])
+    return P, cost
 
 
 def _fit_part(
@@ -127,24 +132,25 @@ def _fit_part(
     homogeneous: Tensor,
     x: Tensor,
     scale: Tensor,
-    mask: Tensor,
 ) -> tuple[Tensor, Tensor]:
+    """The same for a few problems, with a scale of zero for rows outside the mask."""
     B, K, _, D = P.shape
     T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]
-    scale = scale.mT[:, None, :, None]
-    x = x.mT[:, None, :, None]
+    x, scale = x.mT[:, None], scale.mT[:, None].contiguous()
 
     def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
-        rows = torch.addmm(tangent.constant, P.reshape(B * K, 3 * D), tangent.linear)
-        mapped = torch.bmm(rows.view(B, K * 3 * (T + 1), D), homogeneous).view(B, K, 3, T + 1, N)
-        inverse = mapped[:, :, 2:, :1].clamp_min(1e-9).reciprocal()
-        image = mapped[:, :, :2, :1] * inverse
+        rows = torch.addmm(tangent.constant, P.view(B * K, 3 * D), tangent.linear)
+        mapped = torch.bmm(rows.view(B, K * 3 * (T + 1), D), homogeneous).view(B, K, T + 1, 3, N)
+        numerator, depth = mapped.split((2, 1), dim=3)
+        inverse = depth[:, :, -1].clamp_min(1e-9).reciprocal_()
+        image = numerator[:, :, -1] * inverse
         # d(u / w) = (du - (u / w) dw) / w; the row of the mapping itself becomes the residual
-        J = torch.addcmul(mapped[:, :, :2, 1:], image, mapped[:, :, 2:, 1:], value=-1) * (inverse * scale)
-        residual = (image - x) * scale
-        used, cost = truncated_rows(residual.square().sum((2, 3)), mask, width)
-        rows = torch.cat((J, residual), dim=3) * used[:, :, None, None]
-        rows = rows.transpose(2, 3).reshape(B * K, T + 1, 2 * N)
+        rows = torch.addcmul(numerator, image[:, :, None], depth, value=-1)
+        torch.sub(image, x, out=rows[:, :, -1]).div_(inverse)
+        rows.mul_((inverse * scale)[:, :, None])
+        squared = rows[:, :, -1].square().sum(2)
+        cost = squared.clamp_max(width * width).sum(-1)
+        rows = rows.mul_((squared < width * width)[:, :, None, None]).view(B * K, T + 1, 2 * N)
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     (P,), cost = minimize((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)

@@ -176,7 +176,8 @@ def fit_essential(
     def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _fit_essential_part(iterations, width, *part)
 
-    return in_parts(fit, t.shape[1] * 6 * views.mask.shape[1], R, t, *views.epipolar, views.mask)
+    R, t, cost = in_parts(fit, t.shape[1] * 6 * views.mask.shape[1], R, t, *views.epipolar, views.mask)
+    return R, t, cost
 
 
 def _fit_essential_part(
