@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -54,10 +55,6 @@ def simulated(noise: float = 0.0, frames: int = 8, points: int = 80) -> Observat
     )
 
 
-def started(graph: ObservationGraph, camera: Camera) -> ObservationGraph:
-    return ObservationGraph(**{**vars(graph), "camera": camera})
-
-
 def test_parameters_come_back() -> None:
     theta = parameters(TRUTH, 2)
     torch.testing.assert_close(theta[1:], TRUTH.params[4:6])
@@ -85,7 +82,7 @@ def test_derivatives_of_the_least_cost() -> None:
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_the_camera_of_exact_pixels_is_found(factor: float) -> None:
-    found = calibrate(started(simulated(), misjudged(TRUTH, factor, 2)), num_radial=2).graph.camera
+    found = calibrate(replace(simulated(), camera=misjudged(TRUTH, factor, 2)), num_radial=2).graph.camera
     torch.testing.assert_close(found.params, TRUTH.params, rtol=1e-4, atol=0)
 
 
