@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,11 @@ from experiments.match_weights.weighting import MatchWeights
 HERE = Path(__file__).parent
 CACHE = HERE / "results"
 # Sequences and the share of their frames that a part takes.
-TRAINING = {"redkitchen": (0.0, 0.5), "kitti07": (0.0, 0.5), "machine_hall": (0.0, 0.5)}
+TRAINING = {
+    "redkitchen": (0.0, 0.5),
+    "kitti07": (0.0, 0.5),
+    "machine_hall": (0.0, 0.5),
+}
 UNSEEN = {
     "redkitchen": (0.5, 1.0),
     "kitti07": (0.5, 1.0),
@@ -37,7 +42,7 @@ UNSEEN = {
     "shelf_bin": (0.0, 1.0),
     "fr2_desk_20": (0.0, 1.0),
 }
-SMALL = Settings(steps=300)
+SMALL = Settings()
 LARGE = Settings(steps=4000, batch=64, matches=256)
 COMPETITORS = ("uniform weights", "best kernel", "RANSAC")
 
@@ -46,7 +51,7 @@ def problems_of(parts: dict[str, tuple[float, float]]) -> dict[str, Problems]:
     """The problems of parts of sequences, from the cache where they have been made before."""
     found = {}
     for name, (first, last) in parts.items():
-        path = CACHE / f"{name}_{first:g}_{last:g}.pt"
+        path = CACHE / f"{re.sub(r'[^a-z0-9_]', '_', name)}_{first:g}_{last:g}.pt"
         if not path.exists():
             for sequence in sequences([name]):
                 whole = len(sequence)

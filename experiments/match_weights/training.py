@@ -27,7 +27,7 @@ class Settings:
     steps: int = 400
     batch: int = 32
     matches: int = 128
-    learning_rate: float = 3e-3
+    learning_rate: float = 1e-2
     weight_decay: float = 1e-3
     seed: int = 0
 
