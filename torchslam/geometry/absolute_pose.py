@@ -32,8 +32,8 @@ from torchslam.geometry.ransac import (
 )
 
 _FIRST_ROUND = 160  # samples
-_CANDIDATES = 4  # hypotheses of each round that are optimised
-_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
+_CANDIDATES = 2  # hypotheses of each round that are optimised
+_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 1, 10
 _FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
 
 
@@ -85,30 +85,14 @@ def estimate_absolute_pose(
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
     pixels = torch.where(mask[..., None], pixels, 0.0)
-    with torch.no_grad():
-        generator = torch.Generator().manual_seed(seed)
+    with torch.inference_mode():  # less work per operation than without gradients only
         problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
-        (P,) = search(
-            lambda rows, count: problem.select(rows).propose(count, generator),
-            mask.sum(-1),
-            3,
-            confidence,
-            _FIRST_ROUND,
-            max_samples,
-        )
-        P = problem.refine(P)
-        squared = problem.squared_errors(P)
-        inliers = (squared < 1) & mask
-        success = _is_success(inliers, mask, problem.points, camera, threshold)
-        score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-        t = P[..., 3] - (P[..., :3] @ problem.centre[..., None]).squeeze(-1)
-        T_cw = torch.where(
-            success[:, None, None], rigid(P[..., :3], t), torch.eye(4, dtype=t.dtype, device=t.device)
-        )
+        results = problem.solve(seed, confidence, max_samples)
+    T_cw, success, squared, score = (result.clone() for result in results)  # fit for graphs
+    mask = mask & success[:, None]
     if needs_gradient(points_w, pixels, camera.params):
-        used = (squared < _FINAL_WIDTH**2) & mask & success[:, None]
-        T_cw = _with_gradient(T_cw, points_w, pixels, camera, used)
-    return AbsolutePose(T_cw, inliers & success[:, None], success, score)
+        T_cw = _with_gradient(T_cw, points_w, pixels, camera, (squared < _FINAL_WIDTH**2) & mask)
+    return AbsolutePose(T_cw, (squared < 1) & mask, success, score)
 
 
 @dataclass(frozen=True)
@@ -162,6 +146,26 @@ class _Problem:
         chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
         return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
 
+    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+        generator = torch.Generator().manual_seed(seed)
+        (P,) = search(
+            lambda rows, count: self.select(rows).propose(count, generator),
+            self.mask.sum(-1),
+            3,
+            confidence,
+            _FIRST_ROUND,
+            max_samples,
+        )
+        P = self.refine(P)
+        squared = self.squared_errors(P)
+        success = _is_success((squared < 1) & self.mask, self.mask, self.points, self.camera, self.threshold)
+        score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+        R = P[..., :3]
+        T_cw = rigid(R, P[..., 3] - (R @ self.centre[..., None]).squeeze(-1))
+        eye = torch.eye(4, dtype=P.dtype, device=P.device)
+        return torch.where(success[:, None, None], T_cw, eye), success, squared, score
+
     def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
         """The best pose from `count` minimal samples, locally optimised, its score and its support."""
         sample = sample_minimal(self.mask, 3, count, generator)
@@ -175,8 +179,7 @@ class _Problem:
         P, cost = self.fit(P, _LOCAL_ITERATIONS, 1.0)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         P = P[torch.arange(len(best), device=best.device), best]
-        squared = squared_projections(P[:, None], self.homogeneous, self.normalized, self.scale)[:, 0]
-        near = (squared < SUPPORT_WIDTH**2) & self.mask
+        near = (self.undistorted_errors(P) < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
@@ -195,8 +198,15 @@ class _Problem:
             P, tangent, self.homogeneous, self.normalized, self.scale, self.mask, iterations, width
         )
 
-    def squared_errors(self, P: Tensor) -> Tensor:
+    def undistorted_errors(self, P: Tensor) -> Tensor:
         """Squared errors in thresholds of one pose per problem; infinite behind the camera. (B, N)."""
+        squared = squared_projections(P[:, None], self.homogeneous, self.normalized, self.scale)
+        return squared[:, 0].nan_to_num(torch.inf)
+
+    def squared_errors(self, P: Tensor) -> Tensor:
+        """The same through the distortion, and infinite also beyond its monotone part."""
+        if self.camera.model == "pinhole":
+            return self.undistorted_errors(P)
         projected, valid = self.camera.project((P @ self.homogeneous).mT)
         squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
         return squared.masked_fill(~valid, torch.inf)

@@ -136,14 +136,11 @@ def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor
     matches between two images", 2004, eq. for the number of false alarms.
     """
     n, k = available.double(), inliers.double()
-
-    def log_choose(n: Tensor, k: Tensor) -> Tensor:
-        return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp_min(0.0) + 1)
-
-    samples = torch.full_like(k, float(size))
-    log_alarms = (
-        log_choose(n, k) + log_choose(k, samples) + (k - size) * torch.log(chance.double().clamp(1e-12, 1))
-    )
+    rest = (n - k).clamp_min(0.0)
+    # n over k times k over size, but for what cancels
+    factorials = torch.lgamma(torch.stack((n, rest, (k - size).clamp_min(0.0))) + 1)
+    log_choices = factorials[0] - factorials[1] - factorials[2] - math.lgamma(size + 1)
+    log_alarms = log_choices + (k - size) * torch.log(chance.double().clamp(1e-12, 1))
     log_alarms = log_alarms + torch.log(solutions * (n - size).clamp_min(1.0))
     return (k > size) & (log_alarms < math.log(1e-3))
 
