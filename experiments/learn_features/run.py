@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from experiments.common import sequences, table, write_between
 from experiments.learn_features.clips import Clip, Errors, errors_of, step_of
 from experiments.learn_features.front_end import SubPixel
+from experiments.learn_features.pairs import PairErrors, frames_apart, pair_errors
 from experiments.learn_features.training import Settings, train
 from torchslam import ORB, ClipSLAM, XFeat
 from torchslam.data.sequence import Sequence
@@ -31,69 +33,130 @@ UNSEEN = {
 KEYPOINTS = 600
 CLIP_FRAMES = 8  # of a clip to evaluate
 CLIPS = 4  # per unseen sequence, evenly over it
+PAIRS = 25  # likewise
 BEFORE, AFTER = "XFeat", "XFeat, trained"
 SMALL = Settings()
 LARGE = Settings(steps=3000, clips=4, frames=10)
 
 
-def clips_of(
-    names: dict[str, tuple[float, float]], count: int, device: torch.device
-) -> dict[str, list[Clip]]:
-    """Clips spread evenly over parts of the sequences at hand."""
+@dataclass(frozen=True)
+class Part:
+    """A part of a sequence to evaluate on: first frames of pairs, and clips."""
+
+    sequence: Sequence
+    pairs: list[int]
+    clips: list[Clip]
+
+
+def parts_of(names: dict[str, tuple[float, float]], device: torch.device) -> dict[str, Part]:
+    """Pairs and clips spread evenly over parts of the sequences at hand."""
     found = {}
     for name, (first, last) in names.items():
         for sequence in sequences([name]):
             step = step_of(sequence)
-            begin, end = round(first * len(sequence)), round(last * len(sequence)) - CLIP_FRAMES * step
-            starts = torch.linspace(begin, max(begin, end), count).round().int().unique().tolist()
-            found[name] = [Clip.of(sequence, start, CLIP_FRAMES, step, device) for start in starts]
+            begin, end = round(first * len(sequence)), round(last * len(sequence))
+            pairs = spread(PAIRS, begin, end - frames_apart(sequence) - 1)
+            clips = spread(CLIPS, begin, end - CLIP_FRAMES * step)
+            made = [Clip.of(sequence, start, CLIP_FRAMES, step, device) for start in clips]
+            found[name] = Part(sequence, pairs, made)
     return found
 
 
+def spread(count: int, first: int, last: int) -> list[int]:
+    """At most `count` different numbers, evenly from the first to the last."""
+    return torch.linspace(first, last, count).round().int().unique().tolist()
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a front end is worth on one part of a sequence."""
+
+    pairs: PairErrors
+    clips: list[Errors]
+
+
 @torch.no_grad()
-def measure(front_end: nn.Module, unseen: dict[str, list[Clip]]) -> dict[str, list[Errors]]:
-    """The errors of every clip, by sequence."""
+def measure(front_end: nn.Module, parts: dict[str, Part], device: torch.device) -> dict[str, Result]:
+    """The errors of every pair and clip, by sequence."""
     clip_slam = ClipSLAM(front_end)
-    return {name: [errors_of(clip_slam, clip) for clip in clips] for name, clips in unseen.items()}
+    return {
+        name: Result(
+            pair_errors(front_end, part.sequence, part.pairs, device),
+            [errors_of(clip_slam, clip) for clip in part.clips],
+        )
+        for name, part in parts.items()
+    }
 
 
-def report(results: dict[str, dict[str, list[Errors]]], unseen: dict[str, list[Clip]]) -> str:
-    """A row per unseen sequence and front end: medians; then geometric means over the clips that all could pose."""
+def report(results: dict[str, dict[str, Result]]) -> str:
+    """Medians by unseen part and front end; then geometric means over the pairs and clips that all could pose."""
     rows = []
-    for name, clips in unseen.items():
-        for label, result in results.items():
-            frames = sum(errors.posed for errors in result[name])
-            inliers = sum(errors.seen for errors in result[name]) / max(1, frames)
-            errors = numbers(errors for errors in result[name] if errors.enough)
-            posed = f"{frames} of {len(clips) * CLIP_FRAMES}"
-            rows.append([name, label, posed, f"{inliers:.0f}", *cells(errors.median(0).values)])
-    common = common_clips(results)
-    for label, errors in common.items():
-        rows.append(["geometric mean", label, f"{len(errors)} clips", "", *cells(errors.log().mean(0).exp())])
-    header = ["unseen", "front end", "frames posed", "inliers a frame", "ATE / path", "rotation error (mrad)"]
-    return table(header, rows)
+    for name in results[BEFORE]:
+        for label, parts in results.items():
+            pairs, clips = parts[name].pairs, parts[name].clips
+            median = torch.stack([pairs.rotation, pairs.direction]).nanmedian(-1).values
+            ates = torch.stack(
+                [clip.position if clip.enough else clip.position * torch.nan for clip in clips]
+            )
+            rows.append(
+                [
+                    name,
+                    label,
+                    f"{float(pairs.inliers.mean()):.0f}",
+                    *_angles(median),
+                    f"{sum(clip.enough for clip in clips)} of {len(clips)}",
+                    _share(ates.nanmedian()),
+                ]
+            )
+    pairs_by_label, clips_by_label = common_pairs(results), common_clips(results)
+    for label in results:
+        pairs, clips = pairs_by_label[label], clips_by_label[label]
+        means = [errors.log().mean(-1).exp() for errors in (pairs, clips)]
+        rows.append(
+            [
+                "geometric mean",
+                label,
+                f"{pairs.shape[-1]} pairs",
+                *_angles(means[0]),
+                f"{len(clips)} clips",
+                _share(means[1]),
+            ]
+        )
+    header = ["unseen", "front end", "inliers a pair", "rotation error (mrad)", "direction error (°)"]
+    return table([*header, "clips posed", "ATE / path"], rows)
 
 
-def common_clips(results: dict[str, dict[str, list[Errors]]]) -> dict[str, Tensor]:
-    """(C, 2) errors by front end, of the clips in which all front ends have enough poses."""
-    columns = [[errors for part in result.values() for errors in part] for result in results.values()]
-    rows = [row for row in zip(*columns, strict=True) if all(errors.enough for errors in row)]
-    return {label: numbers(row[index] for row in rows) for index, label in enumerate(results)}
+def common_pairs(results: dict[str, dict[str, Result]]) -> dict[str, Tensor]:
+    """(2, P) rotation and direction errors by front end, of the pairs for which all front ends have a motion."""
+    errors = torch.stack(
+        [
+            torch.cat(
+                [torch.stack([part.pairs.rotation, part.pairs.direction]) for part in parts.values()], 1
+            )
+            for parts in results.values()
+        ]
+    )
+    return dict(zip(results, errors[..., ~errors.isnan().any(0).any(0)], strict=True))
 
 
-def numbers(errors: Iterable[Errors]) -> Tensor:
-    """(C, 2) position and rotation errors; a row of NaN where there are none."""
-    rows = [torch.stack([one.position, one.rotation]) for one in errors]
-    return torch.stack(rows) if rows else torch.full((1, 2), torch.nan)
+def common_clips(results: dict[str, dict[str, Result]]) -> dict[str, Tensor]:
+    """(C,) position errors by front end, of the clips in which all front ends have enough poses."""
+    columns = [[clip for part in parts.values() for clip in part.clips] for parts in results.values()]
+    rows = [row for row in zip(*columns, strict=True) if all(clip.enough for clip in row)]
+    positions = torch.tensor([[float(clip.position) for clip in row] for row in rows]).view(-1, len(results))
+    return dict(zip(results, positions.T, strict=True))
 
 
-def cells(errors: Tensor) -> list[str]:
-    """Position and rotation error (2,) in words."""
-    return [f"{100 * float(errors[0]):.2f} %", f"{1e3 * float(errors[1]):.2f}"]
+def _angles(errors: Tensor) -> list[str]:
+    return [f"{1e3 * float(errors[0]):.2f}", f"{math.degrees(float(errors[1])):.2f}"]
 
 
-def draw(path: Path, losses: list[float], results: dict[str, dict[str, list[Errors]]]) -> None:
-    """Left the loss over the steps, right the rotation error of every unseen clip before and after."""
+def _share(error: Tensor) -> str:
+    return f"{100 * float(error):.2f} %"
+
+
+def draw(path: Path, losses: list[float], results: dict[str, dict[str, Result]]) -> None:
+    """Left the loss over the steps, right the rotation error of every unseen pair before and after."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 4.0), layout="constrained")
     left.plot(losses, ".", color="0.75", markersize=4, label="one clip")
     window = max(1, len(losses) // 8)
@@ -101,14 +164,12 @@ def draw(path: Path, losses: list[float], results: dict[str, dict[str, list[Erro
     left.plot(range(window // 2, window // 2 + len(means)), means, color="#d62728", label=f"mean of {window}")
     left.set(xlabel="step", ylabel="log(ATE / path) + log(rotation error)", title="training")
     left.legend(frameon=False)
-    for name in results[BEFORE]:
-        pairs = zip(results[BEFORE][name], results[AFTER][name], strict=True)
-        errors = [1e3 * torch.stack([a.rotation, b.rotation]) for a, b in pairs if a.enough and b.enough]
-        if errors:
-            right.plot(*torch.stack(errors).T, "o", markersize=5, label=name)
+    for name, part in results[BEFORE].items():
+        before, after = part.pairs.rotation, results[AFTER][name].pairs.rotation
+        right.plot(1e3 * before, 1e3 * after, "o", markersize=4, label=name)
     right.axline((1, 1), (2, 2), color="0.7", linewidth=0.8, zorder=0)
     right.set(xscale="log", yscale="log", xlabel=f"{BEFORE} (mrad)", ylabel=f"{AFTER} (mrad)")
-    right.set(title="rotation error of unseen clips; below the line: better", aspect="equal")
+    right.set(title="rotation error of unseen pairs; below the line: better", aspect="equal")
     right.legend(frameon=False, fontsize=8)
     for axis in (left, right):
         axis.spines[["top", "right"]].set_visible(False)
@@ -134,10 +195,10 @@ def main() -> None:
         losses = train(ClipSLAM(front_end), drawing(sequence, share, settings.frames, device), settings)
         if arguments.save:
             torch.save(front_end.moves.state_dict(), arguments.save)
-        unseen = clips_of(UNSEEN, CLIPS, device)
+        unseen = parts_of(UNSEEN, device)
         candidates = {BEFORE: front_end.front_end, AFTER: front_end, "ORB": ORB(KEYPOINTS)}
-        results = {label: measure(module, unseen) for label, module in candidates.items()}
-        text = report(results, unseen)
+        results = {label: measure(module, unseen, device) for label, module in candidates.items()}
+        text = report(results)
         print(text)
         write_between(HERE / "README.md", text)
         draw(HERE / "learned.png", losses, results)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import fields
+
 import pytest
 import torch
 from torch import Tensor, nn
 
 from experiments.learn_features.clips import Clip, Errors, errors_of, step_of
 from experiments.learn_features.front_end import RADIUS, REACH, SubPixel, patches
-from experiments.learn_features.run import common_clips, drawing, report
+from experiments.learn_features.pairs import PairErrors, frames_apart, pair_errors
+from experiments.learn_features.run import BEFORE, Result, common_pairs, drawing, report
 from experiments.learn_features.training import Settings, train
 from tests.test_clip import BentEyes
 from tests.walks import Walk, arc
-from torchslam import ORB, ClipSLAM
+from torchslam import ORB, ClipSLAM, Features
 
 CPU = torch.device("cpu")
 
@@ -79,15 +83,34 @@ def test_training_lowers_both_errors() -> None:
     assert float(after.rotation.detach()) < 0.5 * float(before.rotation.detach())
 
 
-def test_the_report_compares_clips_that_all_have_posed() -> None:
-    walk = Walk(arc(10))
-    clip = Clip.of(walk, 0, frames=4, step=1, device=CPU)
+def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
+    walk = Walk(arc(10, length=1.0))
+    eyes = BentEyes(walk, bend=0.0, noise_px=0.0)
+    apart = frames_apart(walk)
+
+    class Pair(nn.Module):
+        def forward(self, images: Tensor) -> Features:
+            features = eyes(images)
+            return Features(*(getattr(features, c.name)[[2, 2 + apart]] for c in fields(Features)))
+
+    found = pair_errors(Pair(), walk, [2], CPU)
+    assert found.inliers[0] > 50
+    assert found.rotation[0] < 1e-4
+    assert found.direction[0] < 1e-3
+
+
+def test_the_report_compares_what_all_could_pose() -> None:
+    def result(rotations: list[float], inliers: float, clips: list[Errors]) -> Result:
+        rotation = torch.tensor(rotations)
+        return Result(PairErrors(rotation, 10 * rotation, torch.full_like(rotation, inliers)), clips)
+
+    none = errors(0.5, 0.5, posed=0, seen=0)
     results = {
-        "one": {"walk": [errors(0.01, 0.002), errors(0.04, 0.008)]},
-        "other": {"walk": [errors(0.02, 0.004), errors(0.5, 0.5, posed=0, seen=0)]},
+        BEFORE: {"walk": result([0.002, 0.004, 0.008], 100, [errors(0.01, 0.002), errors(0.04, 0.008)])},
+        "other": {"walk": result([0.001, 0.002, math.nan], 80, [errors(0.02, 0.004), none])},
     }
-    assert len(common_clips(results)["one"]) == 1
-    text = report(results, {"walk": [clip, clip]})
-    assert "| walk | one | 16 of 16 | 100 |" in text
-    assert "| geometric mean | one | 1 clips |  | 1.00 % | 2.00 |" in text
-    assert "| geometric mean | other | 1 clips |  | 2.00 % | 4.00 |" in text
+    assert common_pairs(results)["other"].shape == (2, 2)
+    text = report(results)
+    assert f"| walk | {BEFORE} | 100 | 4.00 | 2.29 | 2 of 2 | 1.00 % |" in text
+    assert f"| geometric mean | {BEFORE} | 2 pairs | 2.83 | 1.62 | 1 clips | 1.00 % |" in text
+    assert "| geometric mean | other | 2 pairs | 1.41 | 0.81 | 1 clips | 2.00 % |" in text
