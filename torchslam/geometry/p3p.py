@@ -24,10 +24,10 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         f, X = (x.reshape(-1, 3, 3).permute(1, 2, 0).contiguous() for x in (rays, points))
         depths, valid = _depths(f, X)
         corners = depths[:, None] * f[:, :, None]
-        frames = _frame(torch.cat((corners, X[:, :, None]), dim=2)).permute(3, 2, 1, 0)
-        R = torch.matmul(frames[:, :4], frames[:, 4:].mT)
-        t = (corners.sum(0).permute(2, 1, 0) - (R @ X.sum(0).T[:, None, :, None]).squeeze(-1)) / 3
-        valid = valid.T & torch.isfinite(t.sum(-1))
+        frames = _frame(torch.cat((corners, X[:, :, None]), dim=2))
+        R = (frames[:, :, None, :4] * frames[:, None, :, 4:]).sum(0)
+        t = (corners.sum(0) - (R * X.sum(0)[:, None]).sum(1)) / 3
+        R, t, valid = R.permute(3, 2, 0, 1), t.permute(2, 1, 0), (valid & torch.isfinite(t.sum(0))).T
         shape = rays.shape[:-2]
     return R.unflatten(0, shape), t.unflatten(0, shape), valid.unflatten(0, shape)
 
