@@ -141,14 +141,14 @@ def _variance_form(E: Tensor) -> Tensor:
 def _essential_tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Two linear maps that make E, its derivatives and those of its variance matrix products.
 
-    (9, 54): from the frame of the direction (t, a, b, as rows) to the left factors L of E = L R and of its
-    derivatives by the rotation (three) and by turning the frame about its b and a; (9, 162): from E to the (9, 18)
+    (9, 54): from the frame of the direction (t, a, b, as rows) to the left factors of the derivatives of E = L R
+    by the rotation (three) and by turning the frame about its b and a, and to L itself; (9, 162): from E to the (9, 18)
     matrix that takes dE to half the derivative of `_variance_form`.
     """
     axes = generators(dtype, device)
     units = torch.eye(9, dtype=dtype, device=device).unflatten(-1, (3, 3))
     crosses = skew(units)  # (9, row of the frame, 3, 3)
-    left = torch.cat((crosses[:, :1], crosses[:, :1] @ axes, crosses[:, 1:2], -crosses[:, 2:]), dim=1)
+    left = torch.cat((crosses[:, :1] @ axes, crosses[:, 1:2], -crosses[:, 2:], crosses[:, :1]), dim=1)
     bilinear = [[_variance_form(E + F) - _variance_form(E) - _variance_form(F) for F in units] for E in units]
     return left.flatten(1), 0.5 * torch.stack([torch.stack(row) for row in bilinear]).flatten(1)
 
@@ -190,16 +190,16 @@ def _fit_essential_part(
     def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
         left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
         E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
-        form = torch.bmm(E, (E[:, 0] @ variance_table).view(B * K, 9, 18))
+        form = torch.bmm(E, (E[:, -1] @ variance_table).view(B * K, 9, 18))
         value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, constraint.shape[-1])
         spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, constraint.shape[-1])
-        inverse = spread[:, :, :1].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt()
+        inverse = spread[:, :, -1:].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt_()
         # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
-        rows = value * inverse
-        residual = rows[:, :, :1]
-        J = torch.addcmul(rows[:, :, 1:], residual * inverse * inverse, spread[:, :, 1:], value=-1)
+        rows = value.mul_(inverse)
+        residual = rows[:, :, -1:]
+        rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
         used, cost = truncated_rows(residual.squeeze(2).square(), mask, width)
-        rows = (torch.cat((J, residual), dim=2) * used[:, :, None]).view(B * K, 6, constraint.shape[-1])
+        rows = rows.mul_(used[:, :, None]).view(B * K, 6, constraint.shape[-1])
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
@@ -273,7 +273,14 @@ def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
     """Truncated scores of homographies or rotations, in float32. (B, M, 3, 3) -> (B, M)."""
     h_1, x_2, scale, mask = _transfer(views)
-    return score_projections(H.float(), h_1.float(), x_2.float(), scale, mask)
+
+    def score(*part: Tensor) -> tuple[Tensor]:
+        return (score_projections(*part),)
+
+    (scores,) = in_parts(
+        score, 3 * H.shape[1] * mask.shape[1], H.float(), h_1.float(), x_2.float(), scale, mask
+    )
+    return scores
 
 
 def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
