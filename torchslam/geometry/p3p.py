@@ -56,9 +56,10 @@ _CONICS = (
 
 @lru_cache(maxsize=4)
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices of the factors of the adjugate, (24,); how often each of its entries is in the full matrix, (6, 1);
+    """What the conics and their adjugates are made of.
 
-    the conics as a linear function of distances times one and the cosines, (12, 12).
+    Indices of the factors of the adjugate (24,); how often each entry is in the full matrix (6, 1); the conics as a
+    linear function of distances times one and the cosines (12, 12).
     """
     pairs = (*zip(*_ADJUGATE_PLUS, strict=True), *zip(*_ADJUGATE_MINUS, strict=True))
     conics = torch.zeros(2, 6, 3, 4, dtype=dtype, device=device)
