@@ -31,6 +31,6 @@ def draw(path: Path, errors: dict[str, dict[str, Tensor]]) -> None:
         axis.set(title=f"{part} ({len(error)})", xlabel="position error (cm)", ylim=(0, 1))
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("share of problems")
-    axes[-1].legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(path, dpi=80)
     plt.close(figure)
