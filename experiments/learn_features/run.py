@@ -168,8 +168,8 @@ def draw(path: Path, losses: list[float], results: dict[str, dict[str, Result]])
         before, after = part.pairs.rotation, results[AFTER][name].pairs.rotation
         right.plot(1e3 * before, 1e3 * after, "o", markersize=4, label=name)
     right.axline((1, 1), (2, 2), color="0.7", linewidth=0.8, zorder=0)
-    right.set(xscale="log", yscale="log", xlabel=f"{BEFORE} (mrad)", ylabel=f"{AFTER} (mrad)")
-    right.set(title="rotation error of unseen pairs; below the line: better", aspect="equal")
+    right.set(xscale="log", yscale="log", xlabel=f"rotation error, {BEFORE} (mrad)", ylabel=f"{AFTER} (mrad)")
+    right.set(title="unseen pairs; below the line: better", aspect="equal")
     right.legend(frameon=False, fontsize=8)
     for axis in (left, right):
         axis.spines[["top", "right"]].set_visible(False)
