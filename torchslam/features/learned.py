@@ -131,7 +131,9 @@ def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tens
     keypoints, descriptors = (
         F.pad(t, (0, 0, 0, missing)) * mask[..., None] for t in (keypoints, descriptors)
     )
-    return Features(keypoints, scores, torch.full_like(scores, _SCALE), torch.zeros_like(scores), descriptors, mask)
+    return Features(
+        keypoints, scores, torch.full_like(scores, _SCALE), torch.zeros_like(scores), descriptors, mask
+    )
 
 
 def _read(weights: str | Path) -> dict[str, Tensor]:
