@@ -9,6 +9,7 @@ import torch
 from torchslam.config import Config
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera
+from torchslam.history import History
 from torchslam.map import Map
 from torchslam.output.report import metrics, summary, table
 from torchslam.run import Run, keyframe_trajectory
@@ -22,6 +23,7 @@ def run(trajectory: Trajectory, slam_map: Map, camera: Camera, results: list[Ste
         trajectory=Trajectory(trajectory.timestamps[posed], trajectory.T_wc[posed]),
         keyframes=keyframe_trajectory(slam_map),
         map=slam_map,
+        history=History(),
         camera=camera,
         config=Config(),
         results=results,
