@@ -13,6 +13,7 @@ from torchslam.geometry import (
     transform,
     triangulate,
     triangulate_many,
+    triangulation_covariance,
 )
 
 RADIAL = Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
@@ -134,3 +135,26 @@ def test_batch_equals_loop_and_device(device: torch.device) -> None:
     single = triangulate_many(T_cw, pixels, camera)
     torch.testing.assert_close(batch.points_w[0], single.points_w)
     torch.testing.assert_close(batch.points_w[1], single.points_w.flip(0))
+
+
+def test_covariance_is_that_of_noisy_triangulations() -> None:
+    T_cw, pixels, points_w = views(RADIAL)
+    sigmas = torch.full_like(points_w[:, 0], 0.3)
+    covariances = triangulation_covariance(T_cw[0], T_cw[1], points_w, sigmas, sigmas, RADIAL, RADIAL)
+    generator = torch.Generator().manual_seed(1)
+    noise = 0.3 * torch.randn(200, *pixels.shape, generator=generator, dtype=torch.float64)
+    errors = triangulate_many(T_cw, pixels + noise, RADIAL).points_w - points_w
+    squared = (errors * torch.linalg.solve(covariances, errors[..., None]).squeeze(-1)).sum(-1)
+    assert 0.9 < float(squared.mean()) / 3 < 1.1
+    half = triangulation_covariance(T_cw[0], T_cw[1], points_w, sigmas / 2, sigmas / 2, RADIAL, RADIAL)
+    torch.testing.assert_close(half, covariances / 4)
+
+
+def test_covariance_is_zero_where_the_views_do_not_determine_a_point(device: torch.device) -> None:
+    T_cw, _, points_w = (x.to(device) for x in views())
+    camera, sigmas = CAMERA.to(device), torch.ones_like(points_w[:, 0])
+    no_parallax = triangulation_covariance(T_cw[0], T_cw[0], points_w, sigmas, sigmas, camera, camera)
+    behind = triangulation_covariance(T_cw[0], T_cw[1], -points_w, sigmas, sigmas, camera, camera)
+    assert (no_parallax == 0).all()
+    assert (behind == 0).flatten(1).all(-1).any()
+    assert torch.isfinite(behind).all()

@@ -44,6 +44,7 @@ from torchslam.geometry.triangulation import (
     correct_matches,
     triangulate,
     triangulate_many,
+    triangulation_covariance,
 )
 
 __all__ = [
@@ -84,6 +85,7 @@ __all__ = [
     "transform",
     "triangulate",
     "triangulate_many",
+    "triangulation_covariance",
     "umeyama",
     "vee",
 ]

@@ -96,6 +96,33 @@ def triangulate(
     return Triangulation(points_w, angles, depth_1, depth_2, errors_1, errors_2, mask)
 
 
+def triangulation_covariance(
+    T_1w: Tensor,
+    T_2w: Tensor,
+    points_w: Tensor,
+    sigmas_1: Tensor,
+    sigmas_2: Tensor,
+    camera_1: Camera,
+    camera_2: Camera,
+) -> Tensor:
+    """How well two views, poses taken as exact, determine points: (sum of J^T J / sigma^2)^-1. (..., N, 3, 3).
+
+    points_w: (..., N, 3); sigmas_1, sigmas_2: (..., N) standard deviations of their pixels. Zero where the two views
+    do not determine a point: no parallax, or not in front of both.
+    """
+    information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
+    determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
+    for T_cw, sigmas, camera in ((T_1w, sigmas_1, camera_1), (T_2w, sigmas_2, camera_2)):
+        _, valid, J_c, _ = camera.project_with_jacobians(transform(T_cw, points_w))
+        J = J_c @ T_cw[..., None, :3, :3] / sigmas[..., None, None]
+        information, determined = information + J.mT @ J, determined & valid
+    eye = torch.eye(3, dtype=points_w.dtype, device=points_w.device)
+    size = information.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
+    determined &= torch.linalg.det(information.detach()) > 100 * torch.finfo(eye.dtype).eps * size**3
+    covariances = torch.linalg.inv(torch.where(determined[..., None, None], information, eye))
+    return torch.where(determined[..., None, None], covariances, 0.0)
+
+
 def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     """Moves matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
 
