@@ -100,10 +100,12 @@ class History:
         )
 
     def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
-        """Move the map and the frames to the solution of their graph."""
+        """Move the map and the frames to the solution of their graph; the map keeps how certain it is."""
         count = slam_map.num_keyframes
         slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
         slam_map.points["positions_w"][graph.point_ids] = solution.points_w
+        keyframes = torch.arange(count, device=graph.point_ids.device)
+        slam_map.take_covariances(keyframes, graph.point_ids, solution.keyframes.covariance())
         order = torch.argsort(graph.frame_ids)
         solved = order[torch.searchsorted(graph.frame_ids[order], self.frames["frame_index"])]
         T_rw = slam_map.T_cw[self.frames["reference"]]

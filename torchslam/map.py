@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
+from torchslam.solvers.schur import Marginals
 from torchslam.table import Table
 from torchslam.types import Features, View
 
@@ -81,12 +82,18 @@ class Map:
             mask=points["alive"][point_ids][None],
         )
 
+    def centre_covariances_w(self) -> Tensor:
+        """(K, 3, 3) covariances of the positions of the keyframes, zero where unknown."""
+        R_cw = self.T_cw[:, :3, :3]
+        return R_cw.mT @ self.keyframes["covariances"][:, :3, :3] @ R_cw
+
     # --- growing ---------------------------------------------------------------------------------------------
 
     def add_keyframe(self, view: View, T_cw: Tensor) -> int:
-        """Add a keyframe that observes nothing yet; returns its index."""
+        """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
         ids = self.keyframes.append(
             T_cw=T_cw[None],
+            covariances=T_cw.new_zeros(1, 6, 6),
             frame_index=torch.tensor([view.index], device=T_cw.device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=T_cw.device),
             keypoints=view.keypoints[None],
@@ -98,8 +105,12 @@ class Map:
         )
         return int(ids[0])
 
-    def add_points(self, positions_w: Tensor, descriptors: Tensor, keyframe: int) -> Tensor:
+    def add_points(
+        self, positions_w: Tensor, descriptors: Tensor, keyframe: int, covariances_w: Tensor | None = None
+    ) -> Tensor:
         """Add points (n, 3) with descriptors (n, D), first seen in a keyframe; returns their ids (n,).
+
+        covariances_w: (n, 3, 3) of the positions, zero where unknown; all unknown if None
 
         Their view directions and scales are set by `refresh`, once they are observed.
         """
@@ -107,6 +118,7 @@ class Map:
         frame_index = self.keyframes["frame_index"][keyframe].expand(n)
         return self.points.append(
             positions_w=positions_w,
+            covariances_w=like.new_zeros(n, 3, 3) if covariances_w is None else covariances_w,
             descriptors=descriptors,
             normals_w=like.new_zeros(n, 3),
             reach=like.new_zeros(n),
@@ -248,11 +260,23 @@ class Map:
         self.points["angles"][ids] = self.keyframes["angles"][keyframe, keypoint]
         self.points["descriptors"][ids] = self.keyframes["descriptors"][keyframe, keypoint]
 
+    def take_covariances(self, keyframes: Tensor, point_ids: Tensor, marginals: Marginals) -> None:
+        """Note how certain keyframes (k,) and points (n,) are; those the marginals hold no answer for keep theirs."""
+        for column, rows, covariances in (
+            (self.keyframes["covariances"], keyframes, marginals.frames),
+            (self.points["covariances_w"], point_ids, marginals.points),
+        ):
+            known = covariances.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
+            column[rows[known]] = covariances[known]
+
     def rescale(self, factor: float) -> None:
         """Multiply all lengths of the world by a factor."""
         self.points["positions_w"].mul_(factor)
+        self.points["covariances_w"].mul_(factor**2)
         self.points["reach"].mul_(factor)
         self.keyframes["T_cw"][:, :3, 3].mul_(factor)
+        self.keyframes["covariances"][:, :3].mul_(factor)
+        self.keyframes["covariances"][:, :, :3].mul_(factor)
 
 
 def without_repetitions(ids: Tensor, preferred: Tensor) -> Tensor:

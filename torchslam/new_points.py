@@ -9,7 +9,14 @@ from torch import Tensor
 
 from torchslam.config import Config, MatchingConfig
 from torchslam.correspondences import descriptor_distances, max_distance
-from torchslam.geometry import Camera, se3_inverse, skew, transform, triangulate
+from torchslam.geometry import (
+    Camera,
+    se3_inverse,
+    skew,
+    transform,
+    triangulate,
+    triangulation_covariance,
+)
 from torchslam.map import NO_POINT, Map
 from torchslam.types import View
 
@@ -34,7 +41,11 @@ def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Ca
     good &= seen.angles > math.radians(settings.min_parallax_deg)
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.scale_range)
     keep = torch.nonzero(good)[:, 0]
-    ids = slam_map.add_points(seen.points_w[keep], view_1.descriptors[first[keep]], keyframe)
+    points_w = seen.points_w[keep]
+    covariances_w = triangulation_covariance(
+        T_1w, T_2w, points_w, scale_1[keep], scale_2[keep], camera, camera
+    )
+    ids = slam_map.add_points(points_w, view_1.descriptors[first[keep]], keyframe, covariances_w)
     slam_map.observe(keyframe, first[keep], ids)
     slam_map.observe(neighbour, second[keep], ids)
 

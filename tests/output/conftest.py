@@ -39,7 +39,8 @@ def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
         keyframe = made.add_keyframe(_view(index, trajectory, generator), se3_inverse(trajectory.T_wc[index]))
         offsets = torch.randn(20, 3, generator=generator, dtype=torch.float64)
         descriptors = torch.randint(0, 256, (20, 32), generator=generator, dtype=torch.uint8)
-        ids = made.add_points(3 * offsets, descriptors, keyframe)
+        covariances_w = 0.01 * torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+        ids = made.add_points(3 * offsets, descriptors, keyframe, covariances_w)
         made.observe(keyframe, torch.arange(20), ids)
         if keyframe:
             made.observe(keyframe, torch.arange(20, 30), ids[:10] - 20)

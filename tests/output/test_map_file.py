@@ -65,3 +65,6 @@ def test_missing_damaged_and_foreign_files_are_named(tmp_path: Path, slam_map: M
     save_file({"weights": torch.zeros(3)}, str(path), metadata={"torchslam": '{"format": 99}'})
     with pytest.raises(ResultsError, match="map format 99"):
         read_map(path)
+    save_file({"weights": torch.zeros(3)}, str(path), metadata={"torchslam": '{"format": 1}'})
+    with pytest.raises(ResultsError, match="map format 1, this version reads format 2"):
+        read_map(path)

@@ -11,7 +11,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.map import Map
 
-FORMAT = 1
+FORMAT = 2  # 1 had no covariances
 
 
 def write_map(path: str | Path, slam_map: Map, camera: Camera) -> None:
