@@ -15,6 +15,9 @@ from tests.walks import Walk, arc, still, turn
 from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate
+from torchslam.features import SimulatedFeatures
+from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.tracking import Tracker
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -211,3 +214,68 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
         h = 1e-2
         numeric = (error(fx, pixels + h * direction) - error(fx, pixels - h * direction)) / (2 * h)
         assert float(pixels.grad.norm()) == pytest.approx(float(numeric), rel=1e-3)
+
+
+def test_covariances_tell_the_errors_of_the_map() -> None:
+    """Errors of keyframes and points, squared and normalised, average to their degrees of freedom.
+
+    The map's scale is free; of all scales, the covariances belong to the one that least moves the keyframes.
+    """
+    walk = Walk(arc(60))
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, "simulated.noise_px=0.5"]))
+    slam_map = slam.run(walk).map
+    truth = true_T_cw(walk)[slam_map.keyframes["frame_index"]]
+    points_w, known = true_points(slam, walk)
+    points_w, truth = transform(truth[0], points_w), truth @ se3_inverse(truth[0])
+    T_cw = slam_map.T_cw
+    scale = (T_cw[:, :3, 3] ** 2).sum() / (T_cw[:, :3, 3] * truth[:, :3, 3]).sum()
+    truth[:, :3, 3] *= scale
+
+    errors = se3_log(truth @ se3_inverse(T_cw))[1:]
+    keyframes = normalised(errors, slam_map.keyframes["covariances"][1:])
+    assert 0.4 < float(keyframes.mean()) / 6 < 2.0
+    points = normalised(
+        slam_map.positions_w[known] - scale * points_w, slam_map.points["covariances_w"][known]
+    )
+    assert len(points) > 200
+    assert 0.5 < float(points.mean()) / 3 < 1.7
+
+
+def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions (n, 3) in the world of the walk, and ids (n,) of the map's points, by their descriptors."""
+    settings = slam.config.simulated
+    scene = SimulatedFeatures(
+        true_T_cw(walk),
+        walk.camera,
+        points_per_view=settings.points_per_view,
+        depth_near=settings.depth_near,
+        depth_far=settings.depth_far,
+        seed=slam.config.seed,
+    )
+    ids = slam.map.living_points()
+    same = (slam.map.points["descriptors"][ids][:, None] == scene.descriptors).all(-1)
+    assert same.any(1).all()
+    return scene.points_w[same.int().argmax(1)], ids
+
+
+def normalised(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
+    return (errors * torch.linalg.solve(covariances, errors)).sum(-1)
+
+
+def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
+    """An error that is too large for the pixel alone is accepted where the point is uncertain by as much."""
+    walk = Walk(arc(40))
+    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "tracking.gate=mahalanobis")
+    assert len(run.trajectory) == 40
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
+    tracker = Tracker(run.camera, run.config, run.map)
+    ids = run.map.points_seen_by(torch.tensor([1]))
+    T_cw, scales = run.map.T_cw[1], torch.ones(len(ids), dtype=torch.float64)
+    pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
+    assert tracker._agrees(T_cw, ids, pixels, scales).all()
+    run.map.points["covariances_w"][ids] = 0
+    assert not tracker._agrees(T_cw, ids, pixels + 4.0, scales).any()
+    depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
+    spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
+    run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
+    assert tracker._agrees(T_cw, ids, pixels + 4.0, scales).all()

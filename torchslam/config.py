@@ -69,6 +69,9 @@ class TrackingConfig:
     wide_radius_factor: float = 3.0
     refine_radius_px: float = 5.0
     threshold_px: float = 3.0  # of the PnP RANSAC
+    gate: str = (
+        "chi_square"  # errors in units of the pixel noise | mahalanobis: and of the point's uncertainty
+    )
     chi_square: float = 5.991  # 95 % of two degrees of freedom
     min_matches: int = 20
     min_inliers: int = 20
@@ -128,6 +131,7 @@ CHOICES = {
     "scale": ("unit", "groundtruth"),
     "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
     "initialization.criterion": ("uncertainty", "parallax"),
+    "tracking.gate": ("chi_square", "mahalanobis"),
     "mapping.partners": ("covisible", "last"),
 }
 

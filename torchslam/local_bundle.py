@@ -14,10 +14,13 @@ CHI_SQUARE = 5.991  # 95 % of two degrees of freedom
 HUBER = CHI_SQUARE**0.5
 
 
-def adjust(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig) -> None:
+def adjust(
+    slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig, covariances: bool = False
+) -> None:
     """Adjust a keyframe, the ones that see most of its points, and all points that these see.
 
     Other keyframes that see these points take part with fixed poses, and so does the first keyframe of the map.
+    If `covariances`, the map learns how certain all this is, what is fixed taken as exact.
     """
     near = slam_map.covisible(keyframe, settings.window - 1)
     free = torch.cat([near.new_tensor([keyframe]), near])
@@ -26,16 +29,20 @@ def adjust(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig)
     shared[free] = 0
     order = torch.sort(shared, descending=True, stable=True)
     fixed = order.indices[: settings.max_fixed][order.values[: settings.max_fixed] > 0]
-    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations)
+    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances)
 
 
 def adjust_all(slam_map: Map, camera: Camera, settings: BundleConfig) -> None:
     """Adjust the whole map, the first keyframe fixed."""
     everyone = torch.arange(slam_map.num_keyframes)
-    adjust_keyframes(slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations)
+    adjust_keyframes(
+        slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, covariances=False
+    )
 
 
-def adjust_keyframes(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera, iterations: int) -> None:
+def adjust_keyframes(
+    slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera, iterations: int, covariances: bool
+) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     is_point = torch.zeros(len(slam_map.points), dtype=torch.bool)
@@ -60,6 +67,8 @@ def adjust_keyframes(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera,
     solution = bundle_adjust(problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached")
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w
+    if covariances:
+        slam_map.take_covariances(keyframes, point_ids, solution.covariance())
     drop_outliers(slam_map, seen, camera)
     slam_map.refresh(keyframes)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.correspondences import match_near, project_points
 from torchslam.errors import ConfigError
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, se3_inverse, transform, triangulation_covariance
 from torchslam.initialization import Start
 from torchslam.local_bundle import adjust
 from torchslam.map import Map
@@ -32,9 +32,14 @@ class Mapper:
         factor = world_scale(start, self.config.scale)
         T_cw = start.T_cw.clone()
         T_cw[:3, 3] *= factor
-        first = self.map.add_keyframe(start.reference, torch.eye(4, dtype=T_cw.dtype, device=T_cw.device))
+        T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+        points_w, camera = start.points_w * factor, self.camera
+        scales_1, scales_2 = start.reference.scales[start.keypoints_1], start.view.scales[start.keypoints_2]
+        covariances_w = triangulation_covariance(T_1w, T_cw, points_w, scales_1, scales_2, camera, camera)
+        first = self.map.add_keyframe(start.reference, T_1w)
         second = self.map.add_keyframe(start.view, T_cw)
-        ids = self.map.add_points(start.points_w * factor, start.view.descriptors[start.keypoints_2], second)
+        descriptors = start.view.descriptors[start.keypoints_2]
+        ids = self.map.add_points(points_w, descriptors, second, covariances_w)
         self.map.observe(first, start.keypoints_1, ids)
         self.map.observe(second, start.keypoints_2, ids)
         self.map.refresh(torch.tensor([first, second]))
@@ -57,7 +62,8 @@ class Mapper:
                 self.fuse(keyframe, neighbours)
         if self.config.bundle.enabled:
             with self.clock("bundle"):
-                adjust(self.map, keyframe, self.camera, self.config.bundle)
+                wanted = self.config.tracking.gate == "mahalanobis"
+                adjust(self.map, keyframe, self.camera, self.config.bundle, covariances=wanted)
         return keyframe
 
     def cull_recent_points(self, keyframe: int) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.correspondences import Projected, match_near, match_points, project_points
+from torchslam.gating import innovation_covariances, mahalanobis_squared
 from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform
 from torchslam.map import Map
 from torchslam.solvers import refine_pose
@@ -197,12 +198,25 @@ class Tracker:
                 backward="detached",
             )
             T_cw = refined.T_cw[0]
-            projected, valid = self.camera.project(transform(T_cw, points_w))
-            errors = ((projected - pixels) ** 2).sum(-1)
-            mask = valid & (errors < self.config.tracking.chi_square * scales**2)
+            mask = self._agrees(T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
                 break
         return T_cw, mask
+
+    def _agrees(self, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
+        """(n,) whether points are seen where they should be, by the configured gate.
+
+        The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
+        """
+        settings, points = self.config.tracking, self.map.points
+        points_c = transform(T_cw, points["positions_w"][ids])
+        if settings.gate == "chi_square":
+            projected, valid = self.camera.project(points_c)
+            errors = ((projected - pixels) ** 2).sum(-1)
+            return valid & (errors < settings.chi_square * scales**2)
+        projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
+        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], scales)
+        return valid & (mahalanobis_squared(projected - pixels, innovations) < settings.chi_square)
 
     def _accept(self, view: View, tracked: Tracked) -> None:
         """Take the frame over into the state: velocity, reference keyframe, counters of the points."""
