@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from matplotlib.collections import LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
 from torchslam.output import plots
@@ -157,3 +157,19 @@ def test_nothing_to_draw_is_drawn_without_complaint(tmp_path: Path, generator: t
     ]
     for index, figure in enumerate(empty):
         plots.save(figure, tmp_path / f"{index}.png")
+
+
+def test_ellipses_tell_how_certain_keyframes_are(trajectory: Trajectory, points_w: torch.Tensor) -> None:
+    covariances_w = 1e-6 * torch.eye(3, dtype=torch.float64).repeat(len(trajectory), 1, 1)
+    covariances_w[0] = 0  # the fixed one
+    covariances_w[1:, 0, 0] *= 4
+    figure = plots.plot_top_view(trajectory, points_w, keyframes=trajectory, covariances_w=covariances_w)
+    (ellipses,) = (c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    (label,) = (text for text in legend if "sigma" in text)
+    magnification = float(label.split(" x ")[1])
+    assert magnification in (10, 100, 1000)
+    widths, heights = ellipses.get_widths(), ellipses.get_heights()
+    assert widths[0] == heights[0] == 0
+    np.testing.assert_allclose(widths[1:], 2 * 3 * 2e-3 * magnification)
+    np.testing.assert_allclose(heights[1:], 2 * 3 * 1e-3 * magnification)

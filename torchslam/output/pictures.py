@@ -48,24 +48,37 @@ def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
 
 def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     points_w = results.map.positions_w[results.map.living_points()]
+    covariances_w = results.map.centre_covariances_w()
     evaluation = _evaluation(results)
     if evaluation is None:
-        yield from _path_and_map(results.trajectory, results.keyframes, points_w, None, "Path and map")
+        yield from _path_and_map(
+            results.trajectory, results.keyframes, points_w, covariances_w, None, "Path and map"
+        )
         return
     yield "errors", _errors(evaluation, results)
     S = evaluation.S_groundtruth_estimate
     title = f"Path and map, ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
     yield from _path_and_map(
-        evaluation.aligned, _aligned(results.keyframes, S), transform(S, points_w), _truth(results), title
+        evaluation.aligned,
+        _aligned(results.keyframes, S),
+        transform(S, points_w),
+        S[:3, :3] @ covariances_w @ S[:3, :3].mT,
+        _truth(results),
+        title,
     )
 
 
 def _path_and_map(
-    trajectory: Trajectory, keyframes: Trajectory, points_w: Tensor, truth: Trajectory | None, title: str
+    trajectory: Trajectory,
+    keyframes: Trajectory,
+    points_w: Tensor,
+    covariances_w: Tensor,
+    truth: Trajectory | None,
+    title: str,
 ) -> Iterator[tuple[str, Figure]]:
     unit = "" if truth is None else "m"
     yield "scene", plots.plot_scene(trajectory, points_w, truth, keyframes, unit, title)
-    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title)
+    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title, covariances_w)
 
 
 def _truth(results: Results) -> Trajectory | None:

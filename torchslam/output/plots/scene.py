@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 25_000
 MAX_CAMERAS = 30
+SIGMAS = 3.0
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 
 
@@ -29,6 +30,7 @@ class _Scene:
     path: np.ndarray
     rotations: np.ndarray
     cameras: np.ndarray
+    spreads: np.ndarray  # covariances of the cameras' positions, none or one each
     points: np.ndarray
     groundtruth: np.ndarray
     labels: tuple[str, str, str]
@@ -72,9 +74,14 @@ def plot_top_view(
     keyframes: Trajectory | None = None,
     unit: str = "m",
     title: str = "",
+    covariances_w: Tensor | None = None,
 ) -> Figure:
-    """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`."""
-    scene = _scene(trajectory, points_w, groundtruth, keyframes)
+    """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
+
+    covariances_w: (K, 3, 3) of the positions of the keyframes, drawn as ellipses of three standard deviations, all
+                   magnified by the power of ten in the legend
+    """
+    scene = _scene(trajectory, points_w, groundtruth, keyframes, covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
     span = box[:, 1] - box[:, 0]
     width = float(np.clip(6.2 * span[0] / span[1], 4.5, 11.0))
@@ -86,23 +93,30 @@ def plot_top_view(
         axes.set(xlim=box[0], ylim=box[1], aspect="equal")
         axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
         axes.set_title(_title(title, scene, box))
-        figure.legend(loc="outside lower center", ncols=6 if width > 8.0 else 3)
+        figure.legend(loc="outside lower center", ncols=4 if width > 8.0 else 2)
     return figure
 
 
 def _scene(
-    trajectory: Trajectory, points_w: Tensor, groundtruth: Trajectory | None, keyframes: Trajectory | None
+    trajectory: Trajectory,
+    points_w: Tensor,
+    groundtruth: Trajectory | None,
+    keyframes: Trajectory | None,
+    covariances_w: Tensor | None = None,
 ) -> _Scene:
     T_wc = style.to_numpy(trajectory.T_wc)
     upright, labels = style.upright_axes(T_wc)
     shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
-    shown = shown[style.thin(len(shown), MAX_CAMERAS)]
+    rows = style.thin(len(shown), MAX_CAMERAS)
+    shown = shown[rows]
+    spreads = np.zeros((0, 3, 3)) if covariances_w is None else style.to_numpy(covariances_w)[rows]
     points = style.to_numpy(points_w).reshape(-1, 3)
     truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
     return _Scene(
         path=T_wc[:, :3, 3] @ upright.T,
         rotations=upright @ shown[:, :3, :3],
         cameras=shown[:, :3, 3] @ upright.T,
+        spreads=upright @ spreads @ upright.T,
         points=points[np.isfinite(points).all(axis=1)] @ upright.T,
         groundtruth=truth @ upright.T,
         labels=labels,
@@ -175,9 +189,40 @@ def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     )
     lines.set_label("viewing direction")
     axes.add_collection(lines)
+    _draw_ellipses(axes, scene, box)
     if len(scene.path):
         axes.plot(*scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, label="start")
         axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, label="end")
+
+
+def _draw_ellipses(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
+    """How certain the cameras' positions are, magnified as far as the ellipses stay small in the picture."""
+    from matplotlib.collections import EllipseCollection
+
+    variances, directions = np.linalg.eigh(scene.spreads[:, :2, :2])
+    radii = SIGMAS * np.sqrt(variances.clip(min=0.0))
+    if not (radii > 0).any():
+        return
+    room = 0.06 * float((box[:, 1] - box[:, 0]).max())
+    magnification = 10.0 ** max(0, int(np.floor(np.log10(room / radii.max()))))
+    diameters = 2 * magnification * radii
+    angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
+    label = f"keyframe position, {SIGMAS:g} sigma" + (f" x {magnification:g}" if magnification > 1.0 else "")
+    ellipses = EllipseCollection(
+        diameters[:, 1],
+        diameters[:, 0],
+        angles,
+        units="xy",
+        offsets=scene.cameras[:, :2],
+        offset_transform=axes.transData,
+        facecolors="none",
+        edgecolors=style.ACCENT,
+        linewidths=0.9,
+        zorder=5,
+    )
+    axes.add_collection(ellipses)
+    # A legend cannot show a collection of ellipses.
+    axes.plot([], [], "o", ms=8, mfc="none", mec=style.ACCENT, mew=0.9, label=label)
 
 
 def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
