@@ -14,9 +14,9 @@ from torchslam.geometry.lie import transform
 from torchslam.solvers.implicit import Backward, attach, check_backward
 from torchslam.solvers.levenberg import Convergence, minimize
 from torchslam.solvers.linear import factorize
+from torchslam.solvers.pose_expansion import PoseObservations
 from torchslam.solvers.prior import PosePrior, prior_expansion, prior_hessian
 from torchslam.solvers.residuals import (
-    Linearization,
     Observations,
     exact_expansion,
     linearize,
@@ -165,9 +165,8 @@ class _PoseModel:
     """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6).
 
     hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
-    bend:    (B, 6, 6) what the kernel's curvature adds to it, never positive; near the optimum it makes the steps
-             Newton's, several times as effective
-    near:    (B,) bool, whether to add it
+    bend:    (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
+             Newton's, several times as effective; zero elsewhere
     """
 
     T_cw: Tensor
@@ -175,7 +174,6 @@ class _PoseModel:
     gradient: Tensor
     hessian: Tensor
     bend: Tensor
-    near: Tensor
 
 
 class _PoseProblem:
@@ -183,12 +181,13 @@ class _PoseProblem:
 
     def __init__(self, inputs: _Inputs) -> None:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
+        self.laid_out = PoseObservations(inputs.points_w, inputs.observations)
         self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
         counted = (self.observations.weights > 0).sum(-1)
         self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
 
     def evaluate(self, T_cw: Tensor, near: Tensor) -> _PoseModel:
-        model, _ = self._expand(T_cw, near)
+        model = _PoseModel(T_cw, *self.laid_out.expand(T_cw, near))
         if self.prior is None:
             return model
         cost, gradient, hessian = prior_expansion(self.prior, T_cw)
@@ -196,22 +195,10 @@ class _PoseProblem:
             model, cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
         )
 
-    def _expand(self, T_cw: Tensor, near: Tensor) -> tuple[_PoseModel, Linearization]:
-        """The model of the observations' part of the cost."""
-        points_c = transform(T_cw, self.points_w)
-        lin = linearize(self.observations, points_c)
-        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
-        J = torch.cat((lin.J, J_rotation), dim=-1)
-        pulls = (lin.residual[..., None, :] @ J).squeeze(-2)
-        hessian = (lin.weight[..., None, None] * J).flatten(1, 2).mT @ J.flatten(1, 2)
-        bend = (lin.bend[..., None] * pulls).mT @ pulls
-        gradient = (lin.weight[..., None, :] @ pulls).squeeze(-2)
-        return _PoseModel(T_cw, lin.cost.sum(-1), gradient, hessian, bend, near), lin
-
     def step(self, model: _PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
         # Elements without any weight stay solvable: their step is zero.
         grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
-        damped = (model.hessian + model.near[:, None, None] * model.bend) * grow + floor
+        damped = (model.hessian + model.bend) * grow + floor
         factor, failed = torch.linalg.cholesky_ex(damped)
         if failed.any():
             damped = torch.where((failed > 0)[:, None, None], model.hessian * grow + floor, damped)
@@ -228,15 +215,14 @@ class _PoseProblem:
             torch.where(accept, new.cost, old.cost),
             torch.where(vector, new.gradient, old.gradient),
             torch.where(matrix, new.hessian, old.hessian),
-            torch.where(matrix, new.bend, old.bend),
-            torch.where(accept, new.near, False),
+            torch.where(matrix, new.bend, torch.zeros_like(old.bend)),
         )
 
     def covariance(self, T_cw: Tensor) -> Tensor:
         """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
-        model, lin = self._expand(T_cw, self.solvable)
+        lin = linearize(self.observations, transform(T_cw, self.points_w))
         factor = variance_factor(self.observations, lin, num_parameters=6)[:, None, None]
-        information = model.hessian
+        information = self.laid_out.expand(T_cw, torch.zeros_like(self.solvable)).hessian
         if self.prior is not None:  # in absolute units, which the residuals do not calibrate
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
         return factor * factorize(information).solve(self.eye.expand_as(information))

@@ -50,18 +50,18 @@ class Observations:
 class Linearization(NamedTuple):
     """Reprojection errors and their first derivatives.
 
-    cost:         (..., N) the share in the objective, half of rho
     residual:     (..., N, 2) projected minus observed, px
+    J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
+    cost:         (..., N) the share in the objective, half of rho
     weight:       (..., N) weights * rho', zero where the point cannot be projected
     bend:         (..., N) 2 * weights^2 * rho''; weight * I + bend * r r^T is the Hessian of the cost in the residual
-    J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
     """
 
-    cost: Tensor
     residual: Tensor
+    J: Tensor
+    cost: Tensor
     weight: Tensor
     bend: Tensor
-    J: Tensor
 
     @property
     def force(self) -> Tensor:
@@ -77,20 +77,27 @@ def usable(pixels: Tensor, points_w: Tensor, weights: Tensor) -> Tensor:
 
 def linearize(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
     """Errors and Jacobians of finite points_c (..., N, 3)."""
-    camera, weights = observations.camera, observations.weights
-    pixels, valid, J = _project(camera, points_c, free_camera)
+    pixels, valid, J = _project(observations.camera, points_c, free_camera)
     residual = pixels - observations.pixels
+    return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
+
+
+class Weighed(NamedTuple):
+    """`cost`, `weight` and `bend` of a `Linearization`, all (..., N)."""
+
+    cost: Tensor
+    weight: Tensor
+    bend: Tensor
+
+
+def weigh(observations: Observations, squared_px: Tensor, valid: Tensor) -> Weighed:
+    """What squared errors (..., N) in pixels cost and how they pull; those that are not valid pull nowhere."""
+    camera, weights = observations.camera, observations.weights
     diagonal = float(camera.width**2 + camera.height**2)
-    squared = weights * torch.where(valid, residual.square().sum(-1), diagonal)
+    squared = weights * torch.where(valid, squared_px, diagonal)
     rho, slope, curvature = robustify(squared, observations.kernel, observations.scale)
     counted = torch.where(valid, weights, 0.0)
-    return Linearization(
-        0.5 * rho,
-        residual,
-        counted * slope,
-        2 * counted * counted * curvature,
-        J,
-    )
+    return Weighed(0.5 * rho, counted * slope, 2 * counted * counted * curvature)
 
 
 def _project(camera: Camera, points_c: Tensor, free_camera: bool) -> tuple[Tensor, Tensor, Tensor]:

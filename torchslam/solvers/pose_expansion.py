@@ -1,0 +1,99 @@
+"""The local quadratic model of reprojection errors in a pose: what `refine_pose` spends its time on.
+
+Rows of Jacobians run along the observations, (B, D, N), so that one matrix product per problem makes Hessian and
+gradient, and every operation before it streams through contiguous memory.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.solvers.residuals import Observations, linearize, weigh
+
+
+class PoseExpansion(NamedTuple):
+    """Cost, and its derivatives in xi of B problems.
+
+    cost: (B,); gradient: (B, 6)
+    hessian: (B, 6, 6) of iteratively reweighted least squares, positive semi-definite
+    bend:    (B, 6, 6) what the kernel's curvature adds to it, never positive; zero where it was not asked for
+    """
+
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+    bend: Tensor
+
+
+class PoseObservations:
+    """Observations (B, N) of known points, laid out for expansions at many poses."""
+
+    def __init__(self, points_w: Tensor, observations: Observations) -> None:
+        """points_w: (B, N, 3)"""
+        self.observations = observations
+        camera = observations.camera
+        self.points_w = points_w.mT.contiguous()
+        self.pinhole = camera.model == "pinhole"
+        if self.pinhole:
+            self.focal = camera.params[..., :2, None]
+            centre = camera.params[..., 2:4, None]
+            self.normalized = ((observations.pixels.mT - centre) / self.focal).contiguous()
+            self.focal_squared = self.focal.square()
+
+    def expand(self, T_cw: Tensor, near: Tensor) -> PoseExpansion:
+        """The expansion at T_cw (B, 4, 4); `near` (B,) says where to add the bend."""
+        points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
+        rows, cost, weight, bend = self._pinhole(points_c) if self.pinhole else self._general(points_c)
+        moments = (rows * weight).flatten(2) @ rows.flatten(2).mT
+        hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
+        if near.any():
+            pulls = (rows[:, :6] * (self._metric() * rows[:, 6:])).sum(2)
+            added = (pulls * (bend * near[:, None])[:, None]) @ pulls.mT
+        else:
+            added = torch.zeros_like(hessian)
+        return PoseExpansion(cost.sum(-1), gradient, hessian, added)
+
+    def _metric(self) -> Tensor | float:
+        """What turns products of rows into those of pixels."""
+        return self.focal_squared[..., None, :, :] if self.pinhole else 1.0
+
+    def _pinhole(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Rows (B, 7, 2, N) of d residual / d xi and of the residual, in units of the focal length.
+
+        With them the cost (B, N), the weights (B, 1, 2, N) of the rows' products, and the bend (B, N).
+        """
+        observations = self.observations
+        depth = points_c[:, 2:]
+        valid = depth > torch.finfo(depth.dtype).eps
+        inverse = torch.where(valid, depth, 1.0).reciprocal()
+        xy = points_c[:, :2] * inverse
+        residual = xy - self.normalized
+        squared_px = (self.focal_squared * residual.square()).sum(1)
+        cost, weight, bend = weigh(observations, squared_px, valid[:, 0])
+
+        inverse = inverse[:, 0]
+        u, v = xy.unbind(1)
+        zero, product = torch.zeros_like(u), u * v
+        # d(u, v) / d(translation), then / d(rotation): each line is a column of the Jacobian.
+        columns = (
+            *(inverse, zero),
+            *(zero, inverse),
+            *(-inverse * u, -inverse * v),
+            *(-product, -1 - v * v),
+            *(1 + u * u, product),
+            *(-v, u),
+            *residual.unbind(1),
+        )
+        rows = torch.stack(columns, dim=1).unflatten(1, (7, 2))
+        return rows, cost, (weight[:, None] * self.focal_squared)[:, None], bend
+
+    def _general(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `_pinhole`, for any camera; rows are in pixels."""
+        points_c = points_c.mT
+        lin = linearize(self.observations, points_c)
+        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
+        rows = torch.cat((lin.J, J_rotation, lin.residual[..., None]), dim=-1)
+        return rows.permute(0, 3, 2, 1), lin.cost, lin.weight[:, None, None], lin.bend
