@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from torchslam.output import plots
 from torchslam.output.plots import style
+from torchslam.output.plots.scene import _wrapped
 from torchslam.types import StepResult, Trajectory
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -163,13 +164,27 @@ def test_ellipses_tell_how_certain_keyframes_are(trajectory: Trajectory, points_
     covariances_w = 1e-6 * torch.eye(3, dtype=torch.float64).repeat(len(trajectory), 1, 1)
     covariances_w[0] = 0  # the fixed one
     covariances_w[1:, 0, 0] *= 4
-    figure = plots.plot_top_view(trajectory, points_w, keyframes=trajectory, covariances_w=covariances_w)
+    figure = plots.plot_top_view(
+        trajectory, points_w, keyframes=trajectory, keyframe_covariances_w=covariances_w
+    )
     (ellipses,) = (c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     (label,) = (text for text in legend if "sigma" in text)
     magnification = float(label.split(" x ")[1])
     assert magnification in (10, 100, 1000)
     widths, heights = ellipses.get_widths(), ellipses.get_heights()
-    assert widths[0] == heights[0] == 0
-    np.testing.assert_allclose(widths[1:], 2 * 3 * 2e-3 * magnification)
-    np.testing.assert_allclose(heights[1:], 2 * 3 * 1e-3 * magnification)
+    assert len(widths) == len(trajectory) - 1
+    np.testing.assert_allclose(widths, 2 * 3 * 2e-3 * magnification)
+    np.testing.assert_allclose(heights, 2 * 3 * 1e-3 * magnification)
+
+
+def test_ellipses_of_points_are_of_true_size(trajectory: Trajectory, points_w: torch.Tensor) -> None:
+    covariances_w = 1e-6 * torch.eye(3, dtype=torch.float64).repeat(len(points_w), 1, 1)
+    figure = plots.plot_top_view(trajectory, points_w, point_covariances_w=covariances_w)
+    (ellipses,) = (c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
+    assert len(ellipses.get_offsets()) == int(points_w.isfinite().all(-1).sum())
+    np.testing.assert_allclose(ellipses.get_widths(), 2 * 3e-3)
+
+
+def test_long_titles_wrap_in_narrow_pictures() -> None:
+    assert max(map(len, _wrapped("words " * 40, 4.5).split("\n"))) <= 60

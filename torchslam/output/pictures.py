@@ -47,38 +47,23 @@ def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
 
 
 def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
-    points_w = results.map.positions_w[results.map.living_points()]
-    covariances_w = results.map.centre_covariances_w()
-    evaluation = _evaluation(results)
-    if evaluation is None:
-        yield from _path_and_map(
-            results.trajectory, results.keyframes, points_w, covariances_w, None, "Path and map"
-        )
-        return
-    yield "errors", _errors(evaluation, results)
-    S = evaluation.S_groundtruth_estimate
-    title = f"Path and map, ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
-    yield from _path_and_map(
-        evaluation.aligned,
-        _aligned(results.keyframes, S),
-        transform(S, points_w),
-        S[:3, :3] @ covariances_w @ S[:3, :3].mT,
-        _truth(results),
-        title,
-    )
-
-
-def _path_and_map(
-    trajectory: Trajectory,
-    keyframes: Trajectory,
-    points_w: Tensor,
-    covariances_w: Tensor,
-    truth: Trajectory | None,
-    title: str,
-) -> Iterator[tuple[str, Figure]]:
+    evaluation, truth = _evaluation(results), None
+    trajectory, keyframes, title = results.trajectory, results.keyframes, "Path and map"
+    S = torch.eye(4, dtype=trajectory.T_wc.dtype)
+    if evaluation is not None:
+        yield "errors", _errors(evaluation, results)
+        S = evaluation.S_groundtruth_estimate
+        trajectory, keyframes, truth = evaluation.aligned, _aligned(keyframes, S), _truth(results)
+        title += f", ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
     unit = "" if truth is None else "m"
+    ids = results.map.living_points()
+    points_w = transform(S, results.map.positions_w[ids])
+    certainty = [
+        S[:3, :3] @ covariances_w @ S[:3, :3].mT
+        for covariances_w in (results.map.centre_covariances_w(), results.map.points["covariances_w"][ids])
+    ]
     yield "scene", plots.plot_scene(trajectory, points_w, truth, keyframes, unit, title)
-    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title, covariances_w)
+    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title, *certainty)
 
 
 def _truth(results: Results) -> Trajectory | None:

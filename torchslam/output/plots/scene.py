@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from torchslam.output.plots import style
+from torchslam.output.plots.ellipses import draw_ellipses
 from torchslam.types import Trajectory
 
 if TYPE_CHECKING:
@@ -19,7 +21,8 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 25_000
 MAX_CAMERAS = 30
-SIGMAS = 3.0
+MAX_ELLIPSES = 1500  # of points; more hide the picture
+POINT_ELLIPSE = "#cdc6c9"
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 
 
@@ -30,8 +33,9 @@ class _Scene:
     path: np.ndarray
     rotations: np.ndarray
     cameras: np.ndarray
-    spreads: np.ndarray  # covariances of the cameras' positions, none or one each
+    camera_covariances: np.ndarray  # of their positions; zero where unknown
     points: np.ndarray
+    point_covariances: np.ndarray
     groundtruth: np.ndarray
     labels: tuple[str, str, str]
     gaps: np.ndarray
@@ -74,14 +78,15 @@ def plot_top_view(
     keyframes: Trajectory | None = None,
     unit: str = "m",
     title: str = "",
-    covariances_w: Tensor | None = None,
+    keyframe_covariances_w: Tensor | None = None,
+    point_covariances_w: Tensor | None = None,
 ) -> Figure:
     """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
 
-    covariances_w: (K, 3, 3) of the positions of the keyframes, drawn as ellipses of three standard deviations, all
-                   magnified by the power of ten in the legend
+    keyframe_covariances_w, point_covariances_w: (K, 3, 3) and (L, 3, 3) of the positions, drawn as ellipses of three
+        standard deviations, those of keyframes magnified by the power of ten in the legend; none where they are zero
     """
-    scene = _scene(trajectory, points_w, groundtruth, keyframes, covariances_w)
+    scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
     span = box[:, 1] - box[:, 0]
     width = float(np.clip(6.2 * span[0] / span[1], 4.5, 11.0))
@@ -92,7 +97,7 @@ def plot_top_view(
         label = style.length_label(unit)
         axes.set(xlim=box[0], ylim=box[1], aspect="equal")
         axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
-        axes.set_title(_title(title, scene, box))
+        figure.suptitle(_wrapped(_title(title, scene, box), width), x=0.02, ha="left", fontsize=10.5)
         figure.legend(loc="outside lower center", ncols=4 if width > 8.0 else 2)
     return figure
 
@@ -102,26 +107,34 @@ def _scene(
     points_w: Tensor,
     groundtruth: Trajectory | None,
     keyframes: Trajectory | None,
-    covariances_w: Tensor | None = None,
+    keyframe_covariances_w: Tensor | None = None,
+    point_covariances_w: Tensor | None = None,
 ) -> _Scene:
     T_wc = style.to_numpy(trajectory.T_wc)
     upright, labels = style.upright_axes(T_wc)
     shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
     rows = style.thin(len(shown), MAX_CAMERAS)
-    shown = shown[rows]
-    spreads = np.zeros((0, 3, 3)) if covariances_w is None else style.to_numpy(covariances_w)[rows]
     points = style.to_numpy(points_w).reshape(-1, 3)
+    finite = np.isfinite(points).all(axis=1)
     truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
     return _Scene(
         path=T_wc[:, :3, 3] @ upright.T,
-        rotations=upright @ shown[:, :3, :3],
-        cameras=shown[:, :3, 3] @ upright.T,
-        spreads=upright @ spreads @ upright.T,
-        points=points[np.isfinite(points).all(axis=1)] @ upright.T,
+        rotations=upright @ shown[rows, :3, :3],
+        cameras=shown[rows, :3, 3] @ upright.T,
+        camera_covariances=_turned(keyframe_covariances_w, len(shown), upright)[rows],
+        points=points[finite] @ upright.T,
+        point_covariances=_turned(point_covariances_w, len(points), upright)[finite],
         groundtruth=truth @ upright.T,
         labels=labels,
         gaps=_gaps(style.to_numpy(trajectory.timestamps)),
     )
+
+
+def _turned(covariances_w: Tensor | None, count: int, upright: np.ndarray) -> np.ndarray:
+    """Covariances (count, 3, 3) in upright axes, zero where there are none."""
+    if covariances_w is None:
+        return np.zeros((count, 3, 3))
+    return upright @ style.to_numpy(covariances_w) @ upright.T
 
 
 def _gaps(timestamps: np.ndarray) -> np.ndarray:
@@ -189,40 +202,28 @@ def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     )
     lines.set_label("viewing direction")
     axes.add_collection(lines)
-    _draw_ellipses(axes, scene, box)
+    rows = style.thin(len(scene.points), MAX_ELLIPSES)
+    draw_ellipses(
+        axes,
+        scene.points[rows, :2],
+        scene.point_covariances[rows, :2, :2],
+        "map point",
+        POINT_ELLIPSE,
+        linewidth=0.5,
+        zorder=0.5,
+    )
+    width = float((box[:, 1] - box[:, 0]).max())
+    draw_ellipses(
+        axes,
+        scene.cameras[:, :2],
+        scene.camera_covariances[:, :2, :2],
+        "keyframe",
+        style.ACCENT,
+        magnified_in=width,
+    )
     if len(scene.path):
         axes.plot(*scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, label="start")
         axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, label="end")
-
-
-def _draw_ellipses(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
-    """How certain the cameras' positions are, magnified as far as the ellipses stay small in the picture."""
-    from matplotlib.collections import EllipseCollection
-
-    variances, directions = np.linalg.eigh(scene.spreads[:, :2, :2])
-    radii = SIGMAS * np.sqrt(variances.clip(min=0.0))
-    if not (radii > 0).any():
-        return
-    room = 0.06 * float((box[:, 1] - box[:, 0]).max())
-    magnification = 10.0 ** max(0, int(np.floor(np.log10(room / radii.max()))))
-    diameters = 2 * magnification * radii
-    angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
-    label = f"keyframe position, {SIGMAS:g} sigma" + (f" x {magnification:g}" if magnification > 1.0 else "")
-    ellipses = EllipseCollection(
-        diameters[:, 1],
-        diameters[:, 0],
-        angles,
-        units="xy",
-        offsets=scene.cameras[:, :2],
-        offset_transform=axes.transData,
-        facecolors="none",
-        edgecolors=style.ACCENT,
-        linewidths=0.9,
-        zorder=5,
-    )
-    axes.add_collection(ellipses)
-    # A legend cannot show a collection of ellipses.
-    axes.plot([], [], "o", ms=8, mfc="none", mec=style.ACCENT, mew=0.9, label=label)
 
 
 def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -248,6 +249,11 @@ def _few_ticks() -> MaxNLocator:
     from matplotlib.ticker import MaxNLocator
 
     return MaxNLocator(nbins=5, steps=[1, 2, 5, 10])
+
+
+def _wrapped(title: str, width_inches: float) -> str:
+    """The title in lines that fit a narrow picture."""
+    return "\n".join(textwrap.wrap(title, int(12 * width_inches)))
 
 
 def _title(title: str, scene: _Scene, box: np.ndarray) -> str:
