@@ -76,10 +76,11 @@ def test_axes_are_labelled_with_units(name: str, figures: dict[str, Callable[[],
 
 
 def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w: torch.Tensor) -> None:
-    axes = plots.plot_top_view(trajectory, points_w).axes[0]
+    figure = plots.plot_top_view(trajectory, points_w)
+    axes = figure.axes[0]
     assert np.ptp(axes.get_xlim()) < 30
     assert axes.get_aspect() == 1.0
-    assert "5 outside" in axes.get_title(loc="left")
+    assert "5 outside" in figure.get_suptitle().replace("\n", " ")
 
 
 def test_a_world_with_y_down_is_seen_over_x_and_z(trajectory: Trajectory, points_w: torch.Tensor) -> None:
