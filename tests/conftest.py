@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests import accelerator
+
 # Two torch threads on two busy cores wait for each other at barriers.
 torch.set_num_threads(1)
+
+# Before the first backward pass, at which torch counts its devices.
+HAS_SIMULATED_ACCELERATOR = accelerator.register()
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request: pytest.FixtureRequest) -> torch.device:
+@pytest.fixture(params=["cpu", "sim", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """The CPU, a simulated accelerator that finds out where devices are mixed, and a GPU where there is one."""
+    if request.param == "sim":
+        if not HAS_SIMULATED_ACCELERATOR:
+            pytest.skip("this torch has no devices written in Python")
+        with accelerator.simulated_accelerator() as simulated:
+            yield simulated
+        return
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    return torch.device(request.param)
+    yield torch.device(request.param)
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])

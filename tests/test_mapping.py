@@ -52,7 +52,7 @@ def slam(slam_after_20: SLAM) -> SLAM:
 
 def view_of(slam: SLAM, index: int) -> View:
     assert slam.extractor is not None
-    return View.of(WALK[index], slam.extractor(WALK[index]), torch.float64)
+    return View.of(WALK[index], slam.extractor(WALK[index]), WALK.camera.params.double())
 
 
 def walk_from_start(slam: SLAM, index: int) -> torch.Tensor:
@@ -192,7 +192,7 @@ def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[Star
     extract = simulated_extractor(config, walk.camera, true_T_cw(walk))
     initializer = Initializer(walk.camera, config)
     for i in indices:
-        result = initializer.step(View.of(walk[i], extract(walk[i]), torch.float64))
+        result = initializer.step(View.of(walk[i], extract(walk[i]), walk.camera.params.double()))
     return result
 
 

@@ -15,11 +15,11 @@ from torchslam.types import Features, Frame
 Extractor = Callable[[Frame], Features]
 
 
-def image_extractor(config: Config) -> Extractor:
-    """The front end that reads images."""
+def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extractor:
+    """The front end that reads images, on a device."""
     settings = config.features
-    module = extractor(settings.kind, settings.num_keypoints, settings.weights or None)
-    return lambda frame: module(frame.image)
+    module = extractor(settings.kind, settings.num_keypoints, settings.weights or None).to(device)
+    return lambda frame: module(frame.image.to(device))
 
 
 def simulated_extractor(config: Config, camera: Camera, T_cw_groundtruth: torch.Tensor) -> Extractor:

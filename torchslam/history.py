@@ -93,7 +93,8 @@ class History:
             pixels=torch.cat([seen.pixels, own["pixels"]]),
             weights=torch.cat([seen.scales, own["scales"]]) ** -2,
             camera=camera,
-            is_keyframe=torch.arange(slam_map.num_keyframes + len(between)) < slam_map.num_keyframes,
+            is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
+            < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),
             point_ids=point_ids,
             keypoint_index=torch.cat([seen.keypoint_index, own["keypoints"]]),

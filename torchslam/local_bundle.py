@@ -34,7 +34,7 @@ def adjust(
 
 def adjust_all(slam_map: Map, camera: Camera, settings: BundleConfig) -> None:
     """Adjust the whole map, the first keyframe fixed."""
-    everyone = torch.arange(slam_map.num_keyframes)
+    everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
         slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, covariances=False
     )
@@ -45,7 +45,7 @@ def adjust_keyframes(
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
-    is_point = torch.zeros(len(slam_map.points), dtype=torch.bool)
+    is_point = torch.zeros(len(slam_map.points), dtype=torch.bool, device=free.device)
     is_point[slam_map.points_seen_by(free)] = True
     seen = slam_map.observations(keyframes)
     seen = select(seen, is_point[seen.point_index])

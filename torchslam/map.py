@@ -65,6 +65,10 @@ class Map:
         """(L, 3) positions of all points ever made, dead ones included."""
         return self.points["positions_w"]
 
+    def ids(self, *keyframes: int) -> Tensor:
+        """Indices of keyframes as a tensor (k,) beside the map's."""
+        return torch.tensor(keyframes, device=self.T_cw.device)
+
     def living_points(self) -> Tensor:
         """(L',) ids of the points that are alive."""
         return torch.nonzero(self.points["alive"])[:, 0]

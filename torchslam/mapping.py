@@ -42,7 +42,7 @@ class Mapper:
         ids = self.map.add_points(points_w, descriptors, second, covariances_w)
         self.map.observe(first, start.keypoints_1, ids)
         self.map.observe(second, start.keypoints_2, ids)
-        self.map.refresh(torch.tensor([first, second]))
+        self.map.refresh(self.map.ids(first, second))
         return first, second
 
     def insert(self, view: View, tracked: Tracked) -> int:
@@ -54,10 +54,11 @@ class Mapper:
             if settings.cull:
                 self.cull_recent_points(keyframe)
             neighbours = self.map.covisible(keyframe, 2 * settings.neighbours)
-            partners = neighbours if settings.partners == "covisible" else torch.arange(keyframe).flip(0)
-            for neighbour in partners[: settings.neighbours].tolist():
+            by_age = list(range(keyframe - 1, -1, -1))
+            partners = neighbours.tolist() if settings.partners == "covisible" else by_age
+            for neighbour in partners[: settings.neighbours]:
                 triangulate_against(self.map, keyframe, neighbour, self.camera, self.config)
-            self.map.refresh(torch.tensor([keyframe]))
+            self.map.refresh(self.map.ids(keyframe))
             if settings.fuse:
                 self.fuse(keyframe, neighbours)
         if self.config.bundle.enabled:
@@ -79,7 +80,7 @@ class Mapper:
 
     def fuse(self, keyframe: int, neighbours: Tensor) -> None:
         """Find the points of this keyframe in its neighbours and theirs in it; merge what turns out to be one point."""
-        own = self.map.points_seen_by(torch.tensor([keyframe]))
+        own = self.map.points_seen_by(self.map.ids(keyframe))
         self._merge([self._find_in(neighbour, own) for neighbour in neighbours.tolist()])
         self._merge([self._find_in(keyframe, self.map.points_seen_by(neighbours))])
 

@@ -53,7 +53,7 @@ def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Ca
 def has_baseline(slam_map: Map, keyframe: int, neighbour: int, least: float) -> bool:
     """Whether the two are apart by a share of the median depth that the neighbour sees."""
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbour]
-    seen = slam_map.points_seen_by(torch.tensor([neighbour]))
+    seen = slam_map.points_seen_by(slam_map.ids(neighbour))
     depth = transform(T_2w, slam_map.positions_w[seen])[:, 2].median()
     baseline = torch.linalg.vector_norm(se3_inverse(T_1w)[:3, 3] - se3_inverse(T_2w)[:3, 3])
     return bool(baseline > least * depth)

@@ -29,7 +29,10 @@ MIN_KEYFRAMES = 4  # a map that is lost before it has this many was a bad start
 
 
 class SLAM:
-    """Give it frames one after the other; ask it for the map and the trajectory at any time."""
+    """Give it frames one after the other; ask it for the map and the trajectory at any time.
+
+    It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
+    """
 
     def __init__(
         self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
@@ -37,7 +40,7 @@ class SLAM:
         self.config = config or Config()
         self.camera = camera.to(torch.float64)
         if extractor is None and self.config.features.kind != "simulated":
-            extractor = image_extractor(self.config)
+            extractor = image_extractor(self.config, self.camera.params.device)
         self.extractor = extractor  # None: `run` makes simulated features from the true poses of the sequence
         self.clock = Stopwatch()
         self.reset()
@@ -62,7 +65,7 @@ class SLAM:
                 "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
             )
         with self.clock("features"):
-            view = View.of(frame, self.extractor(frame), self.camera.params.dtype)
+            view = View.of(frame, self.extractor(frame), self.camera.params)
         if self.state is State.INITIALIZING:
             return self._initialize(view)
         with self.clock("tracking"):

@@ -46,13 +46,11 @@ class Tracker:
         self.map = slam_map
         self.reference = -1  # keyframe
         self.reference_size = 0  # points of the reference keyframe that other keyframes see too
-        self.T_cr = torch.eye(
-            4, dtype=camera.params.dtype
-        )  # last frame, seen from the reference: it moves with the map
+        # The last frame, seen from the reference: it moves with the map.
+        self.T_cr = torch.eye(4, dtype=camera.params.dtype, device=camera.params.device)
         self.velocity: Tensor | None = None  # last motion, T_c_previous
-        self.seen_last = torch.empty(0, dtype=torch.int64)
-        self.local_keyframes = torch.empty(0, dtype=torch.int64)
-        self.local_points = torch.empty(0, dtype=torch.int64)
+        nobody = torch.empty(0, dtype=torch.int64, device=camera.params.device)
+        self.seen_last, self.local_keyframes, self.local_points = nobody, nobody, nobody
         self.lost_for = 0
 
     # --- state -----------------------------------------------------------------------------------------------
@@ -137,7 +135,7 @@ class Tracker:
         count = self.map.num_keyframes
         for offset in range(min(3, count)):
             keyframe = (count - 1 - 3 * (self.lost_for - 1) - offset) % count
-            ids = self.map.points_seen_by(torch.tensor([keyframe]))
+            ids = self.map.points_seen_by(self.map.ids(keyframe))
             yield match_points(self.map, ids, view, self.config.matching)
 
     def _locate(self, view: View, point_ids: Tensor, keypoints: Tensor) -> Tracked | None:

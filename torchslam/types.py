@@ -97,17 +97,18 @@ class View:
     T_cw_groundtruth: Tensor | None = None
 
     @classmethod
-    def of(cls, frame: Frame, features: Features, dtype: torch.dtype) -> View:
-        """The first element of a batch of features, in the dtype of the geometry."""
+    def of(cls, frame: Frame, features: Features, like: Tensor) -> View:
+        """The first element of a batch of features, with the device and the floating-point dtype of `like`."""
+        features, truth = features.to(like.device), frame.T_cw_groundtruth
         return cls(
             frame.index,
             frame.timestamp,
-            features.keypoints[0].to(dtype),
-            features.scales[0].to(dtype),
-            features.angles[0].to(dtype),
+            features.keypoints[0].to(like.dtype),
+            features.scales[0].to(like.dtype),
+            features.angles[0].to(like.dtype),
             features.descriptors[0],
             features.mask[0],
-            None if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth.to(dtype),
+            None if truth is None else truth.to(like),
         )
 
     @property

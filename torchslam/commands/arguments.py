@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import torch
+
 from torchslam.config import CHOICES, Config, load_config
 from torchslam.data import Sequence, open_sequence
 
@@ -54,6 +56,26 @@ def config(options: argparse.Namespace) -> Config:
     }
     own = [f"{key}={value}" for key, value in named.items() if value is not None]
     return load_config(options.config, [*options.overrides, *own])
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device",
+        type=_device,
+        default=torch.device("cpu"),
+        metavar="DEVICE",
+        help="where to compute, for example cuda (default: %(default)s)",
+    )
+
+
+def _device(text: str) -> torch.device:
+    try:
+        device = torch.device(text)
+        torch.zeros(1, device=device).item()  # "meta" only pretends to compute
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise argparse.ArgumentTypeError(f"{text!r} cannot be used here: {reason}") from None
+    return device
 
 
 def _positive(text: str) -> int:

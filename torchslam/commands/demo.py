@@ -16,8 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", "-o", type=Path, default=Path("results/demo"), metavar="DIR", help="default: %(default)s"
     )
+    arguments.add_device(parser)
     arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    return run(open_sequence(SEQUENCE), arguments.config(options), options.output)
+    return run(open_sequence(SEQUENCE), arguments.config(options), options.output, options.device)

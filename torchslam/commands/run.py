@@ -9,6 +9,8 @@ import argparse
 import sys
 from pathlib import Path
 
+import torch
+
 from torchslam.commands import arguments
 from torchslam.commands.progress import ProgressBar
 from torchslam.config import Config
@@ -31,17 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
     )
+    arguments.add_device(parser)
     arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    return run(arguments.sequence(options), arguments.config(options), options.output)
+    return run(arguments.sequence(options), arguments.config(options), options.output, options.device)
 
 
-def run(sequence: Sequence, config: Config, output: Path) -> int:
+def run(sequence: Sequence, config: Config, output: Path, device: torch.device) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     output.mkdir(parents=True, exist_ok=True)  # better now than after an hour's run
-    slam = SLAM(sequence.camera, config)
+    slam = SLAM(sequence.camera.to(device), config)
     with ProgressBar(len(sequence), lambda: slam.map.num_points) as progress:
         finished = slam.run(sequence, progress.update)
     figures = metrics(finished, _evaluate(finished, sequence))

@@ -21,7 +21,8 @@ class SimulatedFeatures:
     noise_px:   standard deviation of the keypoints
     outliers:   share of the keypoints that lie at a uniformly random place of the image
     dropout:    share of the visible points that a frame misses
-    Each frame draws from a generator seeded by (seed, frame), so frames can be asked for in any order.
+    Each frame draws from a generator seeded by (seed, frame), so frames can be asked for in any order. The scene lies
+    on the CPU, whose generator draws the same everywhere; features go where the frame's pose is.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class SimulatedFeatures:
         dropout: float = 0.0,
         seed: int = 0,
     ) -> None:
-        self.camera = camera
+        self.camera, T_cw = camera.to("cpu"), T_cw.cpu()
         self.num_keypoints = num_keypoints
         self.noise_px, self.outliers, self.dropout, self.seed = noise_px, outliers, dropout, seed
         T_wc = se3_inverse(T_cw)
@@ -82,6 +83,7 @@ class SimulatedFeatures:
     def __call__(self, T_cw: Tensor, frame_index: int) -> Features:
         """Features (batch of one) of the frame with this true pose (4, 4)."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + frame_index)
+        device, T_cw = T_cw.device, T_cw.cpu()
         width, height = self.camera.size
         pixels, visible = self._visible(T_cw, self.points_w)
         ids = torch.nonzero(visible)[:, 0]
@@ -94,7 +96,7 @@ class SimulatedFeatures:
         anywhere = torch.rand(len(ids), 2, generator=generator, dtype=pixels.dtype)
         is_outlier = torch.rand(len(ids), 1, generator=generator) < self.outliers
         keypoints = torch.where(is_outlier, anywhere * pixels.new_tensor([width - 1, height - 1]), keypoints)
-        return self._padded(keypoints, self.descriptors[ids])
+        return self._padded(keypoints, self.descriptors[ids]).to(device)
 
     def _padded(self, keypoints: Tensor, descriptors: Tensor) -> Features:
         n, N = len(keypoints), self.num_keypoints

@@ -1,0 +1,116 @@
+"""The whole system on another device gives what it gives on the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.accelerator import SimulatedTensor
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc
+from torchslam import ORB, SLAM, ClipSLAM, evaluate, load_config, open_sequence, solve
+from torchslam.cli import main
+from torchslam.evaluation import ate
+
+CPU = torch.device("cpu")
+NOISY = ["features.kind=simulated", "simulated.noise_px=0.3", "simulated.outliers=0.1"]
+# Rounding differs between devices, and grows from keyframe to keyframe.
+TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
+
+
+def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
+    """What a run on a device finds, and the gradient of its error."""
+    config = load_config(None, [*NOISY, "tracking.gate=mahalanobis"])
+    run = SLAM(walk.camera.to(device), config).run(walk)
+    assert run.trajectory.T_wc.device.type == device.type
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
+    graph = run.graph
+    pixels = graph.pixels.clone().requires_grad_()
+    camera = graph.camera.with_params(graph.camera.params.clone().requires_grad_())
+    solution = solve(replace(graph, pixels=pixels, camera=camera))
+    ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids.cpu()].to(device)).backward()
+    assert pixels.grad is not None
+    assert camera.params.grad is not None
+    covariances = solution.keyframes.covariance().frames
+    found = {"T_wc": run.trajectory.T_wc, "camera": camera.params.grad, "covariances": covariances}
+    return {name: tensor.detach().cpu() for name, tensor in found.items()}
+
+
+def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
+    walk = Walk(arc(10))
+    expected = gradients(walk, CPU)
+    for name, found in gradients(walk, device).items():
+        torch.testing.assert_close(found, expected[name], **TOLERANCE)
+
+
+@pytest.mark.parametrize("front_end", ["orb", "opencv-orb"])
+def test_images(device: torch.device, front_end: str) -> None:
+    sequence = open_sequence("synthetic:room").part(0, 18, 2)
+    config = load_config(None, [f"features.kind={front_end}", "features.num_keypoints=300"])
+    expected, found = (SLAM(sequence.camera.to(d), config).run(sequence).trajectory for d in (CPU, device))
+    assert len(expected) == 9
+    torch.testing.assert_close(found.T_wc.cpu(), expected.T_wc, rtol=1e-2, atol=1e-2)
+
+
+def test_a_clip_is_differentiated_on_its_device(device: torch.device) -> None:
+    sequence = open_sequence("synthetic:room").part(0, 12, 2)
+    images = torch.stack([frame.image[0] for frame in sequence]).to(device).requires_grad_()
+    clip_slam = ClipSLAM(ORB(300, differentiable=True).to(device))
+    poses = clip_slam(images, sequence.camera.to(device))
+    assert poses.posed.all()
+    poses.T_cw.sum().backward()
+    assert images.grad is not None
+    assert images.grad.device.type == device.type
+    assert float(images.grad.abs().sum()) > 0
+
+
+def test_results_of_a_run_elsewhere_are_written(device: torch.device, tmp_path: Path) -> None:
+    arguments = [
+        "run",
+        "synthetic:room",
+        "--limit",
+        "10",
+        "--features",
+        "simulated",
+        "--device",
+        str(device),
+        "-o",
+        str(tmp_path),
+    ]
+    assert main(arguments) == 0
+    assert (tmp_path / "map.safetensors").stat().st_size > 0
+    assert (tmp_path / "plots" / "top_view.png").exists()
+
+
+def test_the_command_names_devices_that_cannot_be_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("quark", "meta"):
+        with pytest.raises(SystemExit):
+            main(["run", "synthetic:room", "--device", name, "-o", str(tmp_path)])
+        assert f"'{name}' cannot be used here" in capsys.readouterr().err
+
+
+def test_the_simulated_accelerator_does_not_mix_devices(device: torch.device) -> None:
+    """It is worth something only as far as it refuses what CUDA refuses."""
+    if device.type == "cpu":
+        pytest.skip("one device alone mixes with nothing")
+    there, here = torch.ones(3, device=device), torch.ones(3)
+    assert device.type != "sim" or isinstance(there, SimulatedTensor)
+    for mixed in (
+        lambda: there + here,
+        lambda: torch.cat([there, here]),
+        lambda: there @ here,
+        lambda: here[there > 0],
+        lambda: torch.where(there > 0, there, here),
+        lambda: torch.rand(3, generator=torch.Generator(), device=device),
+    ):
+        with pytest.raises(RuntimeError):
+            mixed()
+    assert (there * torch.tensor(2.0)).tolist() == [2, 2, 2]
+    assert there[torch.tensor([0, 2])].tolist() == [1, 1]
+    assert torch.equal(there.cpu(), here)
