@@ -10,7 +10,7 @@ import torch
 from torchslam.config import Config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
-from torchslam.evaluation import evaluate
+from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.output.report import metrics
 from torchslam.slam import SLAM
 
@@ -34,8 +34,9 @@ def figures(sequence: Sequence, config: Config) -> dict:
     """Run a sequence and return its metrics, with `failure` where there is no map."""
     torch.set_num_threads(1)
     run = SLAM(sequence.camera, config).run(sequence)
-    enough = sequence.groundtruth is not None and len(run.trajectory) >= 3
-    evaluation = evaluate(run.trajectory, sequence.groundtruth) if enough else None
+    evaluation = None
+    if sequence.groundtruth is not None and len(run.trajectory) >= MIN_POSES:
+        evaluation = evaluate(run.trajectory, sequence.groundtruth)
     return metrics(run, evaluation) | {"failure": run.failure}
 
 

@@ -13,6 +13,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ def read(data: Path, sequence: str) -> list[Path]:
 
 
 def grey(path: Path) -> NDArray:
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise SystemExit(f"{path}: cannot be read")
+    return image
 
 
 def in_turns(tasks: dict[str, Callable[[], Any]], rounds: int = 30) -> dict[str, float]:
@@ -159,9 +163,9 @@ def speed_tables(image: NDArray, compiled: bool) -> list[str]:
     modules = {"torchslam": ORB(1000)} | (
         {"torchslam, compiled": ORB(1000, compile=True)} if compiled else {}
     )
-    times = {}
+    times: dict[str, tuple[float, float]] = {}
     for name, module in modules.items():
-        pair = in_turns({name: lambda m=module: m(tensor), "cv2": lambda: peer.detectAndCompute(image, None)})
+        pair = in_turns({name: partial(module, tensor), "cv2": lambda: peer.detectAndCompute(image, None)})
         times |= {name: (pair[name], pair["cv2"])}
     lines = ["| ORB, 1000 keypoints, 640x480 | ms | cv2.ORB | ratio |", "|---|---|---|---|"]
     lines += [f"| {name} | {a:.1f} | {b:.1f} | {a / b:.1f} |" for name, (a, b) in times.items()]
@@ -172,8 +176,8 @@ def speed_tables(image: NDArray, compiled: bool) -> list[str]:
         arrays = a.descriptors[0].numpy(), b.descriptors[0].numpy()
         t = in_turns(
             {
-                "ours": lambda a=a, b=b: match(a, b, ratio=None, max_distance=None),
-                "cv2": lambda arrays=arrays: matcher.match(*arrays),
+                "ours": partial(match, a, b, ratio=None, max_distance=None),
+                "cv2": partial(matcher.match, *arrays),
             }
         )
         lines.append(f"| {count} x {count} | {t['ours']:.2f} | {t['cv2']:.2f} | {t['ours'] / t['cv2']:.2f} |")
@@ -186,7 +190,7 @@ def speed_tables(image: NDArray, compiled: bool) -> list[str]:
         a, b = random_descriptors(points, 0), random_descriptors(keypoints, 1)
         t = in_turns(
             {
-                str(radius): lambda a=a, b=b, r=radius: match_projected(a.descriptors, a.keypoints, r, b)
+                str(radius): partial(match_projected, a.descriptors, a.keypoints, radius, b)
                 for radius in (15.0, 50.0)
             }
         )

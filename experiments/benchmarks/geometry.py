@@ -14,6 +14,7 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -68,16 +69,14 @@ def relative(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
         x_1, x_2, R, t, _ = problems.two_view(seed, 500, outliers)
         options = {"max_epipolar_error": RELATIVE_THRESHOLD}
         ms, (pose, _) = timed(
-            lambda x_1=x_1, x_2=x_2, options=options: poselib.estimate_relative_pose(
-                x_1, x_2, POSELIB_CAMERA, POSELIB_CAMERA, options, {}
-            )
+            partial(poselib.estimate_relative_pose, x_1, x_2, POSELIB_CAMERA, POSELIB_CAMERA, options, {})
         )
         theirs.append(
             Errors(ms, problems.rot_err_deg(R, pose.R), problems.dir_err_deg(t, pose.t, signed=True))
         )
-        matches = batch_of_one(x_1, x_2)
+        one, two = batch_of_one(x_1, x_2)
         ms, found = timed(
-            lambda matches=matches: estimate_relative_pose(*matches, CAMERA, CAMERA, RELATIVE_THRESHOLD)
+            partial(estimate_relative_pose, one, two, CAMERA, CAMERA, threshold=RELATIVE_THRESHOLD)
         )
         T_21 = found.T_21[0].numpy()
         rotation, direction = T_21[:3, :3], T_21[:3, 3]
@@ -94,13 +93,11 @@ def absolute(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
         points, pixels, R, t, _ = problems.pnp(seed, 300, outliers)
         options = {"max_reproj_error": ABSOLUTE_THRESHOLD}
         ms, (pose, _) = timed(
-            lambda points=points, pixels=pixels, options=options: poselib.estimate_absolute_pose(
-                pixels, points, POSELIB_CAMERA, options, {}
-            )
+            partial(poselib.estimate_absolute_pose, pixels, points, POSELIB_CAMERA, options, {})
         )
         theirs.append(Errors(ms, problems.rot_err_deg(R, pose.R), float(np.linalg.norm(t - pose.t))))
-        pairs = batch_of_one(points, pixels)
-        ms, found = timed(lambda pairs=pairs: estimate_absolute_pose(*pairs, CAMERA, ABSOLUTE_THRESHOLD))
+        one, two = batch_of_one(points, pixels)
+        ms, found = timed(partial(estimate_absolute_pose, one, two, CAMERA, threshold=ABSOLUTE_THRESHOLD))
         T_cw = found.T_cw[0].numpy()
         ours.append(Errors(ms, problems.rot_err_deg(R, T_cw[:3, :3]), float(np.linalg.norm(t - T_cw[:3, 3]))))
     return ours, theirs
@@ -138,7 +135,8 @@ def models(problems: ModuleType, baseline: float, expected: str, count: int = 50
     seen, ambiguous, errors = Counter[str](), 0, []
     for seed in range(count):
         x_1, x_2, _, t = plane(problems, seed, baseline)
-        found = estimate_relative_pose(*batch_of_one(x_1, x_2), CAMERA, CAMERA, RELATIVE_THRESHOLD)
+        one, two = batch_of_one(x_1, x_2)
+        found = estimate_relative_pose(one, two, CAMERA, CAMERA, RELATIVE_THRESHOLD)
         seen[found.model[0]] += 1
         ambiguous += int(found.ambiguous.item())
         if found.success.item():
@@ -192,8 +190,8 @@ def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> str:
         ratio = statistics.mean(mine) / statistics.mean(peer)
         cells.append(f"{statistics.mean(mine):.{digits}f} / {statistics.mean(peer):.{digits}f} ({ratio:.2f})")
     cells.append(f"{max(errors.rotation for errors in ours):.2f}")
-    mine, peer = (statistics.median(errors.ms for errors in group) for group in (ours, theirs))
-    cells.append(f"{mine:.1f} / {peer:.1f} ({mine / peer:.2f})")
+    my_ms, peer_ms = (statistics.median(errors.ms for errors in group) for group in (ours, theirs))
+    cells.append(f"{my_ms:.1f} / {peer_ms:.1f} ({my_ms / peer_ms:.2f})")
     return f"| {what} | " + " | ".join(cells) + " |"
 
 

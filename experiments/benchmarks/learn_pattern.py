@@ -59,7 +59,7 @@ def warped(image: np.ndarray, warp: np.ndarray, rng: np.random.Generator) -> np.
     shrink = np.sqrt(abs(np.linalg.det(warp[:2, :2])))
     if shrink < 1:
         image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / shrink**2 - 1) + 1e-3)
-    out = cv2.warpPerspective(image, warp, image.shape[::-1]).astype(np.float64)
+    out: np.ndarray = cv2.warpPerspective(image, warp, image.shape[::-1]).astype(np.float64)
     if rng.random() < 0.5:
         out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.5))
     out = out * rng.uniform(0.6, 1.3) + rng.uniform(-20, 20) + rng.normal(0, rng.uniform(0, 8), out.shape)
@@ -84,6 +84,8 @@ def matching_samples(data: Path, rng: np.random.Generator) -> tuple[Tensor, Tens
         paths = sorted((data / name / "rgb").iterdir())
         for path in paths[:: max(1, len(paths) // IMAGES_EACH[name])]:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                raise SystemExit(f"{path}: cannot be read")
             keypoints, level, values = samples(orb, image)
             for _ in range(WARPS_EACH):
                 warp = random_warp(rng, *image.shape)

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from torchslam.geometry import Camera, transform
 from torchslam.graph import GraphSolution, ObservationGraph, solve
-from torchslam.solvers.robust import robustify
+from torchslam.solvers.robust import Kernel, robustify
 
-KERNEL, SCALE = "huber", 2.45
+KERNEL: Kernel = "huber"
+SCALE = 2.45
 _MAX_STEP = 0.1
 _CONVERGED = 1e-5
 
@@ -82,7 +83,8 @@ def least_cost(graph: ObservationGraph, theta: Tensor) -> LeastCost:
     cost, count = _cost(graph, solution, with_parameters(graph.camera, direct))
     (gradient,) = torch.autograd.grad(cost, direct, create_graph=True)
     rows = [
-        sum(torch.autograd.grad(component, (through, direct), retain_graph=True)) for component in gradient
+        torch.stack(torch.autograd.grad(component, (through, direct), retain_graph=True)).sum(0)
+        for component in gradient
     ]
     hessian = torch.stack(rows)
     moved = 6 * (len(graph.T_cw) - 1) + 3 * int(solution.keyframes.moved_points.sum())

@@ -119,8 +119,8 @@ def colmap_of(case: Case) -> Camera | None:
     if case.simulated or not file.exists():
         return None
     model = json.loads(file.read_text())["RADIAL" if case.num_radial else "SIMPLE_PINHOLE"]
-    f, size = model["focal"], (0, 0)
-    return Camera.radial_tangential(f, f, 0.0, 0.0, *(model["distortion"] or [0.0, 0.0]), 0.0, 0.0, size=size)
+    f, (k1, k2) = model["focal"], model["distortion"] or (0.0, 0.0)
+    return Camera.radial_tangential(f, f, 0.0, 0.0, k1, k2, 0.0, 0.0, size=(0, 0))
 
 
 def calibrated_in_rounds(case: Case, sequence: Sequence, factor: float, frames: int) -> list[str]:
