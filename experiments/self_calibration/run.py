@@ -43,8 +43,8 @@ SIMULATED = ("features.kind=simulated", "simulated.points_per_view=300")
 CASES = [
     Case("simulated, exact", "synthetic:room", 60, 2, SIMULATED),
     Case("simulated, 0.5 px", "synthetic:room", 120, 2, (*SIMULATED, "simulated.noise_px=0.5")),
-    Case("redkitchen", "redkitchen", 200, 0),
-    Case("redkitchen, distortion free", "redkitchen", 200, 2),
+    Case("redkitchen", "redkitchen", 1000, 0),
+    Case("redkitchen, distortion free", "redkitchen", 1000, 2),
     Case("kitti07", "kitti07", 160, 0),
     Case("kitti07, distortion free", "kitti07", 160, 2),
     Case("machine_hall", "machine_hall", 160, 2),
