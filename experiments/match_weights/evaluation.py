@@ -10,16 +10,18 @@ from torch import Tensor
 
 from experiments.match_weights.problems import RANSAC_PX, Problems
 from experiments.match_weights.weighting import MatchWeights, propagated_variances, refine, refine_learned
+from torchslam.geometry import transform
 from torchslam.solvers.robust import Kernel
 
 KERNELS: tuple[Kernel, ...] = ("huber", "cauchy", "geman_mcclure", "truncated")
 SCALES = (1.0, 2.0, 4.0)
+ORACLE_PX = 1.5  # of the keypoint's level
 _CHUNK = 64
 
 
-def pose_errors(T: Tensor, problems: Problems) -> Tensor:
+def pose_errors(T: Tensor, T_true: Tensor) -> Tensor:
     """(P, 2) distance of the camera centres in metres and angle in radians; gradients are zero at zero."""
-    difference = T @ torch.linalg.inv(problems.T_true)
+    difference = T @ torch.linalg.inv(T_true)
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     squared = (difference - eye)[:, :3].square()
     # |R - I|_F = 2 sqrt(2) sin(angle / 2)
@@ -28,8 +30,8 @@ def pose_errors(T: Tensor, problems: Problems) -> Tensor:
 
 
 def relative_errors(errors: Tensor, problems: Problems) -> Tensor:
-    """(P,) one number for (P, 2): root of the squares of distance over the scene's depth, and angle."""
-    return torch.hypot(errors[:, 0] / problems.depths, errors[:, 1])
+    """(..., P) one number for (..., P, 2): root of the squares of distance over the scene's depth, and angle."""
+    return torch.hypot(errors[..., 0] / problems.depths, errors[..., 1])
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Propagated(FixedKernel):
     """Refinement with the inverse of the variance that follows from the triangulation: weights by hand."""
 
     def __call__(self, problems: Problems) -> Tensor:
-        return refine(problems, 1 / propagated_variances(problems), self.kernel, self.scale).T_cw
+        weights = 1 / propagated_variances(problems, problems.T_start)
+        return refine(problems, weights, self.kernel, self.scale).T_cw
 
     def __str__(self) -> str:
         return f"{self.kernel}, scale {self.scale:g}, weights from propagated variances"
@@ -78,10 +81,24 @@ class Learned:
     network: MatchWeights
 
     def __call__(self, problems: Problems) -> Tensor:
-        return refine_learned(self.network, problems).T_cw
+        return refine_learned(self.network, problems)[-1].T_cw
 
 
-Method = FixedKernel | Ransac | Learned
+@dataclass(frozen=True)
+class Oracle:
+    """Least squares over the matches that agree with the true pose, as nobody can know: a bound, and no fair one.
+
+    It also picks, among matches of equal quality, those whose noise happens to point towards the truth.
+    """
+
+    def __call__(self, problems: Problems) -> Tensor:
+        projected, valid = problems.camera.project(transform(problems.T_true, problems.points))
+        residuals = (projected - problems.pixels).norm(dim=-1) / problems.cues.scales_query
+        weights = (valid & (residuals < ORACLE_PX)) / problems.cues.scales_query.square()
+        return refine(problems, weights, "none", start=problems.T_true).T_cw
+
+
+Method = FixedKernel | Ransac | Learned | Oracle
 UNIFORM = FixedKernel("cauchy", 1.0)
 
 
@@ -97,23 +114,24 @@ def candidates() -> dict[str, list[Method]]:
 
 
 @torch.no_grad()
-def errors_of(method: Method, problems: Problems) -> Tensor:
-    """(P, 2) metres and radians."""
+def poses_of(method: Method, problems: Problems) -> Tensor:
+    """(P, 4, 4) base to query."""
     parts = [problems[start : start + _CHUNK] for start in range(0, len(problems), _CHUNK)]
-    return torch.cat([pose_errors(method(part), part) for part in parts])
+    return torch.cat([method(part) for part in parts])
 
 
-def choose(methods: list[Method], parts: dict[str, Problems], at_most: int = 64) -> Method:
+def median_error(method: Method, problems: Problems) -> Tensor:
+    """The median relative error against the reference poses."""
+    errors = pose_errors(poses_of(method, problems), problems.T_true)
+    return relative_errors(errors, problems).median()
+
+
+def choose(methods: list[Method], parts: list[Problems], at_most: int = 100) -> Method:
     """The method whose median relative error is lowest, as a geometric mean over parts.
 
     Takes `at_most` problems of each part, evenly spaced.
     """
     if len(methods) == 1:
         return methods[0]
-    thin = [problems[:: -(-len(problems) // at_most)] for problems in parts.values()]
-
-    def score(method: Method) -> float:
-        medians = [relative_errors(errors_of(method, part), part).median() for part in thin]
-        return float(torch.stack(medians).log().mean())
-
-    return min(methods, key=score)
+    thin = [problems[:: -(-len(problems) // at_most)] for problems in parts]
+    return min(methods, key=lambda method: sum(float(median_error(method, part).log()) for part in thin))

@@ -1,12 +1,13 @@
 """Localisation problems from real images: where is a frame, given points triangulated from a few frames before?
 
-Points come from matches of a base frame with two frames before it, triangulated with the true poses; a later frame is
-matched to them by descriptor alone. The world of a problem is the base frame's camera, so errors are in metres without
-any alignment.
+Points come from matches of a base frame with two frames before it, triangulated with the reference poses; a later
+frame is matched to them by descriptor alone. Every problem is made in both directions of time. Its world is the base
+frame's camera, so errors are in metres without any alignment.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, tran
 from torchslam.types import Features
 
 REFERENCES_S = (0.2, 0.4)  # seconds before the base frame that points are triangulated with
-QUERIES_S = (0.5, 1.0, 1.5)  # seconds after it that frames are localised
+QUERIES_S = (0.5, 1.0, 2.0)  # seconds after it that frames are localised
 BASES_PER_SECOND = 10
 MAX_MATCHES = 400
 MIN_MATCHES = 30
@@ -37,8 +38,11 @@ _CHUNK = 64
 class Cues:
     """What is known of matches before any pose, (P, N) each.
 
-    distances, seconds:         bits, to the matched keypoint and to the nearest other keypoint of the query
+    distances:                  bits, between the keypoint of the query and that of the base
+    seconds_query:              bits, from the keypoint of the base to the second nearest one of the query
+    seconds_base:               bits, from the keypoint of the query to the second nearest one with a point
     scales_query, scales_base:  pixels
+    scores_query, scores_base:  logarithms of the detector's response, over the image's median
     turns:                      radians between the keypoints' directions
     parallaxes:                 radians, largest between the views that made the point
     views:                      their number
@@ -46,9 +50,12 @@ class Cues:
     """
 
     distances: Tensor
-    seconds: Tensor
+    seconds_query: Tensor
+    seconds_base: Tensor
     scales_query: Tensor
     scales_base: Tensor
+    scores_query: Tensor
+    scores_base: Tensor
     turns: Tensor
     parallaxes: Tensor
     views: Tensor
@@ -64,7 +71,9 @@ class Problems:
     pixels:      (P, N, 2) in the query, undistorted, relative to the principal point
     mask:        (P, N) bool
     focals:      (P,) pixels
-    T_true:      (P, 4, 4) base to query
+    T_true:      (P, 4, 4) base to query, by the reference poses
+    T_given:     (P, 4, 4) the same by the ground truth that comes with the sequence
+    spans:       (P, 2) seconds from the start of the sequence to the first and to the last of a problem's frames
     T_ransac:    (P, len(RANSAC_PX), 4, 4) by threshold
     """
 
@@ -75,6 +84,8 @@ class Problems:
     cues: Cues
     focals: Tensor
     T_true: Tensor
+    T_given: Tensor
+    spans: Tensor
     T_ransac: Tensor
 
     def __len__(self) -> int:
@@ -156,31 +167,47 @@ class _Landmarks:
     mask: Tensor
 
 
-def make_problems(sequence: Sequence, part: range) -> Problems:
-    """The problems of a sequence with all their frames in a part of it, in the order of time."""
+def make_problems(sequence: Sequence, part: range, T_cw: Tensor) -> Problems:
+    """The problems of a sequence with all their frames in a part of it; T_cw (frames, 4, 4), NaN where unknown."""
     rate = sequence.frame_rate
     back = [max(1, round(s * rate)) for s in REFERENCES_S]
     ahead = [max(1, round(s * rate)) for s in QUERIES_S]
     step = max(1, round(rate / BASES_PER_SECOND))
-    frames = _Frames(sequence)
-    problems: list[Problems] = []
-    for base in range(part.start + back[-1], part.stop, step):
-        landmarks = _triangulate(frames, base, [base - offset for offset in back])
-        queries = [base + offset for offset in ahead if base + offset < part.stop]
-        found = [_localisation(frames, base, query, landmarks) for query in queries]
-        problems += [problem for problem in found if problem is not None]
-    return with_ransac(Problems.cat(problems))
+    frames = _Frames(sequence, T_cw)
+    problems: list[Problems | None] = []
+    for base, direction in itertools.product(part[::step], (1, -1)):
+        references = [base - direction * offset for offset in back]
+        if not frames.usable([base, *references], part):
+            continue
+        landmarks = _triangulate(frames, base, references)
+        queries = [base + direction * offset for offset in ahead]
+        problems += [
+            _localisation(frames, references, base, query, landmarks)
+            for query in queries
+            if frames.usable([query], part)
+        ]
+    return with_ransac(Problems.cat([problem for problem in problems if problem is not None]))
 
 
 class _Frames:
-    """Keypoints as a camera without distortion sees them, and true poses, by index; every image is read once."""
+    """Keypoints as a camera without distortion sees them, and poses, by index; every image is read once."""
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: Sequence, T_cw: Tensor) -> None:
         self.sequence = sequence
+        self.T_cw = T_cw
         self.focal = float(sequence.camera.focal)
         self.camera = Camera.pinhole(self.focal, self.focal, 0.0, 0.0, size=sequence.size)
         self._orb = ORB(1000)
         self._features: dict[int, Features] = {}
+
+    def usable(self, indices: list[int], part: range) -> bool:
+        """Whether all frames are in a part and have both poses."""
+        return all(
+            index in part
+            and self.sequence.pose(index) is not None
+            and bool(torch.isfinite(self.T_cw[index]).all())
+            for index in indices
+        )
 
     def features(self, index: int) -> Features:
         if index not in self._features:
@@ -191,18 +218,17 @@ class _Frames:
         """(N, 2) float64."""
         return self.sequence.camera.normalize(self.features(index).keypoints[0].double()) * self.focal
 
-    def pose(self, index: int) -> Tensor:
+    def given_pose(self, index: int) -> Tensor:
         T_cw = self.sequence.pose(index)
-        if T_cw is None:
-            raise ValueError(f"frame {index} of {self.sequence.name} has no true pose")
+        assert T_cw is not None, "frames are checked before they are used"
         return T_cw
 
 
 def _triangulate(frames: _Frames, base: int, references: list[int]) -> _Landmarks:
-    """Points from a base frame and references, from the views that agree with the true poses."""
-    T_wb = se3_inverse(frames.pose(base))
+    """Points from a base frame and references, from the views that agree with the reference poses."""
+    T_wb = se3_inverse(frames.T_cw[base])
     features = frames.features(base)
-    T_vb = torch.stack([frames.pose(view) @ T_wb for view in (base, *references)])
+    T_vb = frames.T_cw[[base, *references]] @ T_wb
     pixels, scales, seen = [frames.pixels(base)], [features.scales[0].double()], [features.mask[0]]
     for view in references:
         other = frames.features(view)
@@ -236,7 +262,9 @@ def _covariances(points: Tensor, T_vb: Tensor, weights: Tensor, camera: Camera, 
     return torch.where((singular == 0)[:, None, None], covariances, eye)
 
 
-def _localisation(frames: _Frames, base: int, query: int, landmarks: _Landmarks) -> Problems | None:
+def _localisation(
+    frames: _Frames, references: list[int], base: int, query: int, landmarks: _Landmarks
+) -> Problems | None:
     """The problem of one query frame, still without RANSAC; None where it has too few matches."""
     features_base, features_query = frames.features(base), frames.features(query)
     known = Features(
@@ -252,20 +280,24 @@ def _localisation(frames: _Frames, base: int, query: int, landmarks: _Landmarks)
     if len(row) < MIN_MATCHES:
         return None
     column = matches.indices_2[0][row]
-    distances = hamming(features_base.descriptors[0, row], features_query.descriptors[0]).float()
-    distances = distances.masked_fill(~features_query.mask, torch.inf)
-    nearest = distances.topk(2, largest=False).values
+    bits = hamming(features_base.descriptors[0], features_query.descriptors[0]).float()
+    bits = bits.masked_fill(~(landmarks.mask[:, None] & features_query.mask[0]), 256.0)
     turn = features_query.angles[0][column] - features_base.angles[0][row]
     cues = Cues(
-        nearest[:, 0],
-        nearest[:, 1],
+        bits[row, column],
+        bits[row].topk(2, largest=False).values[:, 1],
+        bits[:, column].topk(2, dim=0, largest=False).values[1],
         features_query.scales[0][column],
         features_base.scales[0][row],
+        _log_scores(features_query)[column],
+        _log_scores(features_base)[row],
         torch.atan2(turn.sin(), turn.cos()),
         landmarks.parallaxes[row],
         landmarks.views[row],
         landmarks.errors[row],
     )
+
+    times = (frames.sequence.timestamps - frames.sequence.timestamps[0])[[*references, base, query]]
 
     def padded(values: Tensor) -> Tensor:
         return torch.cat([values, values[:1].expand(MAX_MATCHES - len(values), *values.shape[1:])])[None]
@@ -277,9 +309,17 @@ def _localisation(frames: _Frames, base: int, query: int, landmarks: _Landmarks)
         torch.arange(MAX_MATCHES)[None] < len(row),
         _each(lambda x: padded(x.double()), cues),
         torch.tensor([frames.focal], dtype=torch.float64),
-        (frames.pose(query) @ se3_inverse(frames.pose(base)))[None],
+        (frames.T_cw[query] @ se3_inverse(frames.T_cw[base]))[None],
+        (frames.given_pose(query) @ se3_inverse(frames.given_pose(base)))[None],
+        torch.stack([times.min(), times.max()])[None],
         torch.empty(1, 0, 4, 4, dtype=torch.float64),
     )
+
+
+def _log_scores(features: Features) -> Tensor:
+    """(K,) of the keypoints of one image."""
+    logarithms = features.scores[0].clamp_min(1e-12).log()
+    return logarithms - logarithms[features.mask[0]].median()
 
 
 def with_ransac(problems: Problems) -> Problems:

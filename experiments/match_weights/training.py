@@ -16,7 +16,7 @@ from experiments.match_weights.evaluation import UNIFORM, pose_errors
 from experiments.match_weights.problems import Problems
 from experiments.match_weights.weighting import MatchWeights, refine, refine_learned
 
-SHARDS = 4  # of a batch; the number of processes divides it
+SHARDS = 2  # of a batch; the number of processes divides it
 _CHUNK = 64
 
 
@@ -37,9 +37,11 @@ def losses(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
 
     Grows like a logarithm, so that the problems in the middle count, not the hopeless ones; zero on failure.
     """
-    refined = refine_learned(network, problems)
-    errors = pose_errors(refined.T_cw, problems)
-    return torch.where(refined.success, (errors / units).log1p().sum(-1), 0.0)
+    total = torch.zeros_like(units[:, 0])
+    for refined in refine_learned(network, problems):
+        errors = pose_errors(refined.T_cw, problems.T_true)
+        total = total + torch.where(refined.success, (errors / units).log1p().sum(-1), 0.0)
+    return total
 
 
 @torch.no_grad()
@@ -51,13 +53,18 @@ def expected_errors(problems: Problems) -> Tensor:
     return variances.unflatten(-1, (2, 3)).sum(-1).clamp_min(1e-12).sqrt()
 
 
-def train(network: MatchWeights, problems: Problems, settings: Settings) -> list[float]:
-    """Fit the network in place; returns the mean loss of every step, the same on every process."""
+def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> list[float]:
+    """Fit the network in place, every part being drawn as often as any other.
+
+    Returns the mean loss of every step, the same on every process.
+    """
     rank, ranks = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
     if SHARDS % ranks or settings.batch % SHARDS:
         raise ValueError(
             f"a batch of {settings.batch} in {SHARDS} shards does not divide among {ranks} processes"
         )
+    problems, sizes = Problems.cat(parts), torch.tensor([len(part) for part in parts])
+    first = sizes.cumsum(0) - sizes
     units = expected_errors(problems)
     parameters = list(network.parameters())
     optimizer = torch.optim.AdamW(parameters, settings.learning_rate, weight_decay=settings.weight_decay)
@@ -65,7 +72,8 @@ def train(network: MatchWeights, problems: Problems, settings: Settings) -> list
     generator = torch.Generator().manual_seed(settings.seed)
     history = []
     for _ in range(settings.steps):
-        rows = torch.randint(len(problems), (settings.batch,), generator=generator)
+        part = torch.randint(len(parts), (settings.batch,), generator=generator)
+        rows = first[part] + (torch.rand(settings.batch, generator=generator) * sizes[part]).long()
         keys = torch.rand(settings.batch, problems.mask.shape[1], generator=generator)
         shards = list(zip(rows.chunk(SHARDS), keys.chunk(SHARDS), strict=True))
         mine = [
@@ -76,8 +84,8 @@ def train(network: MatchWeights, problems: Problems, settings: Settings) -> list
         ]
         mean = _gathered(torch.stack(mine), ranks).sum(0) / settings.batch
         history.append(float(mean[-1]))
-        sizes = [parameter.numel() for parameter in parameters]
-        for parameter, gradient in zip(parameters, mean[:-1].split(sizes), strict=True):
+        numbers = [parameter.numel() for parameter in parameters]
+        for parameter, gradient in zip(parameters, mean[:-1].split(numbers), strict=True):
             parameter.grad = gradient.view_as(parameter).clone()
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()

@@ -10,19 +10,25 @@ from torchslam.geometry import transform
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.solvers.robust import Kernel
 
-NUM_FEATURES = 17
-KERNEL: Kernel = "geman_mcclure"
-SCALE = 2.0
-ITERATIONS = 15
-TOLERANCE = 1e-8
+NUM_FEATURES = 21
+ROUNDS = 2
+KERNEL: Kernel = "cauchy"
+SCALE = 1.0
+ITERATIONS = 10
+TOLERANCE = 1e-7
+NEIGHBOURHOOD = 0.06  # radius in focal lengths
 
 
 def refine(
-    problems: Problems, weights: Tensor | None = None, kernel: Kernel = KERNEL, scale: float = SCALE
+    problems: Problems,
+    weights: Tensor | None = None,
+    kernel: Kernel = KERNEL,
+    scale: float = SCALE,
+    start: Tensor | None = None,
 ) -> RefinedPose:
-    """Poses from the start that RANSAC found, with weights (P, N) in px^-2, one if None."""
+    """Poses from a start (P, 4, 4), RANSAC's if None, with weights (P, N) in px^-2, one if None."""
     return refine_pose(
-        problems.T_start,
+        problems.T_start if start is None else start,
         problems.points,
         problems.pixels,
         problems.camera,
@@ -35,19 +41,32 @@ def refine(
     )
 
 
-def refine_learned(network: MatchWeights, problems: Problems) -> RefinedPose:
-    """Poses with learned weights, with gradients to the network."""
-    weights = network(describe(problems), propagated_variances(problems), problems.mask)
-    return refine(problems, weights)
+def refine_learned(network: MatchWeights, problems: Problems) -> list[RefinedPose]:
+    """Poses with learned weights after every round, with gradients to the weights of that round."""
+    T = problems.T_start
+    rounds = []
+    for head in network.heads:
+        weights = head(describe(problems, T), propagated_variances(problems, T), problems.mask)
+        rounds.append(refine(problems, weights, start=T))
+        T = rounds[-1].T_cw.detach()
+    return rounds
 
 
 class MatchWeights(nn.Module):
+    """Weights in rounds: what a match looks like at the pose of the one round is what the next one goes by."""
+
+    def __init__(self, width: int = 32, seed: int = 0) -> None:
+        super().__init__()
+        self.heads = nn.ModuleList(_Head(width, ROUNDS * seed + number) for number in range(ROUNDS))
+
+
+class _Head(nn.Module):
     """Weights from features, each match seen beside the mean of its problem.
 
     The network corrects the inverse of a variance that is known; it starts with no correction at all.
     """
 
-    def __init__(self, width: int = 32, seed: int = 0) -> None:
+    def __init__(self, width: int, seed: int) -> None:
         super().__init__()
         self.local = nn.Linear(NUM_FEATURES, width, dtype=torch.float64)
         self.mixed = nn.Linear(2 * width, width, dtype=torch.float64)
@@ -69,63 +88,74 @@ class MatchWeights(nn.Module):
         return torch.where(mask, logarithm.exp() / variances, 0.0)
 
 
-def describe(problems: Problems) -> Tensor:
+def describe(problems: Problems, T: Tensor) -> Tensor:
     """What the network knows of each match, free of units and of about unit size: (P, N, NUM_FEATURES).
 
-    Residuals, depths and propagated variances are those at the pose that RANSAC found.
+    Residuals, depths and propagated variances are those at the poses T (P, 4, 4).
     """
     cues, mask = problems.cues, problems.mask
-    points_q = transform(problems.T_start, problems.points)
+    points_q = transform(T, problems.points)
     projected, valid = problems.camera.project(points_q)
-    residuals = (projected - problems.pixels).norm(dim=-1) / cues.scales_query
-    residuals = torch.where(valid, residuals, 100.0)
+    errors = projected - problems.pixels
+    residuals = torch.where(valid, errors.norm(dim=-1) / cues.scales_query, 100.0)
     inliers = (residuals < 3.0) & mask
     noise = _median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
+    surprise = (torch.linalg.solve(_covariances(problems, T), errors) * errors).sum(-1).clamp_min(0)
     depths_q, depths_b = points_q[..., 2].clamp_min(1e-3), problems.points[..., 2]
     growth = (cues.scales_query * depths_q / (cues.scales_base * depths_b)).log()
     turn = cues.turns - _median(cues.turns, mask)
-    matches = mask.sum(-1, keepdim=True)
+    crowd, support = _neighbours(problems, inliers)
     columns = [
         cues.distances / 32 - 1,
-        4 * (cues.distances / cues.seconds.clamp_min(1)) - 3,
+        4 * (cues.distances / cues.seconds_query.clamp_min(1)) - 3,
+        4 * (cues.distances / cues.seconds_base.clamp_min(1)) - 3,
         2 * cues.scales_query.log() - 1,
         2 * cues.scales_base.log() - 1,
+        4 * cues.scores_query,
+        4 * cues.scores_base,
         4 * growth.abs().clamp_max(1) - 1,
         2 * turn.sin().square() + (1 - turn.cos()),
         (residuals + 0.05).log(),
         (residuals / noise + 0.05).log(),
+        (surprise + 0.01).log() / 2,
         noise.log(),
         (cues.parallaxes / 0.03).log(),
         cues.views - 2.5,
         cues.errors - 0.5,
         (depths_q / _median(depths_q, mask)).log(),
-        propagated_variances(problems).log() / 2,
-        crowding(problems),
-        4 * inliers.sum(-1, keepdim=True) / matches - 3,
-        (matches / 100).log(),
+        propagated_variances(problems, T).log() / 2,
+        crowd,
+        4 * support - 3,
+        4 * inliers.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True) - 3,
     ]
     features = torch.stack([column.expand_as(depths_q) for column in columns], dim=-1)
     return torch.where(mask[..., None], features, 0.0).clamp(-6, 6)
 
 
-def propagated_variances(problems: Problems) -> Tensor:
-    """(P, N) px^2, mean of x and y: of a keypoint by its level, plus what its point's covariance adds."""
-    points_q = transform(problems.T_start, problems.points)
-    J = problems.camera.project_with_point_jacobians(points_q)[2] @ problems.T_start[:, None, :3, :3]
-    added = 0.5 * (J @ problems.covariances @ J.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return problems.cues.scales_query.square() + added
+def _covariances(problems: Problems, T: Tensor) -> Tensor:
+    """(P, N, 2, 2) px^2 at poses T: of a keypoint by its level, plus what its point's covariance adds."""
+    J = problems.camera.project_with_point_jacobians(transform(T, problems.points))[2] @ T[:, None, :3, :3]
+    eye = torch.eye(2, dtype=J.dtype, device=J.device)
+    return problems.cues.scales_query.square()[..., None, None] * eye + J @ problems.covariances @ J.mT
 
 
-def crowding(problems: Problems, radius: float = 0.06) -> Tensor:
-    """(P, N) logarithm of the number of matches within a radius, in focal lengths, over its mean.
+def propagated_variances(problems: Problems, T: Tensor) -> Tensor:
+    """(P, N) px^2, mean of x and y, at poses T."""
+    return 0.5 * _covariances(problems, T).diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def _neighbours(problems: Problems, inliers: Tensor) -> tuple[Tensor, Tensor]:
+    """(P, N) logarithm of the number of matches nearby over its mean, and the share of inliers among the others.
 
     Errors of neighbours are alike: their points were made from the same frames, and move with the same objects.
     """
     x = problems.pixels / problems.focals[:, None, None]
-    near = (torch.cdist(x, x) < radius) & problems.mask[:, None, :]
-    count = near.sum(-1).clamp_min(1).to(x.dtype)
+    near = ((torch.cdist(x, x) < NEIGHBOURHOOD) & problems.mask[:, None, :]).to(x.dtype)
+    count = near.sum(-1).clamp_min(1)
     rows = problems.mask.to(x.dtype)
-    return (count * rows.sum(-1, keepdim=True) / (count * rows).sum(-1, keepdim=True)).log()
+    crowd = (count * rows.sum(-1, keepdim=True) / (count * rows).sum(-1, keepdim=True)).log()
+    agree = (near @ inliers[..., None].to(x.dtype))[..., 0] - inliers.to(x.dtype)
+    return crowd, (agree + 0.5) / count
 
 
 def _median(values: Tensor, mask: Tensor) -> Tensor:
