@@ -24,7 +24,7 @@ _CHUNK = 64
 class Settings:
     """steps and batch (problems of a step) of the training; matches: kept of a problem, drawn anew every time."""
 
-    steps: int = 400
+    steps: int = 800
     batch: int = 32
     matches: int = 128
     learning_rate: float = 1e-2
