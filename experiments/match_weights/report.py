@@ -73,8 +73,11 @@ def gain(parts: list[PartResult]) -> str:
     """The mean over seeds, their standard deviation, and the interval."""
     gains = _log_gains([part.relative() for part in parts]).expm1()
     spread = f" ± {100 * float(gains.std()):.1f}" if len(gains) > 1 else ""
+    mean = f"{100 * float(gains.mean()):+.1f}{spread} %"
+    if max(int(part.blocks().max()) for part in parts) == 0:
+        return mean  # a single block tells nothing about the spread
     low, high = _interval(parts)
-    return f"{100 * float(gains.mean()):+.1f}{spread} % ({100 * low:+.0f} to {100 * high:+.0f})"
+    return f"{mean} ({100 * low:+.0f} to {100 * high:+.0f})"
 
 
 def error_table(parts: dict[str, PartResult]) -> str:
@@ -84,6 +87,9 @@ def error_table(parts: dict[str, PartResult]) -> str:
         [name, f"{len(part.problems)}", *(_cell(part.errors[label]) for label in labels), gain([part])]
         for name, part in parts.items()
     ]
+    header = ["part", "problems", *labels, "gain"]
+    if len(parts) == 1:
+        return table(header, rows)
     relatives = [part.relative() for part in parts.values()]
     means = [
         math.exp(
@@ -93,7 +99,7 @@ def error_table(parts: dict[str, PartResult]) -> str:
     ]
     cells = [f"{1e3 * mean:.2f}e-3" for mean in means]
     rows.append(["relative error, geometric mean", "", *cells, gain(list(parts.values()))])
-    return table(["unseen part", "problems", *labels, "gain"], rows)
+    return table(header, rows)
 
 
 def _cell(errors: Tensor) -> str:
