@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -148,7 +148,7 @@ T = TypeVar("T", Problems, Cues)
 
 def _each(function: Callable[..., Tensor], *tables: T) -> T:
     """The function of every tensor of one table, or of the same tensor of several."""
-    columns = {}
+    columns: dict[str, Any] = {}
     for field in fields(tables[0]):
         values = [getattr(table, field.name) for table in tables]
         columns[field.name] = function(*values) if isinstance(values[0], Tensor) else _each(function, *values)
