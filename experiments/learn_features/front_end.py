@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torchslam import Features
 
 RADIUS = 5  # of the patch around a keypoint, pixels
-REACH = 1.0  # pixels a keypoint may move along x and along y
+NUM_INPUTS = (2 * RADIUS + 1) ** 2
+REACH = 3.0  # pixels a keypoint may move along x and along y
 NOISE = 0.02  # grey value below which contrast is not amplified
 
 
@@ -19,32 +20,54 @@ class SubPixel(nn.Module):
     """Features of a front end, their keypoints moved by what the image patches around them suggest.
 
     front_end: module from images (B, 1, H, W) to Features; it gets no gradient
-    Without training nothing moves.
+    width:     of the hidden layers
+    reach:     pixels
+    seed:      of the weights; without training nothing moves
     """
 
-    def __init__(self, front_end: nn.Module, width: int = 64) -> None:
+    def __init__(self, front_end: nn.Module, width: int = 64, reach: float = REACH, seed: int = 0) -> None:
         super().__init__()
         self.front_end = front_end.requires_grad_(False)
-        size = (2 * RADIUS + 1) ** 2
-        self.moves = nn.Sequential(
-            nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2)
-        )
-        nn.init.zeros_(self.moves[-1].weight)
-        nn.init.zeros_(self.moves[-1].bias)
+        self.reach = reach
+        layers = [nn.Linear(NUM_INPUTS, width), nn.Linear(width, width), nn.Linear(width, 2)]
+        generator = torch.Generator().manual_seed(seed)
+        for layer in layers:
+            nn.init.kaiming_uniform_(layer.weight, generator=generator)
+            nn.init.zeros_(layer.bias)
+        nn.init.zeros_(layers[-1].weight)
+        self.network = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
 
     def forward(self, images: Tensor) -> Features:
         features = self.front_end(images)
-        moves = REACH * torch.tanh(self.moves(patches(images, features.keypoints)))
+        moves = self.moves(patches(images, features.keypoints))
         return replace(features, keypoints=features.keypoints + moves)
+
+    def moves(self, inputs: Tensor) -> Tensor:
+        """(..., NUM_INPUTS) of `patches` -> (..., 2) pixels."""
+        return self.reach * torch.tanh(self.network(inputs))
+
+
+class Remembering(nn.Module):
+    """A front end that, asked for the very images it was asked for last, answers without looking again."""
+
+    def __init__(self, front_end: nn.Module) -> None:
+        super().__init__()
+        self.front_end = front_end
+        self._last: tuple[Tensor, Features] | None = None
+
+    def forward(self, images: Tensor) -> Features:
+        if self._last is None or self._last[0] is not images:
+            self._last = images, self.front_end(images)
+        return self._last[1]
 
 
 def patches(images: Tensor, keypoints: Tensor) -> Tensor:
-    """(B, N, S * S) grey values around the pixels nearest to keypoints (B, N, 2), with mean 0 and deviation 1."""
+    """(B, N, NUM_INPUTS) grey values around keypoints (B, N, 2), row by row, with mean 0 and deviation 1."""
     height, width = images.shape[-2:]
     axis = torch.arange(-RADIUS, RADIUS + 1, device=images.device, dtype=images.dtype)
-    around = torch.cartesian_prod(axis, axis).flip(-1)  # row by row, as (x, y)
-    places = keypoints.detach().to(images.dtype).round()[:, :, None] + around
+    around = torch.cartesian_prod(axis, axis).flip(-1)  # (x, y)
+    places = keypoints.detach().to(images.dtype)[:, :, None] + around
     grid = (2 * places + 1) / places.new_tensor([width, height]) - 1
-    values = F.grid_sample(images, grid, mode="nearest", padding_mode="border", align_corners=False)[:, 0]
+    values = F.grid_sample(images, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
     values = values - values.mean(-1, keepdim=True)
     return values / (values.std(-1, keepdim=True) + NOISE)

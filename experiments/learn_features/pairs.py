@@ -6,23 +6,58 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchslam import estimate_relative_pose, match
+from torchslam import Camera, Features, estimate_relative_pose, match
 from torchslam.data.sequence import Sequence
-from torchslam.geometry import se3_inverse, so3_log
+from torchslam.geometry import RelativePose, se3_inverse, so3_log
 
 APART_S = 0.3
 THRESHOLD_PX = 1.5
 
 
 @dataclass(frozen=True)
+class Pair:
+    """images (2, 1, H, W) of two frames APART_S apart, the true motion T_21 (4, 4), and the camera."""
+
+    images: Tensor
+    T_21: Tensor
+    camera: Camera
+
+    @classmethod
+    def of(cls, sequence: Sequence, start: int, device: torch.device) -> Pair:
+        first, second = sequence[start], sequence[start + frames_apart(sequence)]
+        if first.T_cw_groundtruth is None or second.T_cw_groundtruth is None:
+            raise ValueError(f"{sequence.name}: the pair from frame {start} has no true motion")
+        images = torch.cat([first.image, second.image]).to(device)
+        return cls(images, second.T_cw_groundtruth @ se3_inverse(first.T_cw_groundtruth), sequence.camera)
+
+
+@dataclass(frozen=True)
 class PairErrors:
-    """Of P pairs: rotations and directions of the translation (P,), radians; inliers (P,); NaN, 0 where none fits."""
+    """Of P pairs, (P,) each; NaN, for inliers 0, where no motion fits.
+
+    rotation, direction: radians, of the motion against the true one; direction is that of the translation
+    rotation_halves, direction_halves: radians, between the motions that one half of the matches and the other tell.
+                         Nothing true is needed for these, so nothing wrong in it counts.
+    inliers:             within THRESHOLD_PX
+    """
 
     rotation: Tensor
     direction: Tensor
+    rotation_halves: Tensor
+    direction_halves: Tensor
     inliers: Tensor
+
+    @property
+    def angles(self) -> Tensor:
+        """(4, P) all but the inliers."""
+        return torch.stack([self.rotation, self.direction, self.rotation_halves, self.direction_halves])
+
+    @staticmethod
+    def cat(rows: list[PairErrors]) -> PairErrors:
+        columns = PairErrors.__dataclass_fields__
+        return PairErrors(*(torch.cat([getattr(row, name) for row in rows]) for name in columns))
 
 
 def frames_apart(sequence: Sequence) -> int:
@@ -31,26 +66,37 @@ def frames_apart(sequence: Sequence) -> int:
 
 
 @torch.no_grad()
-def pair_errors(
-    front_end: nn.Module, sequence: Sequence, starts: list[int], device: torch.device
-) -> PairErrors:
-    """Relative poses of the pairs of frames (start, start + APART_S) by five-point RANSAC, against the true ones."""
-    apart = frames_apart(sequence)
-    camera = sequence.camera.to(torch.float64)
-    rows = []
-    for start in starts:
-        first, second = sequence[start], sequence[start + apart]
-        if first.T_cw_groundtruth is None or second.T_cw_groundtruth is None:
-            raise ValueError(f"{sequence.name}: frame {start} or {start + apart} has no true pose")
-        features = front_end(torch.cat([first.image, second.image]).to(device)).to("cpu")
-        one, two = features[:1], features[1:]
-        matches = match(one, two, max_distance=64 if one.descriptors.dtype == torch.uint8 else 0.25)
-        pixels_1 = one.keypoints[0][matches.indices_1[0]][None].double()
-        pixels_2 = two.keypoints[0][matches.indices_2[0]][None].double()
-        found = estimate_relative_pose(pixels_1, pixels_2, camera, camera, THRESHOLD_PX, matches.mask)
-        T_21 = second.T_cw_groundtruth @ se3_inverse(first.T_cw_groundtruth)
-        rotation = so3_log(found.T_21[0, :3, :3] @ T_21[:3, :3].mT).norm()
-        direction = torch.acos(F.cosine_similarity(found.T_21[0, :3, 3], T_21[:3, 3], dim=0).clamp(-1, 1))
-        failed = torch.where(found.success[0], 0.0, torch.nan)
-        rows.append(torch.stack([rotation + failed, direction + failed, found.inliers[0].sum().double()]))
-    return PairErrors(*torch.stack(rows).unbind(-1))
+def pair_errors(features: Features, pair: Pair) -> PairErrors:
+    """Relative pose by five-point RANSAC from the features of both images, against the true one; P = 1."""
+    pixels_1, pixels_2 = matched(features)
+    whole = motion_of(pixels_1, pixels_2, pair.camera)
+    even, odd = (motion_of(pixels_1[half::2], pixels_2[half::2], pair.camera) for half in (0, 1))
+    against_truth = apart(whole.T_21[0], pair.T_21).norm(dim=-1) + _failed(whole)
+    halves = apart(even.T_21[0], odd.T_21[0]).norm(dim=-1) + _failed(even) + _failed(odd)
+    inliers = whole.inliers.sum(-1).to(against_truth.dtype)
+    return PairErrors(*against_truth.split(1), *halves.split(1), inliers)
+
+
+def matched(features: Features) -> tuple[Tensor, Tensor]:
+    """(M, 2) pixels in both images of the keypoints that match."""
+    one, two = features[:1], features[1:]
+    matches = match(one, two, max_distance=64 if one.descriptors.dtype == torch.uint8 else 0.25)
+    rows_1, rows_2 = (rows[0][matches.mask[0]] for rows in (matches.indices_1, matches.indices_2))
+    return one.keypoints[0, rows_1].double(), two.keypoints[0, rows_2].double()
+
+
+def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
+    """The motion that matches (M, 2) tell."""
+    return estimate_relative_pose(pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX)
+
+
+def apart(T_21: Tensor, T_21_other: Tensor) -> Tensor:
+    """(2, 3) rotation vectors that turn the other motion's rotation, and direction of translation, to the first's."""
+    t, t_other = (F.normalize(T[:3, 3], dim=0) for T in (T_21, T_21_other))
+    axis = torch.linalg.cross(t_other, t, dim=0)
+    turn = F.normalize(axis, dim=0) * torch.atan2(axis.norm(), t_other @ t)
+    return torch.stack([so3_log(T_21[:3, :3] @ T_21_other[:3, :3].mT), turn])
+
+
+def _failed(motion: RelativePose) -> float:
+    return 0.0 if motion.success[0] else float("nan")

@@ -1,56 +1,129 @@
-"""Training a front end through the poses of clips: an ordinary loop."""
+"""Training through the error of poses: small draws of tracks, triangulated and localised in every step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor, nn
 
-from experiments.learn_features.clips import Clip, errors_of
-from torchslam import ClipSLAM
+from experiments.learn_features.front_end import REACH, SubPixel
+from experiments.learn_features.tracks import MIN_PARALLAX, MIN_VIEWS, Tracks, straightened
+from torchslam.geometry import se3_inverse, se3_log, triangulate_many
+from torchslam.solvers import refine_pose
+
+UNIT = 3e-3  # of the errors, radians and shares of the median depth: about their median
+KERNEL_PX = 1.5
+MIN_TRACKS = 6
 
 
 @dataclass(frozen=True)
 class Settings:
-    """steps: of the optimiser; clips: per step; frames: per clip; learning_rate: of Adam, falling to zero"""
+    """steps: of the optimiser; problems: of a step; tracks: of a problem, drawn anew every time
 
-    steps: int = 100
-    clips: int = 1
-    frames: int = 7
-    learning_rate: float = 2e-3
-    warm_up: int = 10
-    max_gradient: float = 1.0
-
-
-def train(
-    clip_slam: ClipSLAM, draw: Callable[[torch.Generator], Clip], settings: Settings, seed: int = 0
-) -> list[float]:
-    """Lower the logarithms of both errors on clips that `draw` gives; the mean loss of every step that had one.
-
-    With logarithms every clip counts alike, however far its camera moves. Clips with too few poses are passed over.
+    Of few tracks a pose says more about each: the error is the sum of all their errors.
     """
-    parameters = [parameter for parameter in clip_slam.parameters() if parameter.requires_grad]
-    optimizer = torch.optim.Adam(parameters, settings.learning_rate)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: min(1.0, (step + 1) / settings.warm_up) * (1 - step / settings.steps)
+
+    steps: int = 1500
+    problems: int = 32
+    tracks: int = 16
+    learning_rate: float = 2e-3
+    width: int = 64
+    reach: float = REACH
+
+
+@dataclass(frozen=True)
+class Draw:
+    """B problems of K tracks, and the view that is localised in all of them. Shapes as in `Tracks`."""
+
+    frames: Tensor
+    indices: Tensor
+    seen: Tensor
+    query: int
+
+
+def draw(tracks: Tracks, settings: Settings, generator: torch.Generator) -> Draw:
+    """Some problems, and of each some tracks that the localised view and two others see."""
+    rows = torch.randint(len(tracks), (settings.problems,), generator=generator)
+    query = int(torch.randint(tracks.frames.shape[1], (1,), generator=generator))
+    seen = tracks.seen[rows]
+    usable = seen[..., query] & (seen.sum(-1) >= MIN_VIEWS)
+    keys = torch.rand(usable.shape, generator=generator).masked_fill(~usable, torch.inf)
+    chosen = keys.argsort(-1)[:, : settings.tracks]
+    picked = torch.arange(len(rows))[:, None], chosen
+    return Draw(
+        tracks.frames[rows],
+        tracks.indices[rows][picked],
+        (seen & usable[..., None])[picked],
+        query,
     )
+
+
+def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
+    """Errors (B, 2) of position, as a share of the median depth, and rotation, radians; (B,) whether there is a pose.
+
+    Points are triangulated with the true poses of the other views; the world is the true camera of the localised one,
+    where its refinement starts as well.
+    """
+    frames = drawn.frames[:, None].expand_as(drawn.indices)
+    device = next(front_end.parameters()).device
+    moves = front_end.moves(tracks.patches[frames, drawn.indices].to(device)).cpu()
+    pixels, pinhole = straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
+    others = [view for view in range(frames.shape[-1]) if view != drawn.query]
+    T_cw = tracks.T_cw[drawn.frames]
+    T_vq = T_cw[:, others] @ se3_inverse(T_cw[:, drawn.query])[:, None]
+    points = triangulate_many(T_vq, pixels[:, :, others], pinhole, drawn.seen[..., others])
+    mask = drawn.seen[..., drawn.query] & points.mask & (points.angles > MIN_PARALLAX)
+    refined = refine_pose(
+        torch.eye(4, dtype=pixels.dtype).expand(len(frames), 4, 4),
+        points.points_w,
+        pixels[:, :, drawn.query],
+        pinhole,
+        mask=mask,
+        scale=KERNEL_PX,
+        iterations=8,
+        tolerance=1e-6,
+    )
+    xi = se3_log(refined.T_cw)
+    depths = points.points_w[..., 2].detach().masked_fill(~mask, torch.nan).nanmedian(-1).values
+    success = refined.success & (mask.sum(-1) >= MIN_TRACKS) & (depths > 0)
+    lengths = (xi.unflatten(-1, (2, 3)).square().sum(-1) + 1e-16).sqrt()
+    scales = torch.stack([torch.where(success, depths, 1.0), torch.ones_like(depths)], -1)
+    return lengths / scales, success
+
+
+def train(front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0) -> list[float]:
+    """Lower the errors of localised views; the mean loss of every step.
+
+    The loss grows like a logarithm, so that a few hopeless draws do not rule.
+    """
+    parameters = list(front_end.network.parameters())
+    optimizer = torch.optim.Adam(parameters, settings.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     generator = torch.Generator().manual_seed(seed)
     losses = []
-    for _ in range(settings.steps):
+    for step in range(settings.steps):
+        errors, success = pose_errors(front_end, tracks, draw(tracks, settings, generator))
+        each = (errors / UNIT).log1p().sum(-1)
+        loss = torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
         optimizer.zero_grad()
-        found = []
-        for _ in range(settings.clips):
-            errors = errors_of(clip_slam, draw(generator))
-            if errors.enough:
-                loss = errors.position.log() + errors.rotation.log()
-                loss.backward()
-                found.append(float(loss.detach()))
-        torch.nn.utils.clip_grad_norm_(parameters, settings.max_gradient)
+        loss.backward()
+        nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
-        if found:
-            losses.append(sum(found) / len(found))
-        if found and len(losses) % 10 == 0:
-            print(f"{len(losses):4d}  mean loss of the last ten {sum(losses[-10:]) / 10:.3f}", flush=True)
+        losses.append(float(loss.detach()))
+        if (step + 1) % 250 == 0:
+            print(f"{step + 1:5d}  mean loss of the last 250 {sum(losses[-250:]) / 250:.3f}", flush=True)
     return losses
+
+
+@torch.no_grad()
+def moved(front_end: SubPixel, tracks: Tracks) -> Tensor:
+    """(F, N, 2) the keypoints of the tracks where the network has them."""
+    device = next(front_end.parameters()).device
+    return torch.stack(
+        [
+            keypoints + front_end.moves(patches.to(device)).cpu()
+            for keypoints, patches in zip(tracks.keypoints, tracks.patches, strict=True)
+        ]
+    )
