@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
@@ -56,8 +56,7 @@ class PairErrors:
 
     @staticmethod
     def cat(rows: list[PairErrors]) -> PairErrors:
-        columns = PairErrors.__dataclass_fields__
-        return PairErrors(*(torch.cat([getattr(row, name) for row in rows]) for name in columns))
+        return PairErrors(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(PairErrors)))
 
 
 def frames_apart(sequence: Sequence) -> int:
@@ -74,7 +73,8 @@ def pair_errors(features: Features, pair: Pair) -> PairErrors:
     against_truth = apart(whole.T_21[0], pair.T_21).norm(dim=-1) + _failed(whole)
     halves = apart(even.T_21[0], odd.T_21[0]).norm(dim=-1) + _failed(even) + _failed(odd)
     inliers = whole.inliers.sum(-1).to(against_truth.dtype)
-    return PairErrors(*against_truth.split(1), *halves.split(1), inliers)
+    (rotation, direction), (rotation_halves, direction_halves) = against_truth.split(1), halves.split(1)
+    return PairErrors(rotation, direction, rotation_halves, direction_halves, inliers)
 
 
 def matched(features: Features) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -38,7 +39,7 @@ CLIP_FRAMES = 8
 BLOCK_TRACKS = 200  # for intervals: tracks of neighbouring problems are mostly the same
 BEFORE, AFTER = "XFeat", "XFeat, trained"
 SMALL = Settings()
-LARGE = Settings(steps=10_000, problems=64)
+LARGE = Settings(steps=5000, problems=64, width=128)
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def spread(count: int, first: int, last: int) -> list[int]:
 
 
 @torch.no_grad()
-def measure(candidates: dict[str, nn.Module], parts: dict[str, Part], device: torch.device) -> Results:
+def measure(candidates: Mapping[str, nn.Module], parts: dict[str, Part], device: torch.device) -> Results:
     """The errors of every pair and clip."""
     results: Results = {label: {} for label in candidates}
     for name, part in parts.items():
@@ -105,15 +106,13 @@ def main() -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     xfeat = Remembering(XFeat(arguments.weights, KEYPOINTS)).to(device)
 
-    training, validation = (
-        Tracks.of(xfeat, sequence, part_of(sequence, share), device)
-        for name, share in (TRAINING, VALIDATION)
-        for sequence in sequences([name])
-    )
+    learned_on = prepared(xfeat, device)
+    if not learned_on:
+        return  # `sequences` has said what is missing
     trained, losses = [], []
     for seed in range(arguments.seeds):
         trained.append(SubPixel(xfeat, settings.width, settings.reach, seed).to(device))
-        losses.append(train(trained[-1], training, settings, seed))
+        losses.append(train(trained[-1], learned_on["training"], settings, seed))
     if arguments.save:
         torch.save(trained[0].network.state_dict(), arguments.save)
 
@@ -130,12 +129,21 @@ def main() -> None:
         others = {f"{AFTER}, seed {seed}": one for seed, one in enumerate(trained) if seed}
         for label, found in measure(others, only_pairs, device).items():
             text += f"\n{label}:\n\n" + ratios(results[BEFORE], found)
-    text += "\n" + keypoint_noise(trained[0], {"training": training, "validation": validation})
+    text += "\n" + keypoint_noise(trained[0], learned_on)
     text += "\n" + room_of(TRAINING, xfeat, arguments.pairs, device)
     print(text)
     if not arguments.validate:
         write_between(HERE / "README.md", text)
         draw(HERE / "learned.png", losses, results[BEFORE], results[AFTER])
+
+
+def prepared(front_end: nn.Module, device: torch.device) -> dict[str, Tracks]:
+    """The tracks of both parts of the sequence to learn from."""
+    return {
+        label: Tracks.of(front_end, sequence, part_of(sequence, share), device)
+        for label, (name, share) in (("training", TRAINING), ("validation", VALIDATION))
+        for sequence in sequences([name])
+    }
 
 
 def keypoint_noise(front_end: SubPixel, parts: dict[str, Tracks]) -> str:

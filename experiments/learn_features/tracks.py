@@ -114,15 +114,16 @@ def straightened(pixels: Tensor, camera: Camera) -> tuple[Tensor, Camera]:
 
 @torch.no_grad()
 def residuals(tracks: Tracks, keypoints: Tensor) -> Tensor:
-    """(R,) pixels per coordinate by which tracks seen by all views miss their best point, poses being the true ones.
+    """(R,) pixels per coordinate by which tracks miss their best point, poses being the true ones.
 
     keypoints: (F, N, 2), those of the tracks or others in their place
     """
     found = []
     for views, columns, seen in zip(tracks.frames, tracks.indices, tracks.seen, strict=True):
-        rows = columns[seen.all(-1)]
-        pixels, pinhole = straightened(keypoints[views, rows], tracks.camera)
-        points = triangulate_many(tracks.T_cw[views], pixels, pinhole)
-        freedom = 2 * rows.shape[-1] - 3
-        found.append((points.errors.square().sum(-1) / freedom).sqrt().clamp_max(MAX_ERROR))
+        used = seen.any(-1)
+        pixels, pinhole = straightened(keypoints[views, columns[used]], tracks.camera)
+        points = triangulate_many(tracks.T_cw[views], pixels, pinhole, seen[used])
+        squared = torch.where(seen[used], points.errors, 0.0).square().sum(-1)
+        freedom = 2 * seen[used].sum(-1) - 3
+        found.append((squared / freedom).sqrt().clamp_max(MAX_ERROR))
     return torch.cat(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from experiments.learn_features.front_end import REACH, SubPixel
 from experiments.learn_features.tracks import MIN_PARALLAX, MIN_VIEWS, Tracks, straightened
-from torchslam.geometry import se3_inverse, se3_log, triangulate_many
+from torchslam.geometry import Camera, se3_inverse, se3_log, triangulate_many
 from torchslam.solvers import refine_pose
 
 UNIT = 3e-3  # of the errors, radians and shares of the median depth: about their median
@@ -24,7 +25,7 @@ class Settings:
     Of few tracks a pose says more about each: the error is the sum of all their errors.
     """
 
-    steps: int = 1500
+    steps: int = 1000
     problems: int = 32
     tracks: int = 16
     learning_rate: float = 2e-3
@@ -40,6 +41,9 @@ class Draw:
     indices: Tensor
     seen: Tensor
     query: int
+
+
+Teacher = Callable[[SubPixel, Tracks, Draw], Tensor]
 
 
 def draw(tracks: Tracks, settings: Settings, generator: torch.Generator) -> Draw:
@@ -59,23 +63,28 @@ def draw(tracks: Tracks, settings: Settings, generator: torch.Generator) -> Draw
     )
 
 
+def drawn_pixels(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Camera]:
+    """(B, K, V, 2) where the network has the drawn tracks, as a pinhole camera sees them, and that camera."""
+    frames = drawn.frames[:, None].expand_as(drawn.indices)
+    device = next(front_end.parameters()).device
+    moves = front_end.moves(tracks.patches[frames, drawn.indices].to(device)).cpu()
+    return straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
+
+
 def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
     """Errors (B, 2) of position, as a share of the median depth, and rotation, radians; (B,) whether there is a pose.
 
     Points are triangulated with the true poses of the other views; the world is the true camera of the localised one,
     where its refinement starts as well.
     """
-    frames = drawn.frames[:, None].expand_as(drawn.indices)
-    device = next(front_end.parameters()).device
-    moves = front_end.moves(tracks.patches[frames, drawn.indices].to(device)).cpu()
-    pixels, pinhole = straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
-    others = [view for view in range(frames.shape[-1]) if view != drawn.query]
+    pixels, pinhole = drawn_pixels(front_end, tracks, drawn)
+    others = [view for view in range(pixels.shape[2]) if view != drawn.query]
     T_cw = tracks.T_cw[drawn.frames]
     T_vq = T_cw[:, others] @ se3_inverse(T_cw[:, drawn.query])[:, None]
     points = triangulate_many(T_vq, pixels[:, :, others], pinhole, drawn.seen[..., others])
     mask = drawn.seen[..., drawn.query] & points.mask & (points.angles > MIN_PARALLAX)
     refined = refine_pose(
-        torch.eye(4, dtype=pixels.dtype).expand(len(frames), 4, 4),
+        torch.eye(4, dtype=pixels.dtype).expand(len(pixels), 4, 4),
         points.points_w,
         pixels[:, :, drawn.query],
         pinhole,
@@ -92,20 +101,36 @@ def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tenso
     return lengths / scales, success
 
 
-def train(front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0) -> list[float]:
-    """Lower the errors of localised views; the mean loss of every step.
+def pose_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
+    """() the mean over problems of what grows like the logarithm of both errors, so that a few hopeless do not rule."""
+    errors, success = pose_errors(front_end, tracks, drawn)
+    each = (errors / UNIT).log1p().sum(-1)
+    return torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
 
-    The loss grows like a logarithm, so that a few hopeless draws do not rule.
+
+def reprojection_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
+    """() how far tracks are from the points they make, all poses being the true ones: a teacher to compare with.
+
+    The mean over tracks of log(1 + squared pixels).
     """
+    pixels, pinhole = drawn_pixels(front_end, tracks, drawn)
+    points = triangulate_many(tracks.T_cw[drawn.frames], pixels, pinhole, drawn.seen)
+    squared = torch.where(drawn.seen & points.errors.isfinite(), points.errors, 0.0).square()
+    used = points.mask & (drawn.seen.sum(-1) >= MIN_VIEWS)
+    return torch.where(used, (squared.sum(-1) / 2).log1p(), 0.0).sum() / used.sum().clamp_min(1)
+
+
+def train(
+    front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0, teacher: Teacher = pose_loss
+) -> list[float]:
+    """Lower the loss of what is drawn anew in every step; the loss of each."""
     parameters = list(front_end.network.parameters())
     optimizer = torch.optim.Adam(parameters, settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     generator = torch.Generator().manual_seed(seed)
     losses = []
     for step in range(settings.steps):
-        errors, success = pose_errors(front_end, tracks, draw(tracks, settings, generator))
-        each = (errors / UNIT).log1p().sum(-1)
-        loss = torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
+        loss = teacher(front_end, tracks, draw(tracks, settings, generator))
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(parameters, 1.0)
