@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from experiments.learn_features.clip_noise import Changed
 from experiments.learn_features.clips import Clip, Errors, step_of
 from experiments.learn_features.front_end import NUM_INPUTS, RADIUS, REACH, Remembering, SubPixel, patches
 from experiments.learn_features.pairs import Pair, PairErrors, apart, frames_apart, pair_errors
@@ -176,3 +177,12 @@ def test_the_interval_is_that_of_a_mean() -> None:
     assert math.log(high_runs / low_runs) / 2 == pytest.approx(
         1.96 * float(logs[:80].std()) / math.sqrt(80), rel=0.15
     )
+
+
+def test_a_changed_front_end_shakes_and_rescales() -> None:
+    images, orb = noise_images(), ORB(100)
+    plain, changed = orb(images), Changed(orb, shake=0.1, scale=1.5)(images)
+    moves = (changed.keypoints - plain.keypoints).std()
+    assert float(moves) == pytest.approx(0.1, rel=0.3)
+    assert bool((changed.scales == 1.5).all())
+    assert torch.equal(Changed(orb)(images).keypoints, plain.keypoints)
