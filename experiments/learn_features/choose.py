@@ -21,11 +21,8 @@ VARIANTS = {
     "as chosen": (CHOSEN, pose_loss),
     "reach 1 px": (replace(CHOSEN, reach=1.0), pose_loss),
     "reach 2 px": (replace(CHOSEN, reach=2.0), pose_loss),
-    "8 tracks of a problem": (replace(CHOSEN, tracks=8), pose_loss),
-    "64 tracks": (replace(CHOSEN, tracks=64), pose_loss),
-    "128 wide": (replace(CHOSEN, width=128), pose_loss),
+    "64 tracks of a problem instead of 16": (replace(CHOSEN, tracks=64), pose_loss),
     "300 steps": (replace(CHOSEN, steps=300), pose_loss),
-    "2500 steps": (replace(CHOSEN, steps=2500), pose_loss),
     "taught by reprojection error": (CHOSEN, reprojection_loss),
 }
 

@@ -62,15 +62,21 @@ def medians(results: Results) -> str:
 
 
 def ratios(before: dict[str, Result], after: dict[str, Result]) -> str:
-    """A table of geometric means of after / before, by error and part and over all, with 95 % intervals."""
+    """A table of geometric means of after / before, by error and part and over all, with 95 % intervals.
+
+    Clips may be missing from `after`.
+    """
     columns: dict[str, dict[str, Tensor]] = {error: {} for error in (*ERRORS, "ATE / path")}
     for name in before:
         logs = (after[name].pairs.angles / before[name].pairs.angles).log()
         for error, row in zip(ERRORS, logs, strict=True):
             columns[error][name] = row
-        columns["ATE / path"][name] = (after[name].positions / before[name].positions).log()
+        if after[name].clips:
+            columns["ATE / path"][name] = (after[name].positions / before[name].positions).log()
     rows = []
     for error, parts in columns.items():
+        if not parts:
+            continue
         block = 1 if error == "ATE / path" else BLOCK
         cells = [ratio([part], block) for part in parts.values()]
         rows.append([error, *cells, ratio(list(parts.values()), block)])

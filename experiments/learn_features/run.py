@@ -124,6 +124,7 @@ def main() -> None:
     }
     results = measure({BEFORE: xfeat, AFTER: trained[0], "ORB": ORB(KEYPOINTS)}, unseen, device)
     text = medians(results) + "\n" + ratios(results[BEFORE], results[AFTER])
+    print(text, flush=True)
     if arguments.seeds > 1:
         only_pairs = {name: replace(part, clips=[]) for name, part in unseen.items()}
         others = {f"{AFTER}, seed {seed}": one for seed, one in enumerate(trained) if seed}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from experiments.learn_features.clip_noise import Changed
 from experiments.learn_features.clips import Clip, Errors, step_of
 from experiments.learn_features.front_end import NUM_INPUTS, RADIUS, REACH, Remembering, SubPixel, patches
 from experiments.learn_features.pairs import Pair, PairErrors, apart, frames_apart, pair_errors
+from experiments.learn_features.picture import draw
 from experiments.learn_features.report import Result, bootstrap, medians, ratios
 from experiments.learn_features.room import NOISES_PX, room
 from experiments.learn_features.run import Part, spread
@@ -164,6 +166,13 @@ def test_the_report_compares_what_both_could_pose() -> None:
     assert "| rotation error | 0.50 (0.50 to 0.50) | 0.50 (0.50 to 0.50) |" in text
     assert "| ATE / path | 2.00 (2.00 to 2.00) |" in text
     assert "| inliers | 0.800 | 0.800 |" in text
+    assert "ATE" not in ratios(before, {"walk": replace(after["walk"], clips=[])})
+
+
+def test_the_picture_is_drawn(tmp_path: Path) -> None:
+    before, after = ({"walk": result([0.002, rotation], 100, [])} for rotation in (0.004, 0.003))
+    draw(tmp_path / "learned.png", [[1.0] * 60, [2.0] * 60], before, after)
+    assert (tmp_path / "learned.png").stat().st_size > 0
 
 
 def test_the_interval_is_that_of_a_mean() -> None:
