@@ -34,6 +34,7 @@ UNSEEN = {
     "shelf_bin": (0.0, 1.0),
     "kitti07": (0.0, 1.0),
 }
+CONTROL = {"synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3": (0.0, 1.0)}  # with exact poses
 KEYPOINTS = 600
 CLIP_FRAMES = 8
 BLOCK_TRACKS = 200  # for intervals: tracks of neighbouring problems are mostly the same
@@ -116,15 +117,14 @@ def main() -> None:
     if arguments.save:
         torch.save(trained[0].network.state_dict(), arguments.save)
 
-    parts = dict([VALIDATION]) if arguments.validate else UNSEEN
-    unseen = {
-        name: Part.of(sequence, share, arguments.pairs, arguments.clips)
-        for name, share in parts.items()
-        for sequence in sequences([name])
-    }
-    results = measure({BEFORE: xfeat, AFTER: trained[0], "ORB": ORB(KEYPOINTS)}, unseen, device)
+    unseen = parts_of(dict([VALIDATION]) if arguments.validate else UNSEEN, arguments.pairs, arguments.clips)
+    candidates = {BEFORE: xfeat, AFTER: trained[0], "ORB": ORB(KEYPOINTS)}
+    results = measure(candidates, unseen, device)
     text = medians(results) + "\n" + ratios(results[BEFORE], results[AFTER])
     print(text, flush=True)
+    exact = measure(candidates, parts_of(CONTROL, arguments.pairs, arguments.clips), device)
+    text += "\nIn a rendered room, poses exact:\n\n"
+    text += medians(exact) + "\n" + ratios(exact[BEFORE], exact[AFTER])
     if arguments.seeds > 1:
         only_pairs = {name: replace(part, clips=[]) for name, part in unseen.items()}
         others = {f"{AFTER}, seed {seed}": one for seed, one in enumerate(trained) if seed}
@@ -136,6 +136,15 @@ def main() -> None:
     if not arguments.validate:
         write_between(HERE / "README.md", text)
         draw(HERE / "learned.png", losses, results[BEFORE], results[AFTER])
+
+
+def parts_of(shares: dict[str, tuple[float, float]], pairs: int, clips: int) -> dict[str, Part]:
+    """Parts of the sequences that are at hand."""
+    return {
+        name: Part.of(sequence, share, pairs, clips)
+        for name, share in shares.items()
+        for sequence in sequences([name])
+    }
 
 
 def prepared(front_end: nn.Module, device: torch.device) -> dict[str, Tracks]:
