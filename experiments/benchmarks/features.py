@@ -1,6 +1,6 @@
 """How good and how fast the features and their matching are, beside OpenCV, in one run and on one thread.
 
-    python experiments/benchmarks/features.py [--data FOLDER] [--output FILE] [--pairs 8] [--no-compile]
+    python -m experiments.benchmarks.features [--data FOLDER] [--output FILE] [--pairs 8] [--no-compile]
 
 FOLDER holds the sequences. Both extractors give 1000 keypoints, and the same matcher matches them; OpenCV's keypoints
 are those of `OpenCVORB`, that is with the half pixel put right that cv2.ORB is off on its higher levels. Times are CPU

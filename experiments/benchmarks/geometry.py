@@ -1,6 +1,6 @@
 """How right and how fast the pose estimators are, beside poselib, in one run and on one thread.
 
-    python experiments/benchmarks/geometry.py [--peers FOLDER] [--output FILE] [--problems 60]
+    python -m experiments.benchmarks.geometry [--peers FOLDER] [--output FILE] [--problems 60]
 
 FOLDER holds `problems.py`, which makes the fixed problems. Times are CPU time of the thread, so that other work on
 the machine counts as little as possible, taken in turns with the peer. Prints tables and writes them to FILE.
@@ -9,7 +9,6 @@ the machine counts as little as possible, taken in turns with the peer. Prints t
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import statistics
 import time
 from collections import Counter
@@ -25,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from experiments.benchmarks.problems import PEERS, load_problems
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose
 
 HERE = Path(__file__).parent
@@ -40,15 +40,6 @@ class Errors(NamedTuple):
     ms: float
     rotation: float
     translation: float
-
-
-def load_problems(folder: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("problems", folder / "problems.py")
-    if spec is None or spec.loader is None or not (folder / "problems.py").is_file():
-        raise SystemExit(f"no problems.py in {folder}; name its folder with --peers")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def timed(task: Callable[[], Any]) -> tuple[float, Any]:
@@ -221,7 +212,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peers", type=Path, default=HERE.parents[2] / "shared" / "peers")
+    parser.add_argument("--peers", type=Path, default=PEERS)
     parser.add_argument("--output", type=Path, default=HERE / "geometry.md")
     parser.add_argument("--problems", type=int, default=60, help="how many of each kind")
     arguments = parser.parse_args()

@@ -1,6 +1,6 @@
 """Learn the descriptor's 256 tests and write them to torchslam/features/pattern.py.
 
-    python experiments/benchmarks/learn_pattern.py [--data DIR]
+    python -m experiments.benchmarks.learn_pattern [--data DIR]
 
 Corners are detected in images and in warped copies of them; pairs that the warp confirms are matches, others are not.
 Out of random tests a greedy search picks, one after the other, the test that most increases the separation

@@ -1,6 +1,6 @@
 """How fast and how right the solvers are, beside pycolmap (Ceres), in one run and on one thread.
 
-    python experiments/benchmarks/solvers.py [--peers FOLDER] [--output FILE]
+    python -m experiments.benchmarks.solvers [--peers FOLDER] [--output FILE]
 
 FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and writes it to FILE.
 """
@@ -8,7 +8,6 @@ FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and w
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import statistics
 import time
 from collections.abc import Callable
@@ -20,21 +19,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from experiments.benchmarks.problems import PEERS, load_problems
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
 from torchslam.solvers.robust import Kernel
 
 HERE = Path(__file__).parent
 FOCAL, CENTRE, SIZE = 525.0, (319.5, 239.5), (640, 480)
-
-
-def load_problems(folder: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("problems", folder / "problems.py")
-    if spec is None or spec.loader is None or not (folder / "problems.py").is_file():
-        raise SystemExit(f"no problems.py in {folder}; name its folder with --peers")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 class Row(NamedTuple):
@@ -332,7 +323,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peers", type=Path, default=HERE.parents[2] / "shared" / "peers")
+    parser.add_argument("--peers", type=Path, default=PEERS)
     parser.add_argument("--output", type=Path, default=HERE / "solvers.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -346,7 +337,7 @@ def main() -> None:
     print("\n".join(lines))
     arguments.output.write_text(
         "# Solvers\n\nOne thread, float64, median CPU time of the process, peers measured in turns with ours: "
-        "`python experiments/benchmarks/solvers.py`.\n\n" + "\n".join(lines) + "\n"
+        "`python -m experiments.benchmarks.solvers`.\n\n" + "\n".join(lines) + "\n"
     )
 
 
