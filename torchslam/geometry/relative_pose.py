@@ -33,14 +33,10 @@ _ESSENTIAL, _HOMOGRAPHY, _ROTATION = range(3)
 
 _FIRST_ROUND = 64  # samples of five; of the cheaper models a fixed number
 _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
-_TRIAL_ITERATIONS, _FINAL_ITERATIONS = (
-    5,
-    12,
-)  # of a homography or rotation that may not be needed; of the result
+_TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
+_FINAL_ITERATIONS = 12
 _FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
-_CLEARLY_OFF = (
-    2.0  # thresholds of the transfer error, three standard deviations of noise as large as the threshold
-)
+_CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
@@ -105,33 +101,63 @@ def estimate_relative_pose(
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
     with torch.no_grad():
         views = TwoViews.of(pixels_1, pixels_2, camera_1, camera_2, threshold, mask)
-        fits = _fit_models(views, seed, confidence, max_samples)
-        chance = (
-            2 * threshold * math.hypot(camera_2.width, camera_2.height) / (camera_2.width * camera_2.height)
-        )
-        model = _choose(fits, mask, chance)
-        if bool((model != _ESSENTIAL).any()):
-            fits = fits.finished(views)
-        R, t, normal, ambiguous = _pose(views, fits, model)
-        squared = fits.squared[model, torch.arange(len(model), device=model.device)]
-        inliers = (squared < 1) & mask
-        significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, torch.full_like(t[:, 0], chance), 10)
-        significant = significant & _is_spread(views, inliers)
-        found = significant[:, None]
-        eye = torch.eye(4, dtype=R.dtype, device=R.device)
-        T_21 = torch.where(found[..., None], rigid(R, t), eye)
-        used = (squared < _FINAL_WIDTH**2) & mask & found
-        scores = torch.where(mask, (1 - fits.squared).clamp_min(0.0), 0.0).sum(-1)
+        # The probability that a wrong match is within the threshold of an epipolar line.
+        chance = 2 * threshold * math.hypot(*camera_2.size) / (camera_2.width * camera_2.height)
+        found = _search(views, mask, chance, seed, confidence, max_samples)
+    T_21 = found.T_21
     if needs_gradient(pixels_1, pixels_2, camera_1.params, camera_2.params):
         graph_views = TwoViews.of(pixels_1, pixels_2, camera_1, camera_2, threshold, mask)
-        T_21 = _with_gradient(T_21, normal, graph_views, used, model)
+        T_21 = _with_gradient(T_21, found.normal, graph_views, found.used, found.model)
     return RelativePose(
         T_21,
+        found.inliers,
+        found.significant & (found.model != _ROTATION) & ~found.ambiguous,
+        tuple(MODELS[index] for index in found.model.tolist()),
+        found.ambiguous & found.significant,
+        *found.scores.unbind(0),
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """T_21 (B, 4, 4) of the chosen model (B,), `normal` (B, 3) of its plane, and what it rests on.
+
+    significant: (B,) no accident; used: (B, N) matches that the final fit saw; scores: (3, B)
+    """
+
+    T_21: Tensor
+    normal: Tensor
+    model: Tensor
+    significant: Tensor
+    ambiguous: Tensor
+    inliers: Tensor
+    used: Tensor
+    scores: Tensor
+
+
+def _search(
+    views: TwoViews, mask: Tensor, chance: float, seed: int, confidence: float, max_samples: int
+) -> _Found:
+    """Fit all models, choose one per pair, and take the pose from it."""
+    fits = _fit_models(views, seed, confidence, max_samples)
+    model = _choose(fits, mask, chance)
+    if bool((model != _ESSENTIAL).any()):
+        fits = fits.finished(views)
+    R, t, normal, ambiguous = _pose(views, fits, model)
+    squared = fits.squared[model, torch.arange(len(model), device=model.device)]
+    inliers = (squared < 1) & mask
+    significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, torch.full_like(t[:, 0], chance), 10)
+    significant = significant & _is_spread(views, inliers)
+    found = significant[:, None]
+    return _Found(
+        torch.where(found[..., None], rigid(R, t), torch.eye(4, dtype=R.dtype, device=R.device)),
+        normal,
+        model,
+        significant,
+        ambiguous,
         inliers & found,
-        significant & (model != _ROTATION) & ~ambiguous,
-        tuple(MODELS[index] for index in model.tolist()),
-        ambiguous & significant,
-        *scores.unbind(0),
+        (squared < _FINAL_WIDTH**2) & mask & found,
+        torch.where(mask, (1 - fits.squared).clamp_min(0.0), 0.0).sum(-1),
     )
 
 
