@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchslam.map import NO_POINT, Map
-from torchslam.solvers.schur import Marginals
+from torchslam.solvers import Marginals
 from torchslam.types import View
 
 KEYPOINTS = 8
@@ -138,7 +138,7 @@ def test_several_points_merge_into_one(small_map: Map) -> None:
     assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 0]
 
 
-def test_covariances_follow_the_scale_and_unknown_ones_stay(small_map: Map) -> None:
+def test_covariances_are_taken_over_and_unknown_ones_leave_what_is_there(small_map: Map) -> None:
     frames = torch.eye(6, dtype=torch.float64).repeat(3, 1, 1)
     frames[0] = 0
     points = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
@@ -147,8 +147,4 @@ def test_covariances_follow_the_scale_and_unknown_ones_stay(small_map: Map) -> N
     small_map.take_covariances(everyone, torch.tensor([4, 1]), Marginals(0 * frames, 0 * points, frames[:0]))
     assert torch.equal(small_map.keyframes["covariances"], frames)
     assert small_map.points["covariances_w"].diagonal(dim1=1, dim2=2).sum(-1).tolist() == [0, 3, 0, 0, 3, 0]
-    small_map.rescale(2.0)
-    assert torch.equal(small_map.points["covariances_w"][4], 4 * points[0])
-    scaled = torch.diag(torch.tensor([4.0, 4, 4, 1, 1, 1], dtype=torch.float64))
-    assert torch.equal(small_map.keyframes["covariances"][1], scaled)
-    assert torch.equal(small_map.centre_covariances_w()[1], 4 * points[0])
+    torch.testing.assert_close(small_map.centre_covariances_w()[1:], points)

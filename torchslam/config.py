@@ -69,9 +69,8 @@ class TrackingConfig:
     wide_radius_factor: float = 3.0
     refine_radius_px: float = 5.0
     threshold_px: float = 3.0  # of the PnP RANSAC
-    gate: str = (
-        "chi_square"  # errors in units of the pixel noise | mahalanobis: and of the point's uncertainty
-    )
+    # chi_square: errors in units of the pixel noise | mahalanobis: of that and the point's uncertainty
+    gate: str = "chi_square"
     chi_square: float = 5.991  # 95 % of two degrees of freedom
     min_matches: int = 20
     min_inliers: int = 20

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
-from torchslam.solvers.schur import Marginals
+from torchslam.solvers import Marginals
 from torchslam.table import Table
 from torchslam.types import Features, View
 
@@ -272,15 +272,6 @@ class Map:
         ):
             known = covariances.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
             column[rows[known]] = covariances[known]
-
-    def rescale(self, factor: float) -> None:
-        """Multiply all lengths of the world by a factor."""
-        self.points["positions_w"].mul_(factor)
-        self.points["covariances_w"].mul_(factor**2)
-        self.points["reach"].mul_(factor)
-        self.keyframes["T_cw"][:, :3, 3].mul_(factor)
-        self.keyframes["covariances"][:, :3].mul_(factor)
-        self.keyframes["covariances"][:, :, :3].mul_(factor)
 
 
 def without_repetitions(ids: Tensor, preferred: Tensor) -> Tensor:

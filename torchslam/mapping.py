@@ -54,8 +54,8 @@ class Mapper:
             if settings.cull:
                 self.cull_recent_points(keyframe)
             neighbours = self.map.covisible(keyframe, 2 * settings.neighbours)
-            by_age = list(range(keyframe - 1, -1, -1))
-            partners = neighbours.tolist() if settings.partners == "covisible" else by_age
+            last = range(keyframe - 1, -1, -1)
+            partners = neighbours.tolist() if settings.partners == "covisible" else last
             for neighbour in partners[: settings.neighbours]:
                 triangulate_against(self.map, keyframe, neighbour, self.camera, self.config)
             self.map.refresh(self.map.ids(keyframe))

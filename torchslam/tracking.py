@@ -10,8 +10,14 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.correspondences import Projected, match_near, match_points, project_points
-from torchslam.gating import innovation_covariances, mahalanobis_squared
-from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform
+from torchslam.geometry import (
+    Camera,
+    estimate_absolute_pose,
+    innovation_covariances,
+    mahalanobis_squared,
+    se3_inverse,
+    transform,
+)
 from torchslam.map import Map
 from torchslam.solvers import refine_pose
 from torchslam.solvers.robust import Kernel

@@ -1,4 +1,4 @@
-"""What is trained: a small network that moves keypoints by a fraction of a pixel, behind a front end that stays."""
+"""What is trained: a small network that moves keypoints by up to a few pixels, behind a front end that stays."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from experiments.match_weights.problems import Problems
-from torchslam.geometry import transform
+from torchslam.geometry import innovation_covariances, mahalanobis_squared, transform
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.solvers.robust import Kernel
 
@@ -100,7 +100,7 @@ def describe(problems: Problems, T: Tensor) -> Tensor:
     residuals = torch.where(valid, errors.norm(dim=-1) / cues.scales_query, 100.0)
     inliers = (residuals < 3.0) & mask
     noise = _median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
-    surprise = (torch.linalg.solve(_covariances(problems, T), errors) * errors).sum(-1).clamp_min(0)
+    surprise = mahalanobis_squared(errors, _covariances(problems, T)).clamp_min(0)
     depths_q, depths_b = points_q[..., 2].clamp_min(1e-3), problems.points[..., 2]
     growth = (cues.scales_query * depths_q / (cues.scales_base * depths_b)).log()
     turn = cues.turns - _median(cues.turns, mask)
@@ -135,8 +135,7 @@ def describe(problems: Problems, T: Tensor) -> Tensor:
 def _covariances(problems: Problems, T: Tensor) -> Tensor:
     """(P, N, 2, 2) px^2 at poses T: of a keypoint by its level, plus what its point's covariance adds."""
     J = problems.camera.project_with_point_jacobians(transform(T, problems.points))[2] @ T[:, None, :3, :3]
-    eye = torch.eye(2, dtype=J.dtype, device=J.device)
-    return problems.cues.scales_query.square()[..., None, None] * eye + J @ problems.covariances @ J.mT
+    return innovation_covariances(J, problems.covariances, problems.cues.scales_query)
 
 
 def propagated_variances(problems: Problems, T: Tensor) -> Tensor:

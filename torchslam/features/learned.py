@@ -1,7 +1,8 @@
 """Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
 
 The networks are kornia's. Descriptors are floats of unit length, angles are 0. The networks have a single scale; it is
-given as 2 pixels, about the standard deviation of their keypoints, because that is what scales stand for in weights.
+given as 2 pixels, because scales stand for the standard deviation of keypoints: XFeat's are better than that, but taken
+for 1 pixel, clips come out worse (`experiments/learn_features/clip_noise.md`).
 Keypoints, scores and descriptors carry gradients to the weights.
 """
 

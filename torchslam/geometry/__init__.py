@@ -9,6 +9,7 @@ from torchslam.geometry.essential import (
     five_point,
     sampson_errors,
 )
+from torchslam.geometry.gating import innovation_covariances, mahalanobis_squared
 from torchslam.geometry.homography import (
     decompose_homography,
     homography_from_matches,
@@ -61,6 +62,8 @@ __all__ = [
     "estimate_relative_pose",
     "five_point",
     "homography_from_matches",
+    "innovation_covariances",
+    "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
     "quaternion_from_matrix",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -14,7 +14,7 @@ from torchslam.geometry.lie import transform
 from torchslam.solvers.implicit import Backward, attach, check_backward
 from torchslam.solvers.levenberg import Convergence, minimize
 from torchslam.solvers.linear import factorize
-from torchslam.solvers.pose_expansion import PoseObservations
+from torchslam.solvers.pose_expansion import PoseModel, PoseObservations
 from torchslam.solvers.prior import PosePrior, prior_expansion, prior_hessian
 from torchslam.solvers.residuals import (
     Observations,
@@ -160,22 +160,6 @@ class _Inputs:
         return _Inputs(points_w, self.observations.replaced(rest[:4]), prior)
 
 
-@dataclass(frozen=True)
-class _PoseModel:
-    """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6).
-
-    hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
-    bend:    (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
-             Newton's, several times as effective; zero elsewhere
-    """
-
-    T_cw: Tensor
-    cost: Tensor
-    gradient: Tensor
-    hessian: Tensor
-    bend: Tensor
-
-
 class _PoseProblem:
     """The least-squares problem of `refine_pose`: for `minimize`, and what follows from its minimum."""
 
@@ -186,16 +170,16 @@ class _PoseProblem:
         counted = (self.observations.weights > 0).sum(-1)
         self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
 
-    def evaluate(self, T_cw: Tensor, near: Tensor) -> _PoseModel:
-        model = _PoseModel(T_cw, *self.laid_out.expand(T_cw, near))
+    def evaluate(self, T_cw: Tensor, near: Tensor) -> PoseModel:
+        model = self.laid_out.expand(T_cw, near)
         if self.prior is None:
             return model
         cost, gradient, hessian = prior_expansion(self.prior, T_cw)
-        return replace(
-            model, cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
+        return model._replace(
+            cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
         )
 
-    def step(self, model: _PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, model: PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
         # Elements without any weight stay solvable: their step is zero.
         grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
         damped = (model.hessian + model.bend) * grow + floor
@@ -206,16 +190,16 @@ class _PoseProblem:
         xi = -torch.cholesky_solve(model.gradient[..., None], factor).squeeze(-1)
         return retract(model.T_cw, xi), -0.5 * (xi * model.gradient).sum(-1)
 
-    def select(self, accept: Tensor, new: _PoseModel, old: _PoseModel) -> _PoseModel:
+    def select(self, accept: Tensor, new: PoseModel, old: PoseModel) -> PoseModel:
         if accept.all():
             return new
         matrix, vector = accept[:, None, None], accept[:, None]
-        return _PoseModel(
+        return PoseModel(
             torch.where(matrix, new.T_cw, old.T_cw),
             torch.where(accept, new.cost, old.cost),
             torch.where(vector, new.gradient, old.gradient),
             torch.where(matrix, new.hessian, old.hessian),
-            torch.where(matrix, new.bend, torch.zeros_like(old.bend)),
+            torch.where(matrix, new.bend, 0.0),
         )
 
     def covariance(self, T_cw: Tensor) -> Tensor:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from torchslam.gating import innovation_covariances, mahalanobis_squared
+from torchslam.geometry import innovation_covariances, mahalanobis_squared
 
 
 def test_distance_of_uncertain_predictions_is_chi_square(generator: torch.Generator) -> None:
