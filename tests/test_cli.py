@@ -20,7 +20,7 @@ from torchslam.cli import main
 from torchslam.config import load_config
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
-from torchslam.output.map_file import read_map
+from torchslam.world.map_file import read_map
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]

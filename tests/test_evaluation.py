@@ -14,7 +14,7 @@ from torchslam.data.association import interpolate_poses
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate, evaluate, rpe
 from torchslam.geometry.lie import quaternion_from_matrix, rigid, se3_exp, se3_inverse, so3_exp
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 
 def _poses(generator: torch.Generator, count: int, dtype: torch.dtype = torch.float64) -> Tensor:

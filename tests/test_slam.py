@@ -17,7 +17,7 @@ from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
-from torchslam.tracking import Tracker
+from torchslam.tracking.tracker import Tracker
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 

@@ -5,18 +5,18 @@ run = torchslam.SLAM(sequence.camera).run(sequence)
 torchslam.evaluate(run.trajectory, sequence.groundtruth).ate_m
 """
 
-from torchslam.clip import ClipPoses, ClipSLAM
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.errors import TorchslamError
 from torchslam.evaluation import evaluate
 from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, triangulate, umeyama
-from torchslam.graph import GraphSolution, ObservationGraph, solve
+from torchslam.learning.clip import ClipPoses, ClipSLAM
 from torchslam.run import Run
 from torchslam.slam import SLAM
 from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
-from torchslam.types import Features, Frame, Matches, State, StepResult, Trajectory
+from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
+from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
 
 __version__ = "0.1.0"
 

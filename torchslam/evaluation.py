@@ -17,7 +17,7 @@ from torchslam.data.association import interpolate_poses, nearest
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 TOLERANCE = 0.02
 """Seconds: an estimated pose without a true one this near in time is left out."""

@@ -13,13 +13,13 @@ import torch
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError, InitializationError
-from torchslam.extraction import simulated_extractor
+from torchslam.front_end import simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.graph import solve
-from torchslam.history import History, RunGraph
-from torchslam.local_bundle import adjust_all
-from torchslam.map import Map
-from torchslam.types import State, StepResult, Trajectory
+from torchslam.mapping.local_bundle import adjust_all
+from torchslam.solvers.graph import solve
+from torchslam.values import State, StepResult, Trajectory
+from torchslam.world.history import History, RunGraph
+from torchslam.world.map import Map
 
 if TYPE_CHECKING:
     from torchslam.slam import SLAM

@@ -13,17 +13,17 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.extraction import Extractor, image_extractor
+from torchslam.front_end import Extractor, image_extractor
 from torchslam.geometry import Camera
-from torchslam.history import History
-from torchslam.initialization import Initializer, Start
-from torchslam.keyframes import why_keyframe
-from torchslam.map import Map
-from torchslam.mapping import Mapper
+from torchslam.mapping.keyframes import why_keyframe
+from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
 from torchslam.stopwatch import Stopwatch
-from torchslam.tracking import Tracked, Tracker
-from torchslam.types import Frame, State, StepResult, Trajectory, View
+from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
+from torchslam.world.history import History
+from torchslam.world.map import Map
 
 MIN_KEYFRAMES = 4  # a map that is lost before it has this many was a bad start
 

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from experiments.common import table, write_between
 from torchslam.config import load_config
-from torchslam.extraction import simulated_extractor
+from torchslam.front_end import simulated_extractor
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.slam import SLAM
-from torchslam.types import Frame
+from torchslam.values import Frame
 
 
 def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:

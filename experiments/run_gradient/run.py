@@ -21,8 +21,8 @@ from torchslam.data.association import interpolate_poses
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.graph import GraphSolution, ObservationGraph, solve
 from torchslam.slam import SLAM
+from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, transform
-from torchslam.graph import GraphSolution, ObservationGraph, solve
+from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
 from torchslam.solvers.robust import Kernel, robustify
 
 KERNEL: Kernel = "huber"

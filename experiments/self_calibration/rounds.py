@@ -12,10 +12,10 @@ from experiments.self_calibration.calibration import calibrate, parameters
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.extraction import Extractor
+from torchslam.front_end import Extractor
 from torchslam.geometry import Camera
 from torchslam.slam import SLAM
-from torchslam.types import Features, Frame, Trajectory
+from torchslam.values import Features, Frame, Trajectory
 
 # The discrete choices of a run move its answer by about this much.
 _SETTLED = 2e-3

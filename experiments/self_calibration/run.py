@@ -15,10 +15,10 @@ from experiments.self_calibration.calibration import parameters, with_parameters
 from experiments.self_calibration.rounds import Remembered, Round, one_round, rounds
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Sequence
-from torchslam.extraction import image_extractor, simulated_extractor
+from torchslam.front_end import image_extractor, simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.run import true_poses
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"

@@ -10,7 +10,7 @@ import torch
 from torchslam.data import read_trajectory, write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import se3_exp
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 
 def test_round_trip(tmp_path: Path, generator: torch.Generator) -> None:

@@ -19,10 +19,10 @@ from experiments.self_calibration.rounds import Remembered, rounds
 from experiments.self_calibration.run import PosesOnly, misjudged
 from tests.walks import Walk, arc
 from torchslam.config import load_config
-from torchslam.extraction import simulated_extractor
+from torchslam.front_end import simulated_extractor
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.graph import ObservationGraph
 from torchslam.run import true_poses
+from torchslam.solvers.graph import ObservationGraph
 
 TRUTH = Camera.radial_tangential(400.0, 404.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -1e-3, size=(640, 480))
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchslam.features import hamming, match, match_projected, matching
-from torchslam.types import Features, Matches
+from torchslam.values import Features, Matches
 
 WIDTH, HEIGHT = 320, 240
 

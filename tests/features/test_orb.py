@@ -14,7 +14,7 @@ from torchslam.errors import ConfigError
 from torchslam.features import ORB, OpenCVORB, extractor, match
 from torchslam.features.brief import blur, describe
 from torchslam.features.pattern import PATTERN
-from torchslam.types import Features
+from torchslam.values import Features
 
 EXTRACTORS = pytest.mark.parametrize("kind", [ORB, OpenCVORB])
 

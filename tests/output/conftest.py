@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
-from torchslam.map import Map
-from torchslam.types import State, StepResult, Trajectory, View
+from torchslam.values import State, StepResult, Trajectory, View
+from torchslam.world.map import Map
 
 KEYPOINTS = 40
 FRAMES = 30

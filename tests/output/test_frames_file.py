@@ -7,7 +7,7 @@ import pytest
 
 from torchslam.errors import ResultsError
 from torchslam.output.frames_file import read_frames, write_frames
-from torchslam.types import StepResult
+from torchslam.values import StepResult
 
 
 def test_frames_come_back_without_poses(tmp_path: Path, results: list[StepResult]) -> None:

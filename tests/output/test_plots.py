@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torchslam.output import plots
 from torchslam.output.plots import style
 from torchslam.output.plots.scene import _wrapped
-from torchslam.types import StepResult, Trajectory
+from torchslam.values import StepResult, Trajectory
 
 pytestmark = pytest.mark.filterwarnings("error")
 

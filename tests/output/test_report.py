@@ -9,11 +9,11 @@ import torch
 from torchslam.config import Config
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera
-from torchslam.history import History
-from torchslam.map import Map
 from torchslam.output.report import metrics, summary, table
 from torchslam.run import Run, keyframe_trajectory
-from torchslam.types import State, StepResult, Trajectory
+from torchslam.values import State, StepResult, Trajectory
+from torchslam.world.history import History
+from torchslam.world.map import Map
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from torchslam.types import StepResult
+from torchslam.values import StepResult
 
 
 class ProgressBar:

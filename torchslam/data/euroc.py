@@ -17,7 +17,7 @@ from torchslam.data.text_file import check_later, numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 NANOSECONDS = 1_000_000_000
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"

@@ -17,7 +17,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 ATTEMPTS = 20
 """Unreadable images after which a sequence is given up."""

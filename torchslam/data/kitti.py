@@ -16,7 +16,7 @@ from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.camera import Camera
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 CAMERAS = ("image_0", "image_2")
 """The left cameras, grey and colour."""

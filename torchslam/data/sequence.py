@@ -12,7 +12,7 @@ from torchslam.data.association import interpolate_poses
 from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
-from torchslam.types import Frame, Trajectory
+from torchslam.values import Frame, Trajectory
 
 GROUNDTRUTH_TOLERANCE = 0.02
 """Seconds between an image and the nearest ground-truth pose beyond which the image counts as without one."""

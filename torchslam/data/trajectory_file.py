@@ -9,7 +9,7 @@ import torch
 from torchslam.data.text_file import check_later, numbered_lines, parse_floats
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torchslam.errors import ConfigError
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
-from torchslam.types import Features
+from torchslam.values import Features
 
 _SCALE = 2.0
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
-from torchslam.types import Features, Matches
+from torchslam.values import Features, Matches
 
 # Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
 _AMPLITUDE = 64

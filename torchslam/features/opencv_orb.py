@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchslam.features.orb import check_images
-from torchslam.types import Features
+from torchslam.values import Features
 
 
 class OpenCVORB(nn.Module):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.types import Features
+from torchslam.values import Features
 
 DESCRIPTOR_BYTES = 32
 

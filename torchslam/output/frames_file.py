@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchslam.errors import ResultsError
-from torchslam.types import State, StepResult
+from torchslam.values import State, StepResult
 
 COLUMNS = ("index", "timestamp", "state", "keyframe", "matches", "inliers", "reason")
 STAGE_SUFFIX = "_ms"

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import rigid, so3_log, transform
-from torchslam.map import NO_POINT, Map
 from torchslam.output import plots
 from torchslam.output.results import PLOTS, Results, example_keyframe
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
+from torchslam.world.map import NO_POINT, Map
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

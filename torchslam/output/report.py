@@ -10,7 +10,7 @@ import torch
 
 from torchslam.evaluation import Evaluation
 from torchslam.run import Run
-from torchslam.types import State, StepResult
+from torchslam.values import State, StepResult
 
 
 def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:

@@ -16,12 +16,12 @@ from torchslam.data.image_file import read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
-from torchslam.map import Map
 from torchslam.output.frames_file import read_frames, write_frames
-from torchslam.output.map_file import read_map, write_map
 from torchslam.output.ply import write_ply
 from torchslam.run import Run
-from torchslam.types import StepResult, Trajectory
+from torchslam.values import StepResult, Trajectory
+from torchslam.world.map import Map
+from torchslam.world.map_file import read_map, write_map
 
 TRAJECTORY = "trajectory.txt"
 KEYFRAMES = "keyframes.txt"

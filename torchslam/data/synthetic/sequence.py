@@ -20,7 +20,7 @@ from torchslam.data.synthetic.scene import Rectangle, room, wall
 from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 FRAME_RATE = 20.0
 FRAMES_PER_ROUND = 160

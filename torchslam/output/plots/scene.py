@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.output.plots import style
 from torchslam.output.plots.ellipses import draw_ellipses
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchslam.output.plots import style
-from torchslam.types import State, StepResult
+from torchslam.values import State, StepResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

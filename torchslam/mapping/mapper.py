@@ -6,16 +6,14 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.correspondences import match_near, project_points
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, se3_inverse, transform, triangulation_covariance
-from torchslam.initialization import Start
-from torchslam.local_bundle import adjust
-from torchslam.map import Map
-from torchslam.new_points import triangulate_against
+from torchslam.mapping.local_bundle import adjust
+from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
-from torchslam.tracking import Tracked
-from torchslam.types import View
+from torchslam.tracking.correspondences import match_near, project_points
+from torchslam.values import Start, Tracked, View
+from torchslam.world.map import Map
 
 
 class Mapper:

@@ -10,7 +10,7 @@ from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.features import SimulatedFeatures, extractor
 from torchslam.geometry import Camera
-from torchslam.types import Features, Frame
+from torchslam.values import Features, Frame
 
 Extractor = Callable[[Frame], Features]
 

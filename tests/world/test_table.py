@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.table import Table
+from torchslam.world.table import Table
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=12))

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.graph import GraphSolution, ObservationGraph
-from torchslam.map import Map
-from torchslam.table import Table
-from torchslam.tracking import Tracked
-from torchslam.types import Trajectory, View
+from torchslam.solvers.graph import GraphSolution, ObservationGraph
+from torchslam.values import Tracked, Trajectory, View
+from torchslam.world.map import Map
+from torchslam.world.table import Table
 
 
 @dataclass(frozen=True)

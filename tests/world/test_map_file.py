@@ -8,8 +8,8 @@ from safetensors.torch import save_file
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map import Map
-from torchslam.output.map_file import read_map, write_map
+from torchslam.world.map import Map
+from torchslam.world.map_file import read_map, write_map
 
 
 def test_map_and_camera_come_back_as_they_were(tmp_path: Path, slam_map: Map, camera: Camera) -> None:

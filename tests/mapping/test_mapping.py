@@ -10,19 +10,18 @@ import torch
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
-from torchslam.correspondences import match_near, match_points, project_points
 from torchslam.errors import ConfigError
-from torchslam.extraction import simulated_extractor
+from torchslam.front_end import simulated_extractor
 from torchslam.geometry import se3_exp, se3_inverse, transform
-from torchslam.initialization import Initializer, Start
-from torchslam.keyframes import why_keyframe
-from torchslam.local_bundle import adjust, adjust_all
-from torchslam.map import NO_POINT
-from torchslam.mapping import Mapper, world_scale
-from torchslam.new_points import has_consistent_scale, match_along_epipolar_lines
+from torchslam.mapping.keyframes import why_keyframe
+from torchslam.mapping.local_bundle import adjust, adjust_all
+from torchslam.mapping.mapper import Mapper, world_scale
+from torchslam.mapping.new_points import has_consistent_scale, match_along_epipolar_lines
 from torchslam.slam import SLAM
-from torchslam.tracking import Tracked
-from torchslam.types import View
+from torchslam.tracking.correspondences import match_near, match_points, project_points
+from torchslam.tracking.initialization import Initializer
+from torchslam.values import Start, Tracked, View
+from torchslam.world.map import NO_POINT
 
 OVERRIDES = [
     "features.kind=simulated",

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchslam.map import NO_POINT, Map
 from torchslam.solvers import Marginals
-from torchslam.types import View
+from torchslam.values import View
+from torchslam.world.map import NO_POINT, Map
 
 KEYPOINTS = 8
 

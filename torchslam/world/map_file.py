@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map import Map
+from torchslam.world.map import Map
 
 FORMAT = 2  # 1 had no covariances
 

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from torchslam.config import BundleConfig
 from torchslam.geometry import Camera, transform
-from torchslam.map import Map, Observations
 from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.values import Observations
+from torchslam.world.map import Map
 
 CHI_SQUARE = 5.991  # 95 % of two degrees of freedom
 HUBER = CHI_SQUARE**0.5

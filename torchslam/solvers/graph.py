@@ -20,7 +20,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust, refine_pose
 from torchslam.solvers.implicit import Backward
 from torchslam.solvers.robust import Kernel
-from torchslam.types import Trajectory
+from torchslam.values import Trajectory
 
 _FRAMES_AT_ONCE = 64
 _TENSORS = (

@@ -15,11 +15,11 @@ from torch import Tensor, nn
 
 from torchslam.config import Config
 from torchslam.geometry import Camera
-from torchslam.graph import GraphSolution, solve
-from torchslam.history import RunGraph
 from torchslam.run import finish
 from torchslam.slam import SLAM
-from torchslam.types import Features, Frame
+from torchslam.solvers.graph import GraphSolution, solve
+from torchslam.values import Features, Frame
+from torchslam.world.history import RunGraph
 
 
 @dataclass(frozen=True)

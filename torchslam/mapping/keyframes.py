@@ -6,9 +6,9 @@ import torch
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import se3_inverse, so3_log, transform
-from torchslam.map import Map
-from torchslam.tracking import Tracked, Tracker
-from torchslam.types import View
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import Tracked, View
+from torchslam.world.map import Map
 
 
 def why_keyframe(

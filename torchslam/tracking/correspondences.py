@@ -11,8 +11,8 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.features import hamming, match, match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.map import Map
-from torchslam.types import View
+from torchslam.values import View
+from torchslam.world.map import Map
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import torch
 
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
-from torchslam.graph import ObservationGraph, solve
+from torchslam.solvers.graph import ObservationGraph, solve
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 

@@ -6,35 +6,15 @@ for each keypoint the id of the point it observes, or -1: every list of observat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
 from torchslam.solvers import Marginals
-from torchslam.table import Table
-from torchslam.types import Features, View
+from torchslam.values import Features, Observations, View
+from torchslam.world.table import Table
 
 NO_POINT = -1
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
-
-    keyframe_index, keypoint_index, point_index: (O,) int64
-    pixels: (O, 2); scales: (O,) pixels
-    """
-
-    keyframe_index: Tensor
-    keypoint_index: Tensor
-    point_index: Tensor
-    pixels: Tensor
-    scales: Tensor
-
-    def __len__(self) -> int:
-        return len(self.point_index)
 
 
 class Map:

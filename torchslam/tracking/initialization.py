@@ -3,33 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchslam.config import Config, InitializationConfig
-from torchslam.correspondences import match_views
 from torchslam.geometry import Camera, Triangulation, estimate_relative_pose, triangulate
 from torchslam.solvers import BundleProblem, bundle_adjust
-from torchslam.types import View
-
-
-@dataclass(frozen=True)
-class Start:
-    """A pair of views good enough to start a map.
-
-    reference, view: the two views; the camera of the reference is the world
-    T_cw:      (4, 4) pose of the second view
-    points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
-    """
-
-    reference: View
-    view: View
-    T_cw: Tensor
-    points_w: Tensor
-    keypoints_1: Tensor
-    keypoints_2: Tensor
+from torchslam.tracking.correspondences import match_views
+from torchslam.values import Start, View
 
 
 class Initializer:

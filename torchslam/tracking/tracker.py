@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.correspondences import Projected, match_near, match_points, project_points
 from torchslam.geometry import (
     Camera,
     estimate_absolute_pose,
@@ -18,29 +16,11 @@ from torchslam.geometry import (
     se3_inverse,
     transform,
 )
-from torchslam.map import Map
 from torchslam.solvers import refine_pose
 from torchslam.solvers.robust import Kernel
-from torchslam.types import View
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A frame that knows where it is.
-
-    T_cw:        (4, 4)
-    point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
-    matches:     how many matches the inliers were chosen from
-    """
-
-    T_cw: Tensor
-    point_ids: Tensor
-    keypoints: Tensor
-    matches: int
-
-    @property
-    def inliers(self) -> int:
-        return len(self.point_ids)
+from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
+from torchslam.values import Tracked, View
+from torchslam.world.map import Map
 
 
 class Tracker:

@@ -126,6 +126,60 @@ class View:
 
 
 @dataclass(frozen=True)
+class Start:
+    """A pair of views good enough to start a map.
+
+    reference, view: the two views; the camera of the reference is the world
+    T_cw:      (4, 4) pose of the second view
+    points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
+    """
+
+    reference: View
+    view: View
+    T_cw: Tensor
+    points_w: Tensor
+    keypoints_1: Tensor
+    keypoints_2: Tensor
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame that knows where it is.
+
+    T_cw:        (4, 4)
+    point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
+    matches:     how many matches the inliers were chosen from
+    """
+
+    T_cw: Tensor
+    point_ids: Tensor
+    keypoints: Tensor
+    matches: int
+
+    @property
+    def inliers(self) -> int:
+        return len(self.point_ids)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
+
+    keyframe_index, keypoint_index, point_index: (O,) int64
+    pixels: (O, 2); scales: (O,) pixels
+    """
+
+    keyframe_index: Tensor
+    keypoint_index: Tensor
+    point_index: Tensor
+    pixels: Tensor
+    scales: Tensor
+
+    def __len__(self) -> int:
+        return len(self.point_index)
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """Camera poses over time, ordered by timestamp.
 

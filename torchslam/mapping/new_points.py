@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config, MatchingConfig
-from torchslam.correspondences import descriptor_distances, max_distance
 from torchslam.geometry import (
     Camera,
     se3_inverse,
@@ -17,8 +16,9 @@ from torchslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from torchslam.map import NO_POINT, Map
-from torchslam.types import View
+from torchslam.tracking.correspondences import descriptor_distances, max_distance
+from torchslam.values import View
+from torchslam.world.map import NO_POINT, Map
 
 
 def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Camera, config: Config) -> None:

@@ -1,0 +1,1 @@
+"""SLAM as a module to train through."""

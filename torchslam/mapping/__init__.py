@@ -1,0 +1,1 @@
+"""What a keyframe does to the map: new points, fusion, culling, local adjustment."""

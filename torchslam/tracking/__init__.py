@@ -1,0 +1,1 @@
+"""Where is the camera now? Initialise, predict, correspond, judge, relocalise."""
