@@ -265,7 +265,7 @@ def normalised(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
 def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     """An error that is too large for the pixel alone is accepted where the point is uncertain by as much."""
     walk = Walk(arc(40))
-    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "tracking.gate=mahalanobis")
+    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "measurement.gate=mahalanobis")
     assert len(run.trajectory) == 40
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
     tracker = Tracker(run.camera, run.config, run.map)

@@ -43,6 +43,15 @@ class MatchingConfig:
 
 
 @dataclass(frozen=True)
+class MeasurementConfig:
+    """How far a keypoint may lie from where its point is predicted: the one test of tracking, mapping and adjusting."""
+
+    # chi_square: errors in units of the pixel noise | mahalanobis: in tracking of that and the point's uncertainty
+    gate: str = "chi_square"
+    chi_square: float = 5.991  # 95 % of two degrees of freedom
+
+
+@dataclass(frozen=True)
 class InitializationConfig:
     criterion: str = "uncertainty"  # uncertainty | parallax (the criteria of configs/paper.toml)
     min_matches: int = 100  # fewer than this with the reference frame: a new reference
@@ -69,9 +78,6 @@ class TrackingConfig:
     wide_radius_factor: float = 3.0
     refine_radius_px: float = 5.0
     threshold_px: float = 3.0  # of the PnP RANSAC
-    # chi_square: errors in units of the pixel noise | mahalanobis: of that and the point's uncertainty
-    gate: str = "chi_square"
-    chi_square: float = 5.991  # 95 % of two degrees of freedom
     min_matches: int = 20
     min_inliers: int = 20
     local_keyframes: int = 12
@@ -94,7 +100,6 @@ class MappingConfig:
     partners: str = "covisible"  # new points are triangulated against: covisible | last (keyframes)
     neighbours: int = 5  # how many of them
     min_parallax_deg: float = 1.0
-    max_error_chi_square: float = 5.991
     epipolar_px: float = 2.0
     min_baseline: float = 0.01  # as a share of the median depth
     fuse: bool = True
@@ -119,6 +124,7 @@ class Config:
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     simulated: SimulatedConfig = field(default_factory=SimulatedConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
+    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
@@ -130,7 +136,7 @@ CHOICES = {
     "scale": ("unit", "groundtruth"),
     "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
     "initialization.criterion": ("uncertainty", "parallax"),
-    "tracking.gate": ("chi_square", "mahalanobis"),
+    "measurement.gate": ("chi_square", "mahalanobis"),
     "mapping.partners": ("covisible", "last"),
 }
 

@@ -24,6 +24,7 @@ from torchslam.tracking.tracker import Tracker
 from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
 from torchslam.world.history import History
 from torchslam.world.map import Map
+from torchslam.world.world import World
 
 MIN_KEYFRAMES = 4  # a map that is lost before it has this many was a bad start
 
@@ -52,10 +53,9 @@ class SLAM:
 
     def _forget_map(self) -> None:
         self.state = State.INITIALIZING
-        self.map = Map()
-        self.history = History()
-        self.tracker = Tracker(self.camera, self.config, self.map)
-        self.mapper = Mapper(self.camera, self.config, self.map, self.clock)
+        self.world = World.empty(0, self.camera.params)
+        self.tracker = Tracker(self.camera, self.config)
+        self.mapper = Mapper(self.camera, self.config, self.clock)
 
     @torch.no_grad()
     def step(self, frame: Frame) -> StepResult:
@@ -69,15 +69,23 @@ class SLAM:
         if self.state is State.INITIALIZING:
             return self._initialize(view)
         with self.clock("tracking"):
-            tracked = self.tracker.track(view)
+            tracked = self.tracker.track(self.world, view)
         if tracked is None:
             return self._lose(view)
         self.state = State.TRACKING
-        why = why_keyframe(view, tracked, self.tracker, self.map, self.config.keyframes)
+        why = why_keyframe(view, tracked, self.world, self.config.keyframes)
         if why:
-            self.tracker.follow(self.mapper.insert(view, tracked))
-        self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)
-        return self._result(view, why, self.tracker.T_cw, tracked, is_keyframe=bool(why))
+            self.tracker.follow(self.world, self.mapper.insert(self.map, view, tracked))
+        self.history.add(view, tracked, self.world.track.T_cr, self.world.track.reference)
+        return self._result(view, why, self.world.T_cw, tracked, is_keyframe=bool(why))
+
+    @property
+    def map(self) -> Map:
+        return self.world.map
+
+    @property
+    def history(self) -> History:
+        return self.world.history
 
     def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
@@ -96,14 +104,14 @@ class SLAM:
         if reason:
             return self._result(view, reason)
         self.state = State.TRACKING
-        return self._result(view, "started the map", self.tracker.T_cw, is_keyframe=True)
+        return self._result(view, "started the map", self.world.T_cw, is_keyframe=True)
 
     def _start(self, start: Start) -> str:
         """Make the first map; why it is not believed after all, or nothing."""
-        first, second = self.mapper.start(start)
-        self.tracker.follow(first)
+        first, second = self.mapper.start(self.map, start)
+        self.tracker.follow(self.world, first)
         explained = [self._explain(earlier) for earlier in self.initializer.views]
-        self.tracker.follow(second)
+        self.tracker.follow(self.world, second)
         if sum(explained) >= self.config.initialization.min_explained * len(explained):
             return ""
         self._forget_map()
@@ -111,10 +119,10 @@ class SLAM:
 
     def _explain(self, view: View) -> bool:
         """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
-        tracked = self.tracker.track(view)
+        tracked = self.tracker.track(self.world, view)
         if tracked is None:
             return False
-        self.history.add(view, tracked, self.tracker.T_cr, self.tracker.reference)
+        self.history.add(view, tracked, self.world.track.T_cr, self.world.track.reference)
         return tracked.inliers > 0.5 * tracked.matches
 
     def _lose(self, view: View) -> StepResult:

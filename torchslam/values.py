@@ -85,6 +85,7 @@ class View:
     angles:      (N,) radians
     descriptors: (N, D)
     mask:        (N,) bool
+    session:     which run over the same map saw it, from 0
     """
 
     index: int
@@ -95,6 +96,7 @@ class View:
     descriptors: Tensor
     mask: Tensor
     T_cw_groundtruth: Tensor | None = None
+    session: int = 0
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> View:
@@ -189,6 +191,11 @@ class Trajectory:
 
     timestamps: Tensor
     T_wc: Tensor
+
+    @classmethod
+    def empty(cls) -> Trajectory:
+        """Without poses."""
+        return cls(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
 
     def __len__(self) -> int:
         return int(self.timestamps.shape[0])

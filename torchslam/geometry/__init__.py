@@ -9,7 +9,13 @@ from torchslam.geometry.essential import (
     five_point,
     sampson_errors,
 )
-from torchslam.geometry.gating import innovation_covariances, mahalanobis_squared
+from torchslam.geometry.gating import (
+    CHI_SQUARE_95,
+    fits,
+    innovation_covariances,
+    mahalanobis_squared,
+    squared_reprojection_errors,
+)
 from torchslam.geometry.homography import (
     decompose_homography,
     homography_from_matches,
@@ -49,6 +55,7 @@ from torchslam.geometry.triangulation import (
 )
 
 __all__ = [
+    "CHI_SQUARE_95",
     "AbsolutePose",
     "Camera",
     "MultiViewTriangulation",
@@ -60,6 +67,7 @@ __all__ = [
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",
+    "fits",
     "five_point",
     "homography_from_matches",
     "innovation_covariances",
@@ -84,6 +92,7 @@ __all__ = [
     "so3_exp",
     "so3_left_jacobian",
     "so3_log",
+    "squared_reprojection_errors",
     "transfer_errors",
     "transform",
     "triangulate",

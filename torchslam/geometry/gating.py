@@ -1,9 +1,29 @@
-"""Whether a measurement fits a prediction, both of them uncertain."""
+"""Whether a measurement fits a prediction: the one model of what a keypoint's error may be.
+
+A keypoint is known to its scale in pixels, in each direction, so that the squared error of a right match divided by the
+squared scale follows a chi-square distribution of two degrees of freedom.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+
+CHI_SQUARE_95 = 5.991
+"""95 % of a chi-square distribution of two degrees of freedom."""
+
+
+def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
+    """(...) px^2 between projections of points (..., 3) in the camera frame and pixels (..., 2); infinite behind it."""
+    projected, valid = camera.project(points_c)
+    return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
+
+
+def fits(squared_errors: Tensor, sigmas: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
+    """(...) bool: squared errors (...), px^2, that keypoints of standard deviation sigmas (...), px, may well have."""
+    return squared_errors < chi_square * sigmas**2
 
 
 def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Tensor:

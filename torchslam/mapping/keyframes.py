@@ -6,30 +6,28 @@ import torch
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import se3_inverse, so3_log, transform
-from torchslam.tracking.tracker import Tracker
 from torchslam.values import Tracked, View
-from torchslam.world.map import Map
+from torchslam.world.world import World
 
 
-def why_keyframe(
-    view: View, tracked: Tracked, tracker: Tracker, slam_map: Map, settings: KeyframesConfig
-) -> str:
+def why_keyframe(view: View, tracked: Tracked, world: World, settings: KeyframesConfig) -> str:
     """Why a tracked frame should become a keyframe, in words; empty when it should not.
 
     Because no keyframe around is near it, in translation (as a share of the depth of the scene) and in rotation; or
     because it sees few of the points of its reference keyframe, the one that shares most points with it.
     """
+    slam_map, track = world.map, world.track
     newest = slam_map.num_keyframes - 1
-    age = view.index - int(slam_map.keyframes["frame_index"][newest])
+    age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
     if age < max(1, settings.min_interval):
         return ""
-    around = torch.cat([tracker.local_keyframes, tracker.local_keyframes.new_tensor([newest])])
+    around = torch.cat([track.local_keyframes, track.local_keyframes.new_tensor([newest])])
     T_ck = tracked.T_cw @ se3_inverse(slam_map.T_cw[around])
     depth = transform(tracked.T_cw, slam_map.positions_w[tracked.point_ids])[:, 2].median()
     translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
     rotation = torch.rad2deg(torch.linalg.vector_norm(so3_log(T_ck[:, :3, :3]), dim=-1))
     has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
-    overlap = tracked.inliers / max(tracker.reference_size, 1)
+    overlap = tracked.inliers / max(track.reference_size, 1)
     if bool((has_moved | has_turned).all()):
         if bool(has_moved.all()):
             return f"moved by {float(translation.min()):.2f} of the depth of the scene"

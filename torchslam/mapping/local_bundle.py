@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from torchslam.config import BundleConfig
-from torchslam.geometry import Camera, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.values import Observations
 from torchslam.world.map import Map
 
-CHI_SQUARE = 5.991  # 95 % of two degrees of freedom
-HUBER = CHI_SQUARE**0.5
+HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
 
 
 def adjust(
@@ -77,9 +76,7 @@ def adjust_keyframes(
 def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    projected, valid = camera.project(points_c)
-    errors = ((projected[:, 0] - seen.pixels) ** 2).sum(-1)
-    wrong = ~valid[:, 0] | (errors > CHI_SQUARE * seen.scales**2)
+    wrong = ~fits(squared_reprojection_errors(points_c[:, 0], seen.pixels, camera), seen.scales)
     slam_map.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
     touched = torch.unique(seen.point_index[wrong])
     slam_map.kill(touched[slam_map.points["times_observed"][touched] < 2])

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchslam.config import Config, MatchingConfig
 from torchslam.geometry import (
     Camera,
+    fits,
     se3_inverse,
     skew,
     transform,
@@ -36,8 +37,8 @@ def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Ca
     )
     seen = triangulate(T_1w, T_2w, view_1.keypoints[first], view_2.keypoints[second], camera, camera)
     scale_1, scale_2 = view_1.scales[first], view_2.scales[second]
-    limit = settings.max_error_chi_square
-    good = seen.mask & (seen.errors_1**2 < limit * scale_1**2) & (seen.errors_2**2 < limit * scale_2**2)
+    limit = config.measurement.chi_square
+    good = seen.mask & fits(seen.errors_1**2, scale_1, limit) & fits(seen.errors_2**2, scale_2, limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.scale_range)
     keep = torch.nonzero(good)[:, 0]

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config, InitializationConfig
-from torchslam.geometry import Camera, Triangulation, estimate_relative_pose, triangulate
+from torchslam.geometry import (
+    Camera,
+    Triangulation,
+    estimate_relative_pose,
+    fits,
+    squared_reprojection_errors,
+    transform,
+    triangulate,
+)
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.tracking.correspondences import match_views
 from torchslam.values import Start, View
@@ -152,14 +160,6 @@ def refine_pair(
     refined = solution.T_cw[1].clone()
     refined[:3, 3] *= factor
     points_w = solution.points_w * factor
-    check = triangulation_errors(
-        torch.stack([T[0], refined]), points_w, torch.stack([pixels_1, pixels_2]), camera
-    )
-    return refined, points_w, (check < 5.991 * scales**2).all(0)
-
-
-def triangulation_errors(T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-    """(V, n) squared reprojection errors of points (n, 3) in V views, infinite behind a camera."""
-    points_c = points_w @ T_cw[:, :3, :3].mT + T_cw[:, None, :3, 3]
-    projected, valid = camera.project(points_c)
-    return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
+    points_c = transform(torch.stack([T[0], refined]), points_w)
+    errors = squared_reprojection_errors(points_c, torch.stack([pixels_1, pixels_2]), camera)
+    return refined, points_w, fits(errors, scales).all(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,9 +12,11 @@ from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     estimate_absolute_pose,
+    fits,
     innovation_covariances,
     mahalanobis_squared,
     se3_inverse,
+    squared_reprojection_errors,
     transform,
 )
 from torchslam.solvers import refine_pose
@@ -21,151 +24,148 @@ from torchslam.solvers.robust import Kernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.values import Tracked, View
 from torchslam.world.map import Map
+from torchslam.world.track import Track
+from torchslam.world.world import World
 
 
 class Tracker:
-    """Follows the camera against the local map: the keyframes around the reference keyframe and their points."""
+    """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
 
-    def __init__(self, camera: Camera, config: Config, slam_map: Map) -> None:
+    It keeps nothing itself: where the camera was is the track of the world.
+    """
+
+    def __init__(self, camera: Camera, config: Config) -> None:
         self.camera = camera
-        self.config = config
-        self.map = slam_map
-        self.reference = -1  # keyframe
-        self.reference_size = 0  # points of the reference keyframe that other keyframes see too
-        # The last frame, seen from the reference: it moves with the map.
-        self.T_cr = torch.eye(4, dtype=camera.params.dtype, device=camera.params.device)
-        self.velocity: Tensor | None = None  # last motion, T_c_previous
-        nobody = torch.empty(0, dtype=torch.int64, device=camera.params.device)
-        self.seen_last, self.local_keyframes, self.local_points = nobody, nobody, nobody
-        self.lost_for = 0
+        self.settings = config.tracking
+        self.matching = config.matching
+        self.measurement = config.measurement
+        self.seed = config.seed
 
-    # --- state -----------------------------------------------------------------------------------------------
+    # --- the track -------------------------------------------------------------------------------------------
 
-    @property
-    def T_cw(self) -> Tensor:
-        """(4, 4) pose of the last tracked frame, by the map as it is now."""
-        return self.T_cr @ self.map.T_cw[self.reference]
-
-    def follow(self, keyframe: int) -> None:
+    def follow(self, world: World, keyframe: int) -> None:
         """Go on from a keyframe: the last frame is at its place."""
-        self._set_reference(keyframe, self.map.T_cw[keyframe])
-        self.lost_for = 0
-        seen = self.map.keyframes["point_ids"][keyframe]
-        self.seen_last = seen[seen >= 0]
+        T_cw = world.map.T_cw[keyframe]
+        seen = world.map.keyframes["point_ids"][keyframe]
+        world.track = replace(
+            self._around(world.map, keyframe, T_cw), velocity=world.track.velocity, seen_last=seen[seen >= 0]
+        )
 
-    def _set_reference(self, keyframe: int, T_cw: Tensor) -> None:
-        """The last frame is at T_cw, seen from this keyframe; what is around the keyframe becomes the local map."""
-        self.T_cr = T_cw @ se3_inverse(self.map.T_cw[keyframe])
-        self.reference = keyframe
-        near = self.map.covisible(keyframe, self.config.tracking.local_keyframes)
-        self.local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
-        self.reference_size = self._well_observed(keyframe)
-        recent = self.config.tracking.recent_frames
+    def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> Track:
+        """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
+        near = slam_map.covisible(keyframe, self.settings.local_keyframes)
+        local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
+        recent = self.settings.recent_frames
         if recent:
-            last_seen = self.map.points["last_seen"]
-            self.local_points = torch.nonzero(
-                (last_seen > last_seen.max() - recent) & self.map.points["alive"]
-            )[:, 0]
+            last_seen = slam_map.points["last_seen"]
+            local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["alive"])[
+                :, 0
+            ]
         else:
-            self.local_points = self.map.points_seen_by(self.local_keyframes)
+            local_points = slam_map.points_seen_by(local_keyframes)
+        return Track(
+            T_cr=T_cw @ se3_inverse(slam_map.T_cw[keyframe]),
+            reference=keyframe,
+            reference_size=well_observed(slam_map, keyframe, local_keyframes),
+            velocity=None,
+            seen_last=local_points[:0],
+            local_keyframes=local_keyframes,
+            local_points=local_points,
+        )
 
-    def _well_observed(self, keyframe: int) -> int:
-        """How many points of a keyframe three local keyframes see: what the next frames can be expected to see."""
-        table = self.map.keyframes["point_ids"]
-        local = table[self.local_keyframes].flatten()
-        counts = torch.bincount(local[local >= 0], minlength=len(self.map.points))
-        seen = table[keyframe]
-        return int((counts[seen[seen >= 0]] >= min(3, len(self.local_keyframes))).sum())
-
-    def predict(self) -> Tensor:
+    def predict(self, world: World) -> Tensor:
         """(4, 4) where the next frame should be: constant velocity."""
-        if self.velocity is None or not self.config.tracking.predict:
-            return self.T_cw
-        return self.velocity @ self.T_cw
+        if world.track.velocity is None or not self.settings.predict:
+            return world.T_cw
+        return world.track.velocity @ world.T_cw
 
     # --- one frame -------------------------------------------------------------------------------------------
 
-    def track(self, view: View) -> Tracked | None:
-        """Locate a frame; None when it cannot be located."""
-        candidates = (
-            self._relocalization_candidates(view) if self.lost_for else self._tracking_candidates(view)
-        )
+    def track(self, world: World, view: View) -> Tracked | None:
+        """Locate the frame that comes after the last one; None when it cannot be located."""
+        tracked = self.locate(world.map, view, self._candidates(world, view), world.track.local_points)
+        if tracked is None:
+            world.track.velocity = None
+            return None
+        self.accept(world, view, tracked)
+        return tracked
+
+    def _candidates(self, world: World, view: View) -> Iterator[tuple[Tensor, Tensor]]:
+        """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
+        slam_map, track, settings = world.map, world.track, self.settings
+        T_cw = self.predict(world)
+        if settings.guided:
+            alive = track.seen_last[slam_map.points["alive"][track.seen_last]]
+            near = self._project(slam_map, alive, T_cw, view)
+            yield match_near(slam_map, near, view, settings.radius_px, self.matching, ratio=0.9)
+            local = self._project(slam_map, track.local_points, T_cw, view)
+            wide = settings.radius_px * settings.wide_radius_factor
+            yield match_near(slam_map, local, view, wide, self.matching, ratio=0.9)
+        else:
+            local = self._project(slam_map, track.local_points, T_cw, view)
+        yield match_points(slam_map, local.ids, view, self.matching)
+        yield match_points(slam_map, track.local_points, view, self.matching)
+
+    def locate(
+        self, slam_map: Map, view: View, candidates: Iterator[tuple[Tensor, Tensor]], local_points: Tensor
+    ) -> Tracked | None:
+        """The pose by the first of several sets of matches that gives one, refined against the local points (n,)."""
         for point_ids, keypoints in candidates:
-            tracked = self._locate(view, point_ids, keypoints)
+            tracked = self._locate(slam_map, view, point_ids, keypoints, local_points)
             if tracked is not None:
-                self._accept(view, tracked)
                 return tracked
-        self.lost_for += 1
-        self.velocity = None
         return None
 
-    def _tracking_candidates(self, view: View) -> Iterator[tuple[Tensor, Tensor]]:
-        """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
-        settings, matching = self.config.tracking, self.config.matching
-        T_cw = self.predict()
-        if settings.guided:
-            alive = self.seen_last[self.map.points["alive"][self.seen_last]]
-            near = self._project(alive, T_cw, view)
-            yield match_near(self.map, near, view, settings.radius_px, matching, ratio=0.9)
-            local = self._project(self.local_points, T_cw, view)
-            wide = settings.radius_px * settings.wide_radius_factor
-            yield match_near(self.map, local, view, wide, matching, ratio=0.9)
-        else:
-            local = self._project(self.local_points, T_cw, view)
-        yield match_points(self.map, local.ids, view, matching)
-        yield match_points(self.map, self.local_points, view, matching)
-
-    def _relocalization_candidates(self, view: View) -> Iterator[tuple[Tensor, Tensor]]:
-        """The local map, then a few keyframes in turn, so that all are tried in the end at a bounded cost a frame."""
-        yield match_points(self.map, self.local_points, view, self.config.matching)
-        count = self.map.num_keyframes
-        for offset in range(min(3, count)):
-            keyframe = (count - 1 - 3 * (self.lost_for - 1) - offset) % count
-            ids = self.map.points_seen_by(self.map.ids(keyframe))
-            yield match_points(self.map, ids, view, self.config.matching)
-
-    def _locate(self, view: View, point_ids: Tensor, keypoints: Tensor) -> Tracked | None:
+    def _locate(
+        self, slam_map: Map, view: View, point_ids: Tensor, keypoints: Tensor, local_points: Tensor
+    ) -> Tracked | None:
         """PnP RANSAC over matches, then all local points near their projection, then robust refinement."""
-        settings = self.config.tracking
+        settings = self.settings
         if len(point_ids) < settings.min_matches:
             return None
         pose = estimate_absolute_pose(
-            self.map.positions_w[point_ids][None],
+            slam_map.positions_w[point_ids][None],
             view.keypoints[keypoints][None],
             self.camera,
             threshold=settings.threshold_px,
-            seed=self.config.seed,
+            seed=self.seed,
         )
         if not bool(pose.success[0]):
             return None
         T_cw = pose.T_cw[0]
-        candidates = self._local_points_with(point_ids)
-        near = self._project(candidates, T_cw, view)
-        ids, at = match_near(self.map, near, view, settings.refine_radius_px, self.config.matching, ratio=0.9)
+        candidates = self._local_points_with(slam_map, point_ids, local_points)
+        near = self._project(slam_map, candidates, T_cw, view)
+        ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
         if len(ids) < settings.min_inliers:
             return None
-        T_cw, inliers = self._refine(T_cw, ids, view.keypoints[at], view.scales[at])
+        T_cw, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
         tracked = Tracked(T_cw, ids[inliers], at[inliers], len(ids))
         if tracked.inliers < settings.min_inliers:
             return None
-        self.map.points["times_visible"][near.ids] += 1
+        slam_map.points["times_visible"][near.ids] += 1
         return tracked
 
-    def _project(self, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
-        max_angle = self.config.tracking.max_view_angle_deg
-        return project_points(self.map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
+    def _project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
+        max_angle = self.settings.max_view_angle_deg
+        return project_points(slam_map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
 
-    def _local_points_with(self, point_ids: Tensor) -> Tensor:
-        """The local points, and those that were just matched elsewhere in the map."""
-        if len(self.local_points) and bool(torch.isin(point_ids, self.local_points).all()):
-            return self.local_points
-        keyframe = int(self.map.observers(point_ids).argmax())
-        near = self.map.covisible(keyframe, self.config.tracking.local_keyframes)
-        return self.map.points_seen_by(torch.cat([near.new_tensor([keyframe]), near]))
+    def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
+        """The local points, or those around what was matched where that is elsewhere in the map."""
+        if len(local_points) and bool(torch.isin(point_ids, local_points).all()):
+            return local_points
+        return slam_map.points_seen_by(self.around(slam_map, point_ids))
 
-    def _refine(self, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    def around(self, slam_map: Map, point_ids: Tensor) -> Tensor:
+        """(k,) the keyframe that sees most of the points (n,), and those that share most points with it."""
+        keyframe = int(slam_map.observers(point_ids).argmax())
+        near = slam_map.covisible(keyframe, self.settings.local_keyframes)
+        return torch.cat([near.new_tensor([keyframe]), near])
+
+    def _refine(
+        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """(4, 4) and (n,): the pose by robust least squares, once on all matches and once on those that agree."""
-        points_w = self.map.positions_w[ids]
+        points_w = slam_map.positions_w[ids]
         mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
         for kernel, iterations in passes:
@@ -182,43 +182,54 @@ class Tracker:
                 backward="detached",
             )
             T_cw = refined.T_cw[0]
-            mask = self._agrees(T_cw, ids, pixels, scales)
+            mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
                 break
         return T_cw, mask
 
-    def _agrees(self, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
+    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
 
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
         """
-        settings, points = self.config.tracking, self.map.points
+        chi_square, points = self.measurement.chi_square, slam_map.points
         points_c = transform(T_cw, points["positions_w"][ids])
-        if settings.gate == "chi_square":
-            projected, valid = self.camera.project(points_c)
-            errors = ((projected - pixels) ** 2).sum(-1)
-            return valid & (errors < settings.chi_square * scales**2)
+        if self.measurement.gate == "chi_square":
+            return fits(squared_reprojection_errors(points_c, pixels, self.camera), scales, chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
         innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], scales)
-        return valid & (mahalanobis_squared(projected - pixels, innovations) < settings.chi_square)
+        return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
-    def _accept(self, view: View, tracked: Tracked) -> None:
-        """Take the frame over into the state: velocity, reference keyframe, counters of the points."""
-        was_lost, previous = self.lost_for > 0, self.T_cw
-        self.lost_for = 0
-        self.velocity = None if was_lost else tracked.T_cw @ se3_inverse(previous)
-        self.seen_last = tracked.point_ids
-        self.map.points["times_found"][tracked.point_ids] += 1
-        self.map.points["last_seen"][tracked.point_ids] = view.index
-        best = self._best_reference(tracked.point_ids, everywhere=was_lost)
-        if best != self.reference:
-            self._set_reference(best, tracked.T_cw)
+    def accept(self, world: World, view: View, tracked: Tracked) -> None:
+        """Take a frame over into the track: velocity, reference keyframe, counters of the points."""
+        slam_map, track = world.map, world.track
+        track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
+        track.seen_last = tracked.point_ids
+        slam_map.points["times_found"][tracked.point_ids] += 1
+        slam_map.points["last_seen"][tracked.point_ids] = view.index
+        shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
+        best = int(track.local_keyframes[shared.argmax()])
+        if best == track.reference:
+            track.T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[best])
         else:
-            self.T_cr = tracked.T_cw @ se3_inverse(self.map.T_cw[self.reference])
+            world.track = replace(
+                self._around(slam_map, best, tracked.T_cw), velocity=track.velocity, seen_last=track.seen_last
+            )
 
-    def _best_reference(self, point_ids: Tensor, everywhere: bool) -> int:
-        """The local keyframe that shares most points with the frame; of all keyframes after being lost."""
-        if everywhere:
-            return int(self.map.observers(point_ids).argmax())
-        shared = self.map.observers(point_ids, self.local_keyframes)
-        return int(self.local_keyframes[shared.argmax()])
+    def start_at(self, world: World, view: View, tracked: Tracked) -> None:
+        """Begin a track anew, wherever in the map: at a frame that was located without one."""
+        best = int(world.map.observers(tracked.point_ids).argmax())
+        world.map.points["times_found"][tracked.point_ids] += 1
+        world.map.points["last_seen"][tracked.point_ids] = view.index
+        world.track = replace(
+            self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
+        )
+
+
+def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
+    """How many points of a keyframe three local keyframes see: what the next frames can be expected to see."""
+    table = slam_map.keyframes["point_ids"]
+    local = table[local_keyframes].flatten()
+    counts = torch.bincount(local[local >= 0], minlength=len(slam_map.points))
+    seen = table[keyframe]
+    return int((counts[seen[seen >= 0]] >= min(3, len(local_keyframes))).sum())

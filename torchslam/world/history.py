@@ -11,6 +11,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers.graph import GraphSolution, ObservationGraph
 from torchslam.values import Tracked, Trajectory, View
 from torchslam.world.map import Map
+from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
 
 
@@ -32,14 +33,15 @@ class History:
     """Poses relative to a keyframe, so that they follow when the map is adjusted; observations as flat rows."""
 
     def __init__(self) -> None:
-        self.frames = Table()
-        self.observations = Table()
+        self.frames = Table(FRAMES)
+        self.observations = Table(OBSERVATIONS)
 
     def add(self, view: View, tracked: Tracked, T_cr: Tensor, reference: int) -> None:
         """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
         device = T_cr.device
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
+            session=torch.tensor([view.session], device=device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=device),
             T_cr=T_cr[None],
             reference=torch.tensor([reference], device=device),
@@ -59,13 +61,32 @@ class History:
         """(F, 4, 4) poses of the frames in the order they were added, by the map as it is now."""
         return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference"]]
 
-    def trajectory(self, slam_map: Map) -> Trajectory:
-        """Camera to world, ordered by time."""
+    def trajectory(self, slam_map: Map, session: int | None = None) -> Trajectory:
+        """Camera to world, ordered by time; the frames of one session, or of all."""
         if len(self) == 0:
-            return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
-        timestamps = self.frames["timestamp"]
+            return Trajectory.empty()
+        T_cw, timestamps = self.T_cw(slam_map), self.frames["timestamp"]
+        if session is not None:
+            rows = self.frames["session"] == session
+            T_cw, timestamps = T_cw[rows], timestamps[rows]
         order = torch.argsort(timestamps, stable=True)
-        return Trajectory(timestamps[order].clone(), se3_inverse(self.T_cw(slam_map)[order]))
+        return Trajectory(timestamps[order].clone(), se3_inverse(T_cw[order]))
+
+    def rescale(self, factors: Tensor) -> None:
+        """The unit of length around each keyframe changes by factors (K,): what refers to it follows."""
+        if len(self):
+            self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference"]][:, None]
+
+    def append(self, other: History, keyframes: int, points: int) -> None:
+        """Add the frames of another history whose keyframe and point rows moved by these numbers."""
+        if len(other) == 0:
+            return
+        frames, seen = other.frames.columns(), other.observations.columns()
+        seen["row"] = seen["row"] + len(self)
+        seen["point_ids"] = seen["point_ids"] + points
+        frames["reference"] = frames["reference"] + keyframes
+        self.frames.append(**frames)
+        self.observations.append(**seen)
 
     def graph(self, slam_map: Map, camera: Camera) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.

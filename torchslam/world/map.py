@@ -12,6 +12,7 @@ from torch import Tensor
 from torchslam.geometry import se3_inverse
 from torchslam.solvers import Marginals
 from torchslam.values import Features, Observations, View
+from torchslam.world.schema import KEYFRAMES, POINTS
 from torchslam.world.table import Table
 
 NO_POINT = -1
@@ -21,8 +22,8 @@ class Map:
     """Points and keyframes of one world frame."""
 
     def __init__(self) -> None:
-        self.points = Table()
-        self.keyframes = Table()
+        self.points = Table(POINTS)
+        self.keyframes = Table(KEYFRAMES)
 
     # --- size and plain access -------------------------------------------------------------------------------
 
@@ -78,6 +79,7 @@ class Map:
         ids = self.keyframes.append(
             T_cw=T_cw[None],
             covariances=T_cw.new_zeros(1, 6, 6),
+            session=torch.tensor([view.session], device=T_cw.device),
             frame_index=torch.tensor([view.index], device=T_cw.device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=T_cw.device),
             keypoints=view.keypoints[None],
@@ -90,11 +92,17 @@ class Map:
         return int(ids[0])
 
     def add_points(
-        self, positions_w: Tensor, descriptors: Tensor, keyframe: int, covariances_w: Tensor | None = None
+        self,
+        positions_w: Tensor,
+        descriptors: Tensor,
+        keyframe: int,
+        covariances_w: Tensor | None = None,
+        from_start: bool = False,
     ) -> Tensor:
         """Add points (n, 3) with descriptors (n, D), first seen in a keyframe; returns their ids (n,).
 
         covariances_w: (n, 3, 3) of the positions, zero where unknown; all unknown if None
+        from_start: whether they come from the two views that start the map
 
         Their view directions and scales are set by `refresh`, once they are observed.
         """
@@ -109,6 +117,7 @@ class Map:
             angles=like.new_zeros(n),
             last_seen=frame_index,
             born=torch.full((n,), keyframe, device=like.device),
+            from_start=torch.full((n,), from_start, device=like.device),
             times_observed=torch.zeros(n, dtype=torch.int64, device=like.device),
             times_visible=torch.ones(n, dtype=torch.int64, device=like.device),
             times_found=torch.ones(n, dtype=torch.int64, device=like.device),
@@ -158,11 +167,13 @@ class Map:
 
     def view(self, keyframe: int) -> View:
         """What a keyframe saw."""
-        row = self.keyframes
+        row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
+        names = ("keypoints", "scales", "angles", "descriptors", "mask")
         return View(
-            int(row["frame_index"][keyframe]),
-            float(row["timestamp"][keyframe]),
-            *(row[name][keyframe] for name in ("keypoints", "scales", "angles", "descriptors", "mask")),
+            index=int(row["frame_index"]),
+            timestamp=float(row["timestamp"]),
+            session=int(row["session"]),
+            **{name: row[name] for name in names},
         )
 
     def covisible(self, keyframe: int, count: int, min_shared: int = 15) -> Tensor:
@@ -177,6 +188,18 @@ class Map:
         """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""
         table = self.keyframes["point_ids"][keyframes].flatten()
         return torch.unique(table[table >= 0])
+
+    def append(self, other: Map) -> tuple[int, int]:
+        """Add all keyframes and points of another map, in the same world frame; returns how far their rows moved."""
+        keyframes, points = len(self.keyframes), len(self.points)
+        rows = other.points.columns()
+        rows["born"] = rows["born"] + keyframes
+        rows["replaced_by"] = torch.where(rows["replaced_by"] >= 0, rows["replaced_by"] + points, NO_POINT)
+        self.points.append(**rows)
+        rows = other.keyframes.columns()
+        rows["point_ids"] = torch.where(rows["point_ids"] >= 0, rows["point_ids"] + points, NO_POINT)
+        self.keyframes.append(**rows)
+        return keyframes, points
 
     # --- changing --------------------------------------------------------------------------------------------
 

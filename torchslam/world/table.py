@@ -1,19 +1,23 @@
-"""Columns of tensors that grow together: the storage of the map."""
+"""Columns of tensors that grow together: the storage of a world."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from torchslam.world.schema import Schema
+
 
 class Table:
     """Named columns with one row per item; capacity doubles when it is used up, so appending costs O(1) a row.
 
-    The first `append` fixes the columns, their dtypes and shapes. `table["name"]` is a view of the rows in use:
-    writing into it writes into the table. What is appended is detached: the map holds values, not graphs.
+    The schema fixes names, shapes and kinds; the first `append` fixes dtypes, device and the sizes that the schema
+    leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. What is appended
+    is detached: a world holds values, not graphs.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, schema: Schema) -> None:
+        self.schema = schema
         self._columns: dict[str, Tensor] = {}
         self._size = 0
 
@@ -31,18 +35,33 @@ class Table:
         return {name: self[name] for name in self._columns}
 
     def append(self, **rows: Tensor) -> Tensor:
-        """Add rows, one tensor (n, ...) per column; returns their ids (n,) int64."""
-        counts = {name: len(values) for name, values in rows.items()}
-        if len(set(counts.values())) != 1:
-            raise ValueError(f"the columns of one append differ in length: {counts}")
-        if self._columns and rows.keys() != self._columns.keys():
-            raise ValueError(f"columns are {sorted(self._columns)}, not {sorted(rows)}")
-        start, end = self._size, self._size + next(iter(counts.values()))
+        """Add rows, one tensor (n, ...) per column; returns their ids (n,) int64.
+
+        Raises ValueError for columns that the schema does not have, or that do not fit it or each other.
+        """
+        self._check(rows)
+        start, end = self._size, self._size + len(next(iter(rows.values())))
         for name, values in rows.items():
             self._columns[name] = self._grown(name, values, end)
             self._columns[name][start:end] = values.detach()
         self._size = end
         return torch.arange(start, end, device=next(iter(rows.values())).device)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep some rows (n,), by index, in this order; the others are gone and their memory is given back."""
+        self._columns = {name: self[name][rows] for name in self._columns}
+        self._size = len(rows)
+
+    def _check(self, rows: dict[str, Tensor]) -> None:
+        if rows.keys() != self.schema.keys():
+            raise ValueError(f"columns are {sorted(self.schema)}, not {sorted(rows)}")
+        counts = {name: len(values) for name, values in rows.items()}
+        if len(set(counts.values())) != 1:
+            raise ValueError(f"the columns of one append differ in length: {counts}")
+        for name, values in rows.items():
+            wrong = self.schema[name].why_not(values)
+            if wrong:
+                raise ValueError(f"column {name}: {wrong}")
 
     def _grown(self, name: str, values: Tensor, size: int) -> Tensor:
         old = self._columns.get(name)

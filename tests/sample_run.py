@@ -1,0 +1,89 @@
+"""A small map, path and list of frames, as a run would leave them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
+from torchslam.values import State, StepResult, Trajectory, View
+from torchslam.world.map import Map
+
+KEYPOINTS = 40
+FRAMES = 30
+EVERY = 5  # frames from keyframe to keyframe
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera.pinhole(100.0, 100.0, 79.5, 59.5, size=(160, 120))
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    """An arc around the origin, cameras upright in a world whose y points down, looking ahead."""
+    angles = torch.linspace(0.0, 2.0, FRAMES, dtype=torch.float64)
+    centres_w = torch.stack([2 * angles.cos(), 0.1 * angles, 2 * angles.sin()], dim=-1)
+    R_wc = so3_exp(torch.stack([torch.zeros_like(angles), -angles, torch.zeros_like(angles)], dim=-1))
+    return Trajectory(100.0 + torch.arange(FRAMES, dtype=torch.float64) / 30, rigid(R_wc, centres_w))
+
+
+@pytest.fixture
+def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
+    """Keyframes on the trajectory; each sees twenty points of its own and ten of the one before; one point is dead."""
+    made = Map()
+    for index in range(0, FRAMES, EVERY):
+        keyframe = made.add_keyframe(_view(index, trajectory, generator), se3_inverse(trajectory.T_wc[index]))
+        offsets = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+        descriptors = torch.randint(0, 256, (20, 32), generator=generator, dtype=torch.uint8)
+        covariances_w = 0.01 * torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+        ids = made.add_points(3 * offsets, descriptors, keyframe, covariances_w)
+        made.observe(keyframe, torch.arange(20), ids)
+        if keyframe:
+            made.observe(keyframe, torch.arange(20, 30), ids[:10] - 20)
+    made.refresh(torch.arange(made.num_keyframes))
+    made.kill(torch.tensor([3]))
+    return made
+
+
+@pytest.fixture
+def results() -> list[StepResult]:
+    """Initialising, tracking with keyframes, lost for a while, tracking again."""
+    states = [State.INITIALIZING] * 3 + [State.TRACKING] * 15 + [State.LOST] * 4 + [State.TRACKING] * 8
+    return [_result(index, state) for index, state in enumerate(states)]
+
+
+def _view(index: int, trajectory: Trajectory, generator: torch.Generator) -> View:
+    size = torch.tensor([160.0, 120.0], dtype=torch.float64)
+    return View(
+        index=index,
+        timestamp=float(trajectory.timestamps[index]),
+        keypoints=torch.rand(KEYPOINTS, 2, generator=generator, dtype=torch.float64) * size,
+        scales=torch.ones(KEYPOINTS, dtype=torch.float64),
+        angles=torch.zeros(KEYPOINTS, dtype=torch.float64),
+        descriptors=torch.randint(0, 256, (KEYPOINTS, 32), generator=generator, dtype=torch.uint8),
+        mask=torch.arange(KEYPOINTS) < KEYPOINTS - 2,
+    )
+
+
+def _result(index: int, state: State) -> StepResult:
+    is_tracking = state is State.TRACKING
+    is_keyframe = is_tracking and index % EVERY == 0
+    stage_ms = {"features": 20.0 + math.sin(index), "tracking": 5.0} | (
+        {"mapping": 12.0} if is_keyframe else {}
+    )
+    T_cw: Tensor | None = torch.eye(4, dtype=torch.float64) if is_tracking else None
+    return StepResult(
+        index=index,
+        timestamp=100.0 + index / 30,
+        state=state,
+        T_cw=T_cw,
+        is_keyframe=is_keyframe,
+        matches=100 + index if is_tracking else 8,
+        inliers=90 + index if is_tracking else 0,
+        reason="" if is_tracking else 'few matches: 8, "20" are needed',
+        stage_ms=stage_ms | {"total": sum(stage_ms.values())},
+    )
