@@ -67,7 +67,9 @@ class InitializationConfig:
     min_parallax_deg: float = 3.0  # parallax: a point counts from this angle on
     min_mean_parallax_deg: float = 5.0
     min_explained: float = 0.8  # share of the frames since the reference that the start must explain
-    max_reference_age: int = 60  # frames; an older reference is replaced
+    max_reference_age: int = 300  # frames; an older reference is replaced
+    max_waiting: int = 1000  # frames without a pose that are kept, to be posed once there is a map
+    min_frames: int = 20  # a world that was lost before it had tracked this many after its start is taken back
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,27 @@ class TrackingConfig:
     recent_frames: int = (
         0  # match points seen in the last n frames instead of the co-visible ones; 0: co-visible
     )
+
+
+@dataclass(frozen=True)
+class JudgeConfig:
+    """When a pose is uncertain: it makes no keyframe and no point until later frames confirm it."""
+
+    min_inlier_share: float = 0.5  # of the matches around the predicted pixels
+    max_position_std: float = 0.017  # as a share of the median depth of the tracked points
+    max_rotation_std_deg: float = 0.9
+    max_jump: float = 0.5  # distance from the predicted position, as a share of the depth
+    max_turn_deg: float = 20.0  # from the predicted rotation
+    confirmations: int = 2  # certain frames in a row after an uncertain one
+
+
+@dataclass(frozen=True)
+class RelocalizationConfig:
+    """What happens after the camera is lost."""
+
+    tries: int = 3  # places compared a frame
+    confirmations: int = 4  # certain frames in a row after a relocalised one, before anything is mapped
+    patience: int = 20  # lost frames before a new world may begin
 
 
 @dataclass(frozen=True)
@@ -127,6 +150,8 @@ class Config:
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
+    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)

@@ -151,12 +151,16 @@ class Tracked:
     T_cw:        (4, 4)
     point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
     matches:     how many matches the inliers were chosen from
+    covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
+    depth:       median depth of the points it sees
     """
 
     T_cw: Tensor
     point_ids: Tensor
     keypoints: Tensor
     matches: int
+    covariance: Tensor
+    depth: float
 
     @property
     def inliers(self) -> int:
@@ -211,6 +215,7 @@ class State(Enum):
 
     INITIALIZING = "initializing"
     TRACKING = "tracking"
+    UNCERTAIN = "uncertain"
     LOST = "lost"
 
 
@@ -218,8 +223,11 @@ class State(Enum):
 class StepResult:
     """What came out of one frame.
 
-    state:       after the frame
+    state:       after the frame. Uncertain: there is a pose that may be wrong; nothing is built on it until later
+                 frames confirm it
     T_cw:        (4, 4) pose of the frame, world to camera; None while initializing or lost
+    world:       number of the world the pose is in; None without a pose
+    covariance:  (6, 6) of the pose's left perturbation (translation, rotation); None where it was not estimated
     is_keyframe: whether the frame became a keyframe
     matches:     map points matched in this frame
     inliers:     of these, those that agree with the pose
@@ -231,6 +239,8 @@ class StepResult:
     timestamp: float
     state: State
     T_cw: Tensor | None
+    world: int | None = None
+    covariance: Tensor | None = None
     is_keyframe: bool = False
     matches: int = 0
     inliers: int = 0

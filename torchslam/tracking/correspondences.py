@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -116,3 +116,13 @@ def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfi
     )
     found = matches.mask[0]
     return ids[matches.indices_1[0][found]], matches.indices_2[0][found]
+
+
+def match_keyframe(
+    slam_map: Map, keyframe: int, view: View, settings: MatchingConfig
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) points that a keyframe sees and keypoints of a view, matched by the keyframe's own descriptors."""
+    seen = slam_map.view(keyframe)
+    point_ids = slam_map.keyframes["point_ids"][keyframe]
+    rows, keypoints = match_views(replace(seen, mask=seen.mask & (point_ids >= 0)), view, settings)
+    return point_ids[rows], keypoints

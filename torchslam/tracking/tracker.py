@@ -19,7 +19,7 @@ from torchslam.geometry import (
     squared_reprojection_errors,
     transform,
 )
-from torchslam.solvers import refine_pose
+from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.solvers.robust import Kernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.values import Tracked, View
@@ -138,10 +138,12 @@ class Tracker:
         ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
         if len(ids) < settings.min_inliers:
             return None
-        T_cw, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
-        tracked = Tracked(T_cw, ids[inliers], at[inliers], len(ids))
-        if tracked.inliers < settings.min_inliers:
+        refined, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
+        if int(inliers.sum()) < settings.min_inliers:
             return None
+        T_cw, ids_seen = refined.T_cw[0], ids[inliers]
+        depth = float(transform(T_cw, slam_map.positions_w[ids_seen])[:, 2].median())
+        tracked = Tracked(T_cw, ids_seen, at[inliers], len(ids), refined.covariance[0], depth)
         slam_map.points["times_visible"][near.ids] += 1
         return tracked
 
@@ -163,8 +165,8 @@ class Tracker:
 
     def _refine(
         self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """(4, 4) and (n,): the pose by robust least squares, once on all matches and once on those that agree."""
+    ) -> tuple[RefinedPose, Tensor]:
+        """The pose and (n,) who agrees with it: by robust least squares, once on all matches and once on those that agree."""
         points_w = slam_map.positions_w[ids]
         mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
@@ -185,7 +187,7 @@ class Tracker:
             mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
                 break
-        return T_cw, mask
+        return refined, mask
 
     def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.

@@ -1,0 +1,47 @@
+"""May a pose be believed? By what it rests on: how much agrees with it, how sure it is, whether the motion is possible."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchslam.config import JudgeConfig
+from torchslam.geometry import se3_inverse, so3_log
+from torchslam.values import Tracked
+
+
+def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeConfig) -> str:
+    """Why a pose should not be built on, in words; empty when it may be.
+
+    predicted_T_cw: (4, 4) where the camera was expected; None where nothing was
+    """
+    share = tracked.inliers / max(tracked.matches, 1)
+    if share < settings.min_inlier_share:
+        return f"only {share:.0%} of {tracked.matches} matches agree with the pose"
+    position, rotation = deviations(tracked)
+    if position > settings.max_position_std:
+        return f"the position is known to {position:.3f} of the scene's depth"
+    if rotation > settings.max_rotation_std_deg:
+        return f"the rotation is known to {rotation:.2f} degrees"
+    if predicted_T_cw is None:
+        return ""
+    moved, turned = jump(tracked, predicted_T_cw)
+    if moved > settings.max_jump or turned > settings.max_turn_deg:
+        return f"jumped by {moved:.2f} of the scene's depth and {turned:.0f} degrees"
+    return ""
+
+
+def deviations(tracked: Tracked) -> tuple[float, float]:
+    """Standard deviations of the camera's position, as a share of the depth of the scene, and of its rotation, degrees."""
+    variances = tracked.covariance.diagonal()
+    position = float(variances[:3].sum().clamp(min=0).sqrt()) / max(tracked.depth, 1e-12)
+    return position, math.degrees(float(variances[3:].sum().clamp(min=0).sqrt()))
+
+
+def jump(tracked: Tracked, predicted_T_cw: Tensor) -> tuple[float, float]:
+    """How far a pose is from where it was expected: in shares of the depth of the scene, and in degrees."""
+    motion = tracked.T_cw @ se3_inverse(predicted_T_cw)
+    moved = float(torch.linalg.vector_norm(motion[:3, 3])) / max(tracked.depth, 1e-12)
+    return moved, math.degrees(float(torch.linalg.vector_norm(so3_log(motion[:3, :3]))))

@@ -1,0 +1,57 @@
+"""Where is a camera that is lost? Matches with keyframes that look alike, by their own descriptors, and PnP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.tracking.correspondences import match_keyframe
+from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import Tracked, View
+from torchslam.world.map import Map
+from torchslam.world.world import World
+
+Candidate = tuple[World, int]
+"""A keyframe, by world and row, that may show the same place."""
+
+
+class Relocalizer:
+    """Poses a frame in a map without knowing where it is."""
+
+    def __init__(self, tracker: Tracker, config: Config) -> None:
+        self.tracker = tracker
+        self.matching = config.matching
+        self.judge = config.judge
+        self.tries = config.relocalization.tries
+
+    def locate(self, view: View, candidates: Iterable[Candidate]) -> tuple[World, Tracked] | None:
+        """The frame's pose against the first of the candidates that give one that is to be believed.
+
+        Candidates beside one that failed are left out: they see the same.
+        """
+        tried: list[tuple[World, Tensor]] = []
+        for world, keyframe in candidates:
+            if len(tried) == self.tries:
+                return None
+            if any(world is other and bool((near == keyframe).any()) for other, near in tried):
+                continue
+            near = self._near(world.map, keyframe)
+            tracked = self.tracker.locate(
+                world.map, view, self._matches(world.map, keyframe, view), world.map.points_seen_by(near)
+            )
+            if tracked is not None and not why_doubt(tracked, None, self.judge):
+                return world, tracked
+            tried.append((world, near))
+        return None
+
+    def _near(self, slam_map: Map, keyframe: int) -> Tensor:
+        """(k,) a keyframe and those that share most points with it."""
+        near = slam_map.covisible(keyframe, self.tracker.settings.local_keyframes)
+        return torch.cat([near.new_tensor([keyframe]), near])
+
+    def _matches(self, slam_map: Map, keyframe: int, view: View) -> Iterator[tuple[Tensor, Tensor]]:
+        yield match_keyframe(slam_map, keyframe, view, self.matching)
