@@ -69,7 +69,9 @@ class InitializationConfig:
     min_explained: float = 0.8  # share of the frames since the reference that the start must explain
     max_reference_age: int = 300  # frames; an older reference is replaced
     max_waiting: int = 1000  # frames without a pose that are kept, to be posed once there is a map
-    min_frames: int = 20  # a world that was lost before it had tracked this many after its start is taken back
+    min_frames: int = (
+        20  # a world that was lost before it had tracked this many after its start is taken back
+    )
 
 
 @dataclass(frozen=True)

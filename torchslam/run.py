@@ -88,16 +88,20 @@ def run_sequence(slam: SLAM, sequence: Sequence, progress: Callable[[StepResult]
 
 def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupted: bool) -> Run:
     """Adjust the whole map if so configured, and gather what the run leaves behind."""
-    has_map = slam.map.num_keyframes > 0
-    if has_map and slam.config.bundle.enabled and slam.config.bundle.final:
-        adjust_all(slam.map, slam.camera, slam.config.bundle)
-        graph = slam.history.graph(slam.map, slam.camera)
-        slam.history.take(solve(graph, backward="detached"), graph, slam.map)
+    with torch.no_grad():
+        slam.settle()
+    for world in slam.worlds:
+        if slam.config.bundle.enabled and slam.config.bundle.final:
+            adjust_all(world.map, slam.camera, slam.config.bundle)
+            graph = world.history.graph(world.map, slam.camera)
+            world.history.take(solve(graph, backward="detached"), graph, world.map)
+    main = slam.worlds.main()
+    has_map = main is not None
     return Run(
         slam.trajectory(),
-        keyframe_trajectory(slam.map),
-        slam.map,
-        slam.history,
+        keyframe_trajectory(slam.map if main is None else main.map),
+        slam.map if main is None else main.map,
+        main.history if main is not None else History(),
         slam.camera,
         slam.config,
         results,
@@ -111,7 +115,8 @@ def keyframe_trajectory(slam_map: Map) -> Trajectory:
     """The keyframes, camera to world, in order of time."""
     if slam_map.num_keyframes == 0:
         return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
-    return Trajectory(slam_map.keyframes["timestamp"].clone(), se3_inverse(slam_map.T_cw))
+    order = torch.argsort(slam_map.keyframes["timestamp"], stable=True)
+    return Trajectory(slam_map.keyframes["timestamp"][order], se3_inverse(slam_map.T_cw[order]))
 
 
 def why_no_map(results: list[StepResult], skipped: list[str]) -> str:

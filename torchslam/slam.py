@@ -1,6 +1,7 @@
 """Monocular SLAM, the way of a frame:
 
-frame -> features -> track (or initialise, or lose) -> keyframe? -> map -> StepResult
+frame -> features -> follow the world at hand (track, judge) -> keyframe? -> map -> seen before? -> StepResult
+                  -> or find one: a known place, or the beginning of a new world
 """
 
 from __future__ import annotations
@@ -8,25 +9,32 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, image_extractor
 from torchslam.geometry import Camera
+from torchslam.loops.places import Places
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
 from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.backwards import track_back
 from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.probation import Probation
+from torchslam.tracking.relocalization import Candidate, Relocalizer
 from torchslam.tracking.tracker import Tracker
+from torchslam.tracking.waiting import Waiting
+from torchslam.tracking.youth import Youth
 from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
-from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.world import World
+from torchslam.world.worlds import Worlds
 
-MIN_KEYFRAMES = 4  # a map that is lost before it has this many was a bad start
+STARTED = "started the map"
+FOUND_AGAIN = "found again"
 
 
 class SLAM:
@@ -44,101 +52,216 @@ class SLAM:
             extractor = image_extractor(self.config, self.camera.params.device)
         self.extractor = extractor  # None: `run` makes simulated features from the true poses of the sequence
         self.clock = Stopwatch()
+        self.tracker = Tracker(self.camera, self.config)
+        self.relocalizer = Relocalizer(self.tracker, self.config)
+        self.mapper = Mapper(self.camera, self.config, self.clock)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything and wait for a new start."""
-        self.initializer = Initializer(self.camera, self.config)
-        self._forget_map()
+        self.worlds = Worlds(self.camera.params)
+        self.places = Places()
+        self.waiting = Waiting(self.config.initialization.max_waiting)
+        self._seek()
 
-    def _forget_map(self) -> None:
-        self.state = State.INITIALIZING
-        self.world = World.empty(0, self.camera.params)
-        self.tracker = Tracker(self.camera, self.config)
-        self.mapper = Mapper(self.camera, self.config, self.clock)
+    # --- the way of a frame ----------------------------------------------------------------------------------
 
     @torch.no_grad()
     def step(self, frame: Frame) -> StepResult:
         """Process one frame. A frame without a pose is no error: the result says why there is none."""
-        if self.extractor is None:
-            raise ConfigError(
-                "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
-            )
-        with self.clock("features"):
-            view = View.of(frame, self.extractor(frame), self.camera.params)
-        if self.state is State.INITIALIZING:
-            return self._initialize(view)
-        with self.clock("tracking"):
-            tracked = self.tracker.track(self.world, view)
-        if tracked is None:
-            return self._lose(view)
-        self.state = State.TRACKING
-        why = why_keyframe(view, tracked, self.world, self.config.keyframes)
-        if why:
-            self.tracker.follow(self.world, self.mapper.insert(self.map, view, tracked))
-        self.history.add(view, tracked, self.world.track.T_cr, self.world.track.reference)
-        return self._result(view, why, self.world.T_cw, tracked, is_keyframe=bool(why))
-
-    @property
-    def map(self) -> Map:
-        return self.world.map
-
-    @property
-    def history(self) -> History:
-        return self.world.history
+        view = self._look(frame)
+        return self._find(view) if self.world is None else self._follow(self.world, view)
 
     def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
         return run_sequence(self, sequence, progress)
 
     def trajectory(self) -> Trajectory:
-        """Every posed frame, by the map as it is now."""
-        return self.history.trajectory(self.map)
+        """Every posed frame of the main world, by the map as it is now."""
+        world = self.worlds.main()
+        return Trajectory.empty() if world is None else world.trajectory()
 
-    def _initialize(self, view: View) -> StepResult:
-        """Try to start a map, and believe it if it explains the frames that were seen on the way to it."""
+    @property
+    def map(self) -> Map:
+        """Of the world that is followed, or else of the one with most frames; empty where there is none."""
+        world = self.world or self.worlds.main()
+        return Map() if world is None else world.map
+
+    def _look(self, frame: Frame) -> View:
+        if self.extractor is None:
+            raise ConfigError(
+                "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
+            )
+        with self.clock("features"):
+            return View.of(frame, self.extractor(frame), self.camera.params)
+
+    # --- following a world -----------------------------------------------------------------------------------
+
+    def _follow(self, world: World, view: View) -> StepResult:
+        """Track the frame; what is doubtful is held back until later frames confirm it."""
+        with self.clock("tracking"):
+            expected = None if world.track.velocity is None else self.tracker.predict(world)
+            tracked = self.tracker.track(world, view)
+        if tracked is None:
+            return self._lose(world, view)
+        doubt = why_doubt(tracked, expected, self.config.judge)
+        if doubt or self.probation:
+            return self._hold(world, view, tracked, doubt)
+        self.state = State.TRACKING
+        why = self._take(world, view, tracked)
+        if self.youth is not None:
+            self.youth.grow(view)
+            if self.youth.age >= self.config.initialization.min_frames:
+                self.settle()
+        return self._result(view, why, world, tracked, is_keyframe=bool(why))
+
+    def _take(self, world: World, view: View, tracked: Tracked) -> str:
+        """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing."""
+        why = why_keyframe(view, tracked, world, self.config.keyframes)
+        if why:
+            keyframe = self.mapper.insert(world.map, view, tracked)
+            self._remember(world.map, keyframe)
+            self.tracker.follow(world, keyframe)
+        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        return why
+
+    def _remember(self, slam_map: Map, keyframe: int) -> None:
+        """The place can be recognised from now on."""
+        view = slam_map.view(keyframe)
+        self.places.add(slam_map.key(keyframe), view.descriptors, view.mask)
+
+    def _hold(self, world: World, view: View, tracked: Tracked, doubt: str) -> StepResult:
+        """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""
+        self.probation.hold(view, tracked, world.track, doubt)
+        if self.probation:
+            self.state = State.UNCERTAIN
+            return self._result(view, doubt or self.probation.reason, world, tracked)
+        held = self.probation.release()
+        for earlier in held:
+            world.history.add(*earlier)
+        if self.probation.came_back:
+            first, located, _, _ = held[0]
+            self._track_back(world, first, located)
+        self.state = State.TRACKING
+        return self._result(view, "", world, tracked)
+
+    def _lose(self, world: World, view: View) -> StepResult:
+        """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
+        self.waiting.add(*self.probation.views(), view)
+        reason = "lost"
+        if self.youth is not None and self.youth.age < self.config.initialization.min_frames:
+            self._take_back(self.youth)
+            reason = "lost right after the start: starting anew"
+        self.settle()
+        self._seek()
+        return self._result(view, reason)
+
+    # --- finding one -----------------------------------------------------------------------------------------
+
+    def _seek(self) -> None:
+        """Nothing is followed any more."""
+        self.world: World | None = None
+        self.youth: Youth | None = None  # of the world that is followed, if it began lately
+        self.initializer = Initializer(self.camera, self.config)
+        self.probation = Probation(self.config)
+        self.lost_for = 0
+        self.state = State.LOST if len(self.worlds) else State.INITIALIZING
+
+    def _find(self, view: View) -> StepResult:
+        """Come back to a known place, or else begin a new world; the frame waits until there is a pose for it."""
+        self.lost_for += 1
+        if len(self.worlds):
+            with self.clock("relocalization"):
+                found = self.relocalizer.locate(view, self._candidates(view))
+            if found is not None:
+                return self._return(view, *found)
+        self.waiting.add(view)
+        if len(self.worlds) and self.lost_for <= self.config.relocalization.patience:
+            return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
             if start is not None:
-                reason = self._start(start)
+                reason = self._begin(start)
         if reason:
             return self._result(view, reason)
-        self.state = State.TRACKING
-        return self._result(view, "started the map", self.world.T_cw, is_keyframe=True)
+        return self._result(view, STARTED, self.world, is_keyframe=True)
 
-    def _start(self, start: Start) -> str:
-        """Make the first map; why it is not believed after all, or nothing."""
-        first, second = self.mapper.start(self.map, start)
-        self.tracker.follow(self.world, first)
-        explained = [self._explain(earlier) for earlier in self.initializer.views]
-        self.tracker.follow(self.world, second)
-        if sum(explained) >= self.config.initialization.min_explained * len(explained):
-            return ""
-        self._forget_map()
-        return f"bad start: it explains {sum(explained)} of {len(explained)} frames"
+    def _candidates(self, view: View) -> list[Candidate]:
+        """Keyframes that look like the frame, in any world, the likeliest first."""
+        keys, _ = self.places.query(view.descriptors, view.mask)
+        found = (self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.tries].tolist())
+        return [candidate for candidate in found if candidate is not None]
 
-    def _explain(self, view: View) -> bool:
+    def _return(self, view: View, world: World, tracked: Tracked) -> StepResult:
+        """Go on in a world that was recognised; the next frames have to confirm it."""
+        self.tracker.start_at(world, view, tracked)
+        self.world = world
+        self.probation.come_back(view, tracked, world.track)
+        self.state = State.UNCERTAIN
+        return self._result(view, FOUND_AGAIN, world, tracked)
+
+    # --- a new world -----------------------------------------------------------------------------------------
+
+    def _begin(self, start: Start) -> str:
+        """Begin a world with two views; why it is not believed after all, or nothing."""
+        world = self.worlds.begin()
+        first, second = self.mapper.start(world.map, start)
+        self.tracker.follow(world, first)
+        explained = [self._explain(world, earlier) for earlier in self.initializer.views]
+        self.tracker.follow(world, second)
+        if sum(explained) < self.config.initialization.min_explained * len(explained):
+            self.worlds.forget(world)
+            return f"bad start: it explains {sum(explained)} of {len(explained)} frames"
+        for keyframe in (first, second):
+            self._remember(world.map, keyframe)
+        posed = set(world.history.frames["frame_index"].tolist())
+        views = [view for view in self.initializer.views if view.index in posed]
+        self.waiting.remove(views)
+        self.world, self.youth, self.state = world, Youth(world, views), State.TRACKING
+        return ""
+
+    def _explain(self, world: World, view: View) -> bool:
         """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
-        tracked = self.tracker.track(self.world, view)
+        tracked = self.tracker.track(world, view)
         if tracked is None:
             return False
-        self.history.add(view, tracked, self.world.track.T_cr, self.world.track.reference)
+        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return tracked.inliers > 0.5 * tracked.matches
 
-    def _lose(self, view: View) -> StepResult:
-        """Stay lost and try again with the next frame; a map that is lost right after its start is given up."""
-        self.state = State.LOST
-        reason = "lost"
-        if self.map.num_keyframes < MIN_KEYFRAMES:
-            self.reset()
-            reason = "lost right after the start: starting anew"
-        return self._result(view, reason)
+    def _take_back(self, youth: Youth) -> None:
+        """A start that later frames contradict: its frames wait for another one."""
+        self.waiting.add(*youth.views)
+        self.places.remove(youth.world.map.keys)
+        self.worlds.forget(youth.world)
+        self.youth = None
+
+    def settle(self) -> None:
+        """A young world has proved itself: pose the frames from before its start."""
+        if self.youth is None:
+            return
+        world, self.youth = self.youth.world, None
+        behind = world.aside()
+        self.tracker.follow(behind, 0)
+        self._pose_waiting(behind, before=int(world.map.keyframes["frame_index"][0]))
+
+    def _track_back(self, world: World, view: View, tracked: Tracked) -> None:
+        """Pose the frames that were lost before a frame that was found again."""
+        behind = world.aside()
+        self.tracker.start_at(behind, view, tracked)
+        self._pose_waiting(behind, before=view.index)
+
+    def _pose_waiting(self, behind: World, before: int) -> None:
+        """Follow the camera back through the frames that wait from before a frame."""
+        with self.clock("backwards"):
+            earlier = [view for view in self.waiting if view.index < before]
+            posed = track_back(self.tracker, behind, reversed(earlier), self.config.judge, self._take)
+        self.waiting.remove(posed)
 
     def _result(
         self,
         view: View,
         reason: str,
-        T_cw: Tensor | None = None,
+        world: World | None = None,
         tracked: Tracked | None = None,
         is_keyframe: bool = False,
     ) -> StepResult:
@@ -146,7 +269,9 @@ class SLAM:
             index=view.index,
             timestamp=view.timestamp,
             state=self.state,
-            T_cw=T_cw,
+            T_cw=None if world is None else world.T_cw,
+            world=None if world is None else world.number,
+            covariance=None if tracked is None else tracked.covariance,
             is_keyframe=is_keyframe,
             matches=tracked.matches if tracked else 0,
             inliers=tracked.inliers if tracked else 0,

@@ -16,6 +16,7 @@ from torchslam.world.schema import KEYFRAMES, POINTS
 from torchslam.world.table import Table
 
 NO_POINT = -1
+SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 
 
 class Map:
@@ -49,6 +50,23 @@ class Map:
     def ids(self, *keyframes: int) -> Tensor:
         """Indices of keyframes as a tensor (k,) beside the map's."""
         return torch.tensor(keyframes, device=self.T_cw.device)
+
+    @property
+    def keys(self) -> Tensor:
+        """(K,) names of the keyframes that stay the same however rows are renumbered: session and frame in one."""
+        return (self.keyframes["session"] << SESSION_BITS) + self.keyframes["frame_index"]
+
+    def key(self, keyframe: int) -> int:
+        """The name of one keyframe."""
+        session, frame = self.keyframes["session"][keyframe], self.keyframes["frame_index"][keyframe]
+        return (int(session) << SESSION_BITS) + int(frame)
+
+    def row(self, key: int) -> int:
+        """The row of the keyframe of that name; -1 where there is none."""
+        if self.num_keyframes == 0:
+            return -1
+        rows = torch.nonzero(self.keys == key)
+        return int(rows[0]) if len(rows) else -1
 
     def living_points(self) -> Tensor:
         """(L',) ids of the points that are alive."""

@@ -1,0 +1,55 @@
+"""Frames whose poses are not believed yet: nothing is built on them until the frames after them confirm it."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.values import Tracked, View
+from torchslam.world.track import Track
+
+Held = tuple[View, Tracked, Tensor, int]
+"""A frame, what was found in it, and its pose T_cr (4, 4) relative to a keyframe."""
+
+
+class Probation:
+    """Holds frames back from the first doubtful one until enough certain ones have followed in a row."""
+
+    def __init__(self, config: Config) -> None:
+        self._after_doubt = config.judge.confirmations
+        self._after_return = config.relocalization.confirmations
+        self._held: list[Held] = []
+        self._needed = 0
+        self.came_back = False
+
+    def __bool__(self) -> bool:
+        """Whether anything is held back."""
+        return self._needed > 0
+
+    @property
+    def reason(self) -> str:
+        """What is waited for."""
+        return f"to be confirmed by {self._needed} more frames"
+
+    def come_back(self, view: View, tracked: Tracked, track: Track) -> None:
+        """Begin with a frame that was relocalised."""
+        self._held = [(view, tracked, track.T_cr, track.reference)]
+        self._needed, self.came_back = self._after_return, True
+
+    def hold(self, view: View, tracked: Tracked, track: Track, doubt: str) -> None:
+        """Hold a frame back; one without a doubt counts as a confirmation."""
+        self._held.append((view, tracked, track.T_cr, track.reference))
+        if doubt:
+            self._needed = self._after_return if self.came_back else self._after_doubt
+        else:
+            self._needed -= 1
+
+    def views(self) -> list[View]:
+        """The frames that are held back, in order."""
+        return [held[0] for held in self._held]
+
+    def release(self) -> list[Held]:
+        """What was held back and is believed now; nothing is held any more."""
+        held, self._held = self._held, []
+        self._needed = 0
+        return held
