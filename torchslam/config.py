@@ -92,6 +92,19 @@ class TrackingConfig:
 
 
 @dataclass(frozen=True)
+class StillnessConfig:
+    """When pixels stay in place that should have moved with the scene, as logos and dirt on the lens do."""
+
+    enabled: bool = True
+    min_motion_px: float = 4.0  # a point of the scene would have moved by at least this
+    min_moving_share: float = 0.5  # of the keypoints, before two frames are compared
+    radius_px: float = 1.5  # within which a keypoint has stayed
+    max_distance_share: float = 0.6  # of the distance at which descriptors match
+    min_keypoints: int = 8  # fewer that stay are chance
+    min_evidence: int = 2  # comparisons in which a pixel stayed
+
+
+@dataclass(frozen=True)
 class JudgeConfig:
     """When a pose is uncertain: it makes no keyframe and no point until later frames confirm it."""
 
@@ -152,6 +165,7 @@ class Config:
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    stillness: StillnessConfig = field(default_factory=StillnessConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)

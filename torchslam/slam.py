@@ -16,6 +16,7 @@ from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, image_extractor
 from torchslam.geometry import Camera
 from torchslam.loops.places import Places
+from torchslam.mapping.culling import drop_covered
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
@@ -25,6 +26,7 @@ from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Candidate, Relocalizer
+from torchslam.tracking.stillness import Stillness
 from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
@@ -61,6 +63,7 @@ class SLAM:
         """Forget everything and wait for a new start."""
         self.worlds = Worlds(self.camera.params)
         self.places = Places()
+        self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
         self._seek()
 
@@ -93,7 +96,8 @@ class SLAM:
                 "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
             )
         with self.clock("features"):
-            return View.of(frame, self.extractor(frame), self.camera.params)
+            self.seen = View.of(frame, self.extractor(frame), self.camera.params)
+            return self.stillness.clear_of(self.seen)
 
     # --- following a world -----------------------------------------------------------------------------------
 
@@ -109,11 +113,15 @@ class SLAM:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
         why = self._take(world, view, tracked)
+        is_keyframe = bool(why)
+        if self.config.stillness.enabled and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
+            drop_covered(world, self.stillness.covers)
+            why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
         if self.youth is not None:
             self.youth.grow(view)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
-        return self._result(view, why, world, tracked, is_keyframe=bool(why))
+        return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
 
     def _take(self, world: World, view: View, tracked: Tracked) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing."""
@@ -164,6 +172,7 @@ class SLAM:
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)
+        self.stillness.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
 

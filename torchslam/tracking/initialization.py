@@ -51,10 +51,28 @@ class Initializer:
     def _relate(self, view: View, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
         """The relative pose of the two views, unless the image stands still."""
         settings = self.config.initialization
-        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
-        moved = float(torch.linalg.vector_norm(pixels_2 - pixels_1, dim=-1).median())
-        if moved < settings.min_motion_px:
+        motion = torch.linalg.vector_norm(view.keypoints[second] - self.reference.keypoints[first], dim=-1)
+        moved = float(motion.median())
+        if moved >= settings.min_motion_px:
+            return self._relate_moving(view, first, second, scene_only=False)
+        # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
+        moving = motion >= settings.min_motion_px
+        if int(moving.sum()) < settings.min_matches:
             return None, f"the camera stands still: the image moved by {moved:.1f} px"
+        start, reason = self._relate_moving(view, first[moving], second[moving], scene_only=True)
+        share = 1 - float(moving.double().mean())
+        return start, reason and f"{share:.0%} of the image stands still, and of the rest: {reason}"
+
+    def _relate_moving(
+        self, view: View, first: Tensor, second: Tensor, scene_only: bool
+    ) -> tuple[Start | None, str]:
+        """The relative pose from matches that moved.
+
+        scene_only: they are a part of all matches, and may be a thing that moves before a camera that stands still; only
+        depth tells a scene apart from that.
+        """
+        settings = self.config.initialization
+        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
         relative = estimate_relative_pose(
             pixels_1[None],
             pixels_2[None],
@@ -64,6 +82,8 @@ class Initializer:
             seed=self.config.seed,
         )
         model = relative.model[0]
+        if scene_only and model != "essential":
+            return None, f"something may move before a camera that stands still: a {model} explains it"
         if model == "rotation":
             return None, "the camera only turns: a rotation explains the matches"
         self.planar_views += model == "homography"

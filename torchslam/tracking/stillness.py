@@ -1,0 +1,126 @@
+"""What does not move with the scene: logos, subtitles, dirt on the lens, a part of the car.
+
+A pixel stays in place although the camera moved so much that no point of the scene would have: seen twice in different
+stretches of the way, it is left out of everything from then on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchslam.config import MatchingConfig, StillnessConfig
+from torchslam.features import match_projected
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.tracking.correspondences import max_distance
+from torchslam.values import View
+
+_CELL = 4  # pixels: a corner wanders a little under noise
+_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A frame to compare later ones with: what it saw, where it was, how deep the scene was."""
+
+    view: View
+    T_cw: Tensor
+    depth: float
+
+
+class Stillness:
+    """Collects evidence of pixels that stay, cell by cell."""
+
+    def __init__(self, camera: Camera, settings: StillnessConfig, matching: MatchingConfig) -> None:
+        self.camera = camera
+        self.settings = settings
+        self.matching = matching
+        width, height = camera.size
+        shape = (height // _CELL + 1, width // _CELL + 1)
+        self._evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
+        self._last: _Look | None = None
+
+    def clear_of(self, view: View) -> View:
+        """The view without the keypoints that are known to stay."""
+        if not bool((self._evidence >= self.settings.min_evidence).any()):
+            return view
+        return replace(view, mask=view.mask & ~self.covers(view.keypoints))
+
+    def covers(self, pixels: Tensor) -> Tensor:
+        """(n,) bool: pixels (n, 2) that are known to stay."""
+        row, column = self._cells(pixels)
+        return self._evidence[row, column] >= self.settings.min_evidence
+
+    def observe(self, view: View, T_cw: Tensor, depth: float) -> int:
+        """Compare a posed frame with an earlier one; returns how many keypoints became known to stay.
+
+        view: with all its keypoints; T_cw: (4, 4); depth: median depth of the scene
+        """
+        look, last = _Look(view, T_cw, depth), self._last
+        if last is None or view.session != last.view.session:
+            self._last = look
+            return 0
+        must_move = view.mask.new_zeros(len(last.view.mask))
+        must_move[last.view.mask] = self._least_motion(last, T_cw) > self.settings.min_motion_px
+        if int(must_move.sum()) < self.settings.min_moving_share * int(last.view.mask.sum()):
+            return 0  # not far enough yet to tell
+        self._last = look
+        stayed = self._stayed(last.view, view, must_move)
+        before = int((self._evidence >= self.settings.min_evidence).sum())
+        if len(stayed) < self.settings.min_keypoints:
+            self._evidence[self._evidence < self.settings.min_evidence] = 0
+            return 0
+        self._add(stayed)
+        return int((self._evidence >= self.settings.min_evidence).sum()) - before
+
+    def _least_motion(self, last: _Look, T_cw: Tensor) -> Tensor:
+        """(n,) pixels by which a point of the scene seen at each keypoint moved at least, whatever its depth."""
+        pixels = last.view.keypoints[last.view.mask]
+        rays = self.camera.unproject(pixels)
+        depths = last.depth * rays.new_tensor(_DEPTHS)
+        points_c = rays / rays[:, 2:] * depths[:, None, None]
+        moved, valid = self.camera.project(transform(T_cw @ se3_inverse(last.T_cw), points_c))
+        distance = distances_to_segments(pixels, moved[:-1], moved[1:])
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0)
+
+    def forget_last(self) -> None:
+        """The next frame cannot be compared with the ones before: its pose is in another world."""
+        self._last = None
+
+    def _stayed(self, earlier: View, view: View, candidates: Tensor) -> Tensor:
+        """(m, 2) pixels of the candidates (N,) among the keypoints of an earlier view that look the same now."""
+        rows = torch.nonzero(candidates)[:, 0]
+        matches = match_projected(
+            earlier.descriptors[rows][None],
+            earlier.keypoints[rows][None],
+            self.settings.radius_px,
+            view.features,
+            scales=earlier.scales[rows][None],
+            max_distance=self.settings.max_distance_share * max_distance(view.descriptors, self.matching),
+            ratio=None,
+        )
+        return view.keypoints[matches.indices_2[0][matches.mask[0]]]
+
+    def _add(self, pixels: Tensor) -> None:
+        """One more piece of evidence for the cells of pixels (m, 2) and those around them, each cell once."""
+        row, column = self._cells(pixels)
+        hit = torch.zeros_like(self._evidence)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                hit[(row + down).clamp(0, hit.shape[0] - 1), (column + right).clamp(0, hit.shape[1] - 1)] = 1
+        self._evidence += hit
+
+    def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        cells = torch.div(pixels, _CELL, rounding_mode="floor").long()
+        rows, columns = self._evidence.shape
+        return cells[:, 1].clamp(0, rows - 1), cells[:, 0].clamp(0, columns - 1)
+
+
+def distances_to_segments(points: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """(...) distances of points (..., 2) from the segments between starts and ends (..., 2)."""
+    along = ends - starts
+    length = (along * along).sum(-1).clamp(min=1e-12)
+    share = (((points - starts) * along).sum(-1) / length).clamp(0, 1)
+    return torch.linalg.vector_norm(points - starts - share[..., None] * along, dim=-1)
