@@ -1,12 +1,29 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from torchslam.config import Config, load_config, to_toml
+from torchslam.config import (
+    CHOICES,
+    BundleConfig,
+    Config,
+    FeaturesConfig,
+    MatchingConfig,
+    TrackingConfig,
+    load_config,
+    to_toml,
+)
 from torchslam.errors import ConfigError
+from torchslam.settings import Allowed, Settings, setting
+
+SECTIONS = {
+    f.name: type(getattr(Config(), f.name)) for f in fields(Config) if f.name not in ("seed", "scale")
+}
 
 
 def test_resolved_toml_reads_back_as_the_same_configuration(tmp_path: Path) -> None:
@@ -17,6 +34,13 @@ def test_resolved_toml_reads_back_as_the_same_configuration(tmp_path: Path) -> N
     file.write_text(to_toml(config))
     assert load_config(file) == config
     assert config != Config()
+
+
+def test_every_character_of_a_string_is_written_so_that_it_reads_back(tmp_path: Path) -> None:
+    weights = "".join(map(chr, range(0x100))) + "\u2028\U0001f600"
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(Config(features=FeaturesConfig(weights=weights))), encoding="utf-8")
+    assert load_config(file).features.weights == weights
 
 
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:
@@ -39,8 +63,11 @@ def test_an_integer_serves_as_a_float() -> None:
         ("features.num_keypoints=true", "must be of type int"),
         ("features.kind=sift", "must be one of orb, opencv-orb"),
         ("features=3", "is a section"),
-        ("matching.ratio=nan", "must be finite"),
-        ("matching.ratio=-0.5", "must be finite and not negative"),
+        ("matching.ratio=nan", "matching.ratio must be above 0 and at most 1, not nan"),
+        ("matching.ratio=-0.5", "matching.ratio must be above 0 and at most 1, not -0.5"),
+        ("tracking.radius_px=inf", "tracking.radius_px must be above 0 and finite, not inf"),
+        ("bundle.window=0", "--set bundle.window=0: bundle.window must be at least 2 and finite, not 0"),
+        pytest.param("seed=" + 5000 * "9", "must be of type int", id="too many digits"),
         ("seed", "section.key=value"),
     ],
 )
@@ -63,6 +90,8 @@ def test_a_missing_and_a_broken_file(tmp_path: Path) -> None:
     broken.write_text("[features\n")
     with pytest.raises(ConfigError, match="not valid TOML"):
         load_config(broken)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -80,3 +109,186 @@ def test_every_section_is_written_out() -> None:
     text = to_toml(Config())
     for section in fields(Config):
         assert section.name in text
+
+
+def test_choices_have_one_source() -> None:
+    assert CHOICES == {
+        "scale": ("unit", "groundtruth"),
+        "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
+        "initialization.criterion": ("uncertainty", "parallax"),
+        "tracking.gate": ("chi_square", "mahalanobis"),
+        "mapping.partners": ("covisible", "last"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Config(scale="metric"), "^scale must be one of unit, groundtruth, not 'metric'"),
+        (
+            lambda: TrackingConfig(gate="xyz"),
+            "^tracking.gate must be one of chi_square, mahalanobis, not 'xyz'",
+        ),
+        (lambda: replace(Config().bundle, window=1), "^bundle.window must be at least 2"),
+        (
+            lambda: replace(Config(), seed=-1),
+            "^seed must be at least 0 and at most 9223372036854775807, not -1",
+        ),
+        (lambda: Config(tracking=BundleConfig()), "^tracking must be of type TrackingConfig"),
+        (lambda: Config(tracking=None), "^tracking must be of type TrackingConfig, not None"),
+        (
+            lambda: FeaturesConfig(num_keypoints=100.0),
+            "^features.num_keypoints must be of type int, not 100.0",
+        ),
+        (
+            lambda: FeaturesConfig(weights="\udcff"),
+            "^features.weights must be text that can be written as UTF-8",
+        ),
+        (lambda: MatchingConfig(max_distance=10**400), "^matching.max_distance must be above 0 and finite"),
+    ],
+)
+def test_a_wrong_value_in_python_is_named(build: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build()
+
+
+@pytest.mark.parametrize(
+    ("key", "accepted", "refused"),
+    [
+        ("seed", 2**63 - 1, 2**63),
+        ("features.num_keypoints", 1, 0),
+        ("simulated.points_per_view", 1, 0),
+        ("simulated.depth_near", 1e-9, 0),
+        ("simulated.noise_px", 0, -1e-9),
+        ("simulated.outliers", 1, 1.001),
+        ("matching.max_distance", 1e-9, 0),
+        ("matching.max_cosine_distance", 2, 2.001),
+        ("matching.ratio", 1, 1.001),
+        ("matching.ratio", 1e-9, 0),
+        ("initialization.min_matches", 1, 0),
+        ("initialization.planar_patience", 0, -1),
+        ("initialization.max_reference_age", 2, 1),
+        ("initialization.min_parallax_deg", 180, 180.1),
+        ("initialization.min_explained", 1, 1.001),
+        ("tracking.threshold_px", 1e-9, 0),
+        ("tracking.wide_radius_factor", 1, 0.999),
+        ("tracking.chi_square", 1e-9, 0),
+        ("tracking.max_view_angle_deg", 180, 180.1),
+        ("tracking.local_keyframes", 1, 0),
+        ("tracking.recent_frames", 0, -1),
+        ("keyframes.max_translation", 0, -1e-9),
+        ("keyframes.min_overlap", 1, 1.001),
+        ("mapping.neighbours", 1, 0),
+        ("mapping.min_found_share", 1, 1.001),
+        ("bundle.window", 2, 1),
+        ("bundle.max_fixed", 1, 0),
+        ("bundle.iterations", 1, 0),
+    ],
+)
+def test_the_ends_of_the_ranges(key: str, accepted: float, refused: float) -> None:
+    load_config(None, [f"{key}={accepted}"])
+    with pytest.raises(ConfigError, match=f"{key} must be "):
+        load_config(None, [f"{key}={refused}"])
+
+
+def test_an_integer_becomes_a_float_in_python_too() -> None:
+    assert repr(TrackingConfig(radius_px=20).radius_px) == "20.0"
+
+
+def _valid(default: Any, allowed: Allowed) -> st.SearchStrategy[Any]:
+    """Values that a setting with this default may have."""
+    if isinstance(default, bool):
+        return st.booleans()
+    if isinstance(default, str):
+        return st.sampled_from(allowed.choices) if allowed.choices else st.text()
+    low, high = max(allowed.low, allowed.above), allowed.high if allowed.high < float("inf") else None
+    if isinstance(default, int):
+        return st.integers(int(low), high if high is None else int(high))
+    return st.floats(
+        low, high, exclude_min=allowed.above >= allowed.low, allow_nan=False, allow_infinity=False
+    )
+
+
+def _broken(default: Any, allowed: Allowed) -> st.SearchStrategy[Any]:
+    """Values that it may not have: of another type, out of range, not finite, not among the choices."""
+    other_types: list[Any] = [None, [1], b"orb"]
+    if isinstance(default, bool):
+        return st.sampled_from([*other_types, 0, 1, 1.0, "true"])
+    if isinstance(default, str):
+        words = (
+            st.text().filter(lambda word: word not in allowed.choices) if allowed.choices else st.nothing()
+        )
+        return st.sampled_from([*other_types, 0, True]) | words
+    numbers = st.integers(max_value=int(allowed.low) - 1)
+    if isinstance(default, int):
+        numbers |= st.sampled_from([1.0, float("nan")])
+        numbers |= st.integers(int(allowed.high) + 1) if allowed.high < float("inf") else st.nothing()
+    else:
+        numbers |= st.floats(
+            max_value=max(allowed.low, allowed.above), exclude_max=allowed.above < allowed.low
+        )
+        numbers |= st.sampled_from([float("nan"), float("inf"), 10**400])
+        numbers |= st.floats(allowed.high, exclude_min=True) if allowed.high < float("inf") else st.nothing()
+    return st.sampled_from([*other_types, True, "1"]) | numbers
+
+
+def _settings(kind: type[Settings]) -> dict[str, tuple[Any, Allowed]]:
+    """Default and constraint of the settings of a section, by name."""
+    return {
+        f.name: (f.default, f.metadata.get("allowed", Allowed()))
+        for f in fields(kind)
+        if f.name not in SECTIONS
+    }
+
+
+def _valid_settings(kind: type[Settings]) -> dict[str, st.SearchStrategy[Any]]:
+    return {name: _valid(*declared) for name, declared in _settings(kind).items()}
+
+
+VALID = st.builds(
+    Config,
+    **_valid_settings(Config),
+    **{name: st.builds(kind, **_valid_settings(kind)) for name, kind in SECTIONS.items()},
+)
+KEYS = [(kind, name, key) for name, kind in {"": Config, **SECTIONS}.items() for key in _settings(kind)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(config=VALID)
+def test_any_valid_configuration_reads_back(tmp_path_factory: pytest.TempPathFactory, config: Config) -> None:
+    file = tmp_path_factory.mktemp("valid") / "config.toml"
+    file.write_text(to_toml(config), encoding="utf-8")
+    assert load_config(file) == config
+
+
+@settings(max_examples=300, deadline=None)
+@given(place=st.sampled_from(KEYS), data=st.data())
+def test_any_broken_value_is_named(
+    tmp_path_factory: pytest.TempPathFactory, place: tuple[type[Settings], str, str], data: st.DataObject
+) -> None:
+    kind, section, key = place
+    name = f"{section}.{key}" if section else key
+    value = data.draw(_broken(*_settings(kind)[key]))
+    for build in (kind, lambda **changes: replace(kind(), **changes)):
+        with pytest.raises(ConfigError, match=f"^{name} must be "):
+            build(**{key: value})
+    if isinstance(value, bool | int | float):
+        file = tmp_path_factory.mktemp("broken") / "mine.toml"
+        file.write_text((f"[{section}]\n" if section else "") + f"{key} = {str(value).lower()}\n")
+        with pytest.raises(ConfigError, match=rf"mine\.toml: {name} must be "):
+            load_config(file)
+
+
+def test_a_section_says_what_it_allows_in_words() -> None:
+    @dataclass(frozen=True)
+    class Own(Settings, section="own"):
+        below: float = setting(-1.0, low=-2, high=0)
+        between: float = setting(0.5, above=0, high=1)
+        plain: int = 3
+
+    assert Own() == Own(-1, 0.5)
+    for name, words in (("below", "at least -2 and at most 0"), ("between", "above 0 and at most 1")):
+        with pytest.raises(ConfigError, match=f"own.{name} must be {words}, not 2"):
+            Own(**{name: 2})
+    with pytest.raises(ConfigError, match=r"own\.plain must be at least 0 and finite, not -1"):
+        Own(plain=-1)

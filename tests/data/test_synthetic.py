@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from torchslam.data import open_sequence
+from torchslam.data.synthetic.building import QUARTER_TURN, corridors, rooms
+from torchslam.data.synthetic.paths import OUTWARD
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle, wall
 from torchslam.errors import SequenceError
 
+Build = Callable[[int], list[Rectangle]]
 SIZE = (160, 120)
 K = np.array(((125.0, 0, 79.5), (0, 125.0, 59.5), (0, 0, 1)))
 
@@ -122,10 +128,128 @@ def test_exposure_and_noise() -> None:
     assert float(changing.image(15).mean()) > 1.1 * float(steady.image(15).mean())
 
 
+@lru_cache(maxsize=2)
+def _built(build: Build) -> list[Rectangle]:
+    """Of seed 0; made once, for it takes seconds."""
+    return build(0)
+
+
+def _path(name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions (N, 3) and orientations (N, 3, 3) of the camera in the world."""
+    groundtruth = open_sequence(f"synthetic:{name}").groundtruth
+    assert groundtruth is not None
+    return groundtruth.positions_w, groundtruth.T_wc[:, :3, :3]
+
+
+def _degrees_between(R_1: torch.Tensor, R_2: torch.Tensor) -> torch.Tensor:
+    cosine = ((R_1.mT @ R_2).diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
+    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+
+def test_every_scene_has_its_own_length() -> None:
+    scenes = ("room", "planar", "loop", "corridors")
+    assert [len(open_sequence(f"synthetic:{name}")) for name in scenes] == [160, 160, 720, 560]
+    assert len(open_sequence("synthetic:loop?frames=30")) == 30
+
+
+def test_the_loop_moves_smoothly_and_never_turns_on_the_spot() -> None:
+    positions, R_wc = _path("loop")
+    moves = positions.diff(dim=0)
+    steps, turns = moves.norm(dim=-1), _degrees_between(R_wc[:-1], R_wc[1:])
+    assert 0.02 < float(steps.min()) < float(steps.max()) < 0.035
+    assert 0.5 < float(turns.mean()) < float(turns.max()) < 1.5
+    # The camera looks to the left of where it goes, by as much all the way but for the sway.
+    ahead, view = moves / steps[:, None], R_wc[:-1, :, 2]
+    to_the_left = torch.atan2(ahead[:, 0] * view[:, 2] - ahead[:, 2] * view[:, 0], (ahead * view).sum(dim=-1))
+    assert float((to_the_left - OUTWARD).abs().max()) < 0.25
+    assert float((to_the_left - OUTWARD).mean().abs()) < 0.01
+
+
+def test_the_loop_comes_back_over_its_start() -> None:
+    positions, R_wc = _path("loop")
+    assert float((positions[670:] - positions[:50]).norm(dim=-1).max()) < 0.15
+    assert float(_degrees_between(R_wc[670:], R_wc[:50]).max()) < 5
+    assert float((positions[:50] - positions[335:385]).norm(dim=-1).min()) > 5.0  # the far side in between
+
+
+@pytest.mark.parametrize(("name", "build"), [("loop", rooms), ("corridors?frames=720", corridors)])
+def test_the_walk_keeps_clear_of_walls_and_furniture(name: str, build: Build) -> None:
+    positions = _path(name)[0].numpy()
+    clearance = [_distance(positions, rectangle).min() for rectangle in _built(build)]
+    assert 0.4 < min(clearance) < 1.0
+
+
+def _distance(points: np.ndarray, rectangle: Rectangle) -> np.ndarray:
+    """(N,) from each point (N, 3) to the nearest place of a rectangle."""
+    axes = np.stack((rectangle.axis_u, rectangle.axis_v))
+    inside = ((points - rectangle.origin) @ axes.T).clip(0, rectangle.size)
+    return np.linalg.norm(points - rectangle.origin - inside @ axes, axis=-1)
+
+
+def test_the_corridors_are_never_seen_twice() -> None:
+    positions, _ = _path("corridors")
+    apart = (torch.arange(len(positions))[:, None] - torch.arange(len(positions))).abs() >= 150
+    assert float(torch.cdist(positions, positions)[apart].min()) > 2.5
+    # The first room painted white, the others black.
+    white, black = (np.full((32, 32), grey, np.uint8) for grey in (255, 0))
+    built = _built(corridors)
+    painted = [
+        Rectangle(one.origin, one.axis_u, one.axis_v, one.size, white if row < len(built) / 4 else black)
+        for row, one in enumerate(built)
+    ]
+    renderer, sequence = Renderer(painted, K, SIZE), open_sequence("synthetic:corridors?frames=720")
+    seen = [renderer.render(sequence.pose(index).numpy()).mean() / 255 for index in (0, 440, 500, 559, 670)]
+    assert seen[0] > 0.95
+    assert seen[1:4] == [0, 0, 0]
+    assert seen[4] > 0.95
+
+
+def test_corridors_look_alike_where_rooms_do_not() -> None:
+    T_wc = open_sequence("synthetic:loop").groundtruth.T_wc[40].numpy()
+    quarter = np.eye(4)
+    quarter[:3, :3] = QUARTER_TURN
+    alike, different = (Renderer(_built(build), K, SIZE) for build in (corridors, rooms))
+    for turns in (1, 2, 3):
+        T_wc_there = np.linalg.matrix_power(quarter, turns) @ T_wc
+        here, there = (np.linalg.inv(pose) for pose in (T_wc, T_wc_there))
+        assert np.abs(alike.render(here) - alike.render(there)).mean() < 0.1
+        assert np.abs(different.render(here) - different.render(there)).mean() > 20
+
+
+def test_the_walk_meets_corresponding_places_of_the_corridors() -> None:
+    positions, R_wc = (values.numpy() for values in _path("corridors"))
+    quarter = 670 / 4
+    for turns in (1, 2, 3):
+        index = round(40 + turns * quarter)
+        back = np.linalg.matrix_power(QUARTER_TURN.T, turns)
+        assert np.linalg.norm(back @ positions[index] - positions[40]) < 0.15
+        assert np.linalg.norm(back @ R_wc[index] - R_wc[40]) < 0.1
+
+
+def test_a_building_is_the_same_from_the_same_seed() -> None:
+    pairs = zip(_built(corridors), corridors(0), strict=True)
+    assert all(np.array_equal(one.texture, same.texture) for one, same in pairs)
+
+
+def test_a_shared_texture_is_drawn_like_copies_of_it() -> None:
+    shared = _built(corridors)
+    copies = [
+        Rectangle(one.origin, one.axis_u, one.axis_v, one.size, one.texture.copy())
+        for one in shared[: len(shared) // 2]
+    ]
+    T_cw = open_sequence("synthetic:corridors").pose(100).numpy()
+    images = [Renderer(rectangles, K, SIZE).render(T_cw) for rectangles in (shared[: len(copies)], copies)]
+    # Not the same bytes: places in the atlas differ, and with them the rounding.
+    assert np.abs(images[0] - images[1]).mean() < 0.1
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("synthetic:kitchen", "unknown scene `kitchen`; there are room, planar, rotation, standstill"),
+        (
+            "synthetic:kitchen",
+            "unknown scene `kitchen`; there are room, planar, rotation, standstill, loop, corridors",
+        ),
         ("synthetic:room?frmes=3", "unknown option `frmes`; there are frames, seed"),
         ("synthetic:room?frames=many", "`frames` must be a number, got `many`"),
         ("synthetic:room?frames=0", "`frames` is out of range: 0"),

@@ -82,7 +82,7 @@ class SimulatedFeatures:
 
     def __call__(self, T_cw: Tensor, frame_index: int) -> Features:
         """Features (batch of one) of the frame with this true pose (4, 4)."""
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + frame_index)
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + frame_index) % 2**63)
         device, T_cw = T_cw.device, T_cw.cpu()
         width, height = self.camera.size
         pixels, visible = self._visible(T_cw, self.points_w)

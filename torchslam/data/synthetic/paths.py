@@ -9,6 +9,13 @@ from torch import Tensor
 
 from torchslam.geometry.lie import rigid, so3_exp
 
+RADIUS = 2.87
+"""Metres: the length of the walk around the core by 2 pi."""
+OUTWARD = 0.5
+"""Radians from the heading to where the camera looks."""
+HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
+"""Of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n, weights J_n(1 / 4) / (1 - 4 n)."""
+
 
 def loop(phase: Tensor) -> Tensor:
     """A figure of eight through the middle of the room, one round a phase of 2 pi, held in a hand that sways.
@@ -46,6 +53,25 @@ def sideways(phase: Tensor) -> Tensor:
         -0.25 * torch.sin(phase),
         0.08 * torch.sin(2 * phase),
         0.05 * torch.sin(phase),
+    )
+
+
+def round_the_core(phase: Tensor) -> Tensor:
+    """Around the core of `building`, one round a phase of 2 pi, from the door into the first room, to the right.
+
+    The heading is phase - sin(4 phase) / 4: straight on at the four doors, twice the mean rate in the four corners,
+    at constant speed. Its integral closes for the fourfold symmetry; `HARMONICS` is its Fourier series. The camera
+    looks to the left of the heading, at the outer walls, and sways in the hand.
+    """
+    z = RADIUS * sum(weight * torch.sin(order * phase) for order, weight in HARMONICS)
+    x = -RADIUS * sum(weight * torch.cos(order * phase) for order, weight in HARMONICS)
+    return _poses(
+        x + 0.012 * torch.sin(29.3 * phase),
+        0.015 * torch.sin(47.3 * phase) + 0.05 * torch.sin(3.3 * phase + 0.5),
+        z + 0.012 * torch.sin(23.9 * phase + 1.0),
+        phase - 0.25 * torch.sin(4 * phase) - OUTWARD + 0.015 * torch.sin(36.4 * phase),
+        -0.03 + 0.012 * torch.sin(31.7 * phase + 0.4),
+        0.01 * torch.sin(41.2 * phase),
     )
 
 

@@ -33,8 +33,11 @@ class Renderer:
         self._corners = np.stack((np.zeros_like(du), du, du + dv, dv), axis=1) + self._origins[:, None]
         shapes = np.array([rectangle.texture.shape[::-1] for rectangle in rectangles])
         self._texels = shapes / self._sizes  # per metre
-        self._atlas, offsets = _pack([_pyramid(rectangle.texture) for rectangle in rectangles])
-        # Per texture and level: what a texel shrinks to and where the corner of the first one lies in the atlas, half
+        textures = {id(rectangle.texture): rectangle.texture for rectangle in rectangles}  # each once
+        self._atlas, offsets = _pack([_pyramid(texture) for texture in textures.values()])
+        places = {key: place for place, key in enumerate(textures)}
+        offsets = offsets[[places[id(rectangle.texture)] for rectangle in rectangles]]
+        # Per rectangle and level: what a texel shrinks to and where the corner of the first one lies in the atlas, half
         # a texel before its centre.
         shrink = np.tile(np.exp2(-np.arange(MIP_LEVELS)), len(rectangles))
         self._tiles = np.stack((shrink, *(offsets.reshape(-1, 2) - 0.5).T)).astype(np.float32)

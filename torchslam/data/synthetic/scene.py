@@ -34,15 +34,20 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
-class _Painter:
-    """Makes rectangles, each with a texture of its own, lit from above and a little from the front."""
+class Painter:
+    """Makes rectangles, each with a texture of its own, lit from above and a little from the front.
+
+    rng:   of the textures
+    texel: metres, at most
+    """
 
     rng: np.random.Generator
+    texel: float = TEXEL
 
     def rectangle(
         self, origin: np.ndarray, axis_u: np.ndarray, axis_v: np.ndarray, size: tuple[float, float]
     ) -> Rectangle:
-        texture = surface(self.rng, size, TEXEL, 2 ** (MIP_LEVELS - 1))
+        texture = surface(self.rng, size, self.texel, 2 ** (MIP_LEVELS - 1))
         normal = np.cross(axis_u, axis_v)
         light = 0.8 + 0.15 * abs(float(normal @ Z)) + 0.2 * float(abs(normal @ Y))
         return Rectangle(origin, axis_u, axis_v, size, (texture * min(light, 1.0)).astype(np.uint8))
@@ -62,7 +67,7 @@ class _Painter:
 
 def room(seed: int) -> list[Rectangle]:
     """A room of 6.4 x 2.8 x 5.6 metres (x, y down, z) around the origin, furniture in its far half."""
-    painter = _Painter(np.random.default_rng(seed))
+    painter = Painter(np.random.default_rng(seed))
     rectangles = painter.box((0, 0, 0), (6.4, 2.8, 5.6), 0.0)
     furniture = (
         ((-1.9, 0.95, 1.7), (1.2, 0.9, 0.7), 0.3),  # a table to the left, with two boxes on it
@@ -85,5 +90,5 @@ def room(seed: int) -> list[Rectangle]:
 
 def wall(seed: int) -> list[Rectangle]:
     """A single wall of 9 x 6 metres, 2.5 metres in front of the origin."""
-    painter = _Painter(np.random.default_rng(seed))
+    painter = Painter(np.random.default_rng(seed))
     return [painter.rectangle(np.array((-4.5, -3.0, 2.5)), X, Y, (9.0, 6.0))]

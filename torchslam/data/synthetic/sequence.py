@@ -15,6 +15,7 @@ from torch import Tensor
 from torchslam.data.image_file import grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.data.synthetic import paths
+from torchslam.data.synthetic.building import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, room, wall
 from torchslam.errors import SequenceError
@@ -23,24 +24,43 @@ from torchslam.geometry.lie import se3_inverse
 from torchslam.values import Trajectory
 
 FRAME_RATE = 20.0
-FRAMES_PER_ROUND = 160
 SIZE = (640, 480)
 FOCAL = 500.0
 
-SCENES: dict[str, tuple[Callable[[int], list[Rectangle]], Callable[[Tensor], Tensor]]] = {
-    "room": (room, paths.loop),
-    "planar": (wall, paths.sideways),
-    "rotation": (room, paths.rotation),
-    "standstill": (room, paths.standstill),
+
+@dataclass(frozen=True)
+class Scene:
+    """What is seen and how the camera moves.
+
+    build:            rectangles from a seed
+    path:             T_wc from the phase of each frame
+    frames_per_round: frames in a phase of 2 pi
+    frames:           how many there are where the name does not say
+    """
+
+    build: Callable[[int], list[Rectangle]]
+    path: Callable[[Tensor], Tensor]
+    frames_per_round: int = 160
+    frames: int = 160
+
+
+SCENES = {
+    "room": Scene(room, paths.loop),
+    "planar": Scene(wall, paths.sideways),
+    "rotation": Scene(room, paths.rotation),
+    "standstill": Scene(room, paths.standstill),
+    # Once around and 50 frames on, over the start.
+    "loop": Scene(rooms, paths.round_the_core, 670, 720),
+    # Ends before the start comes into sight: what looks like a return is none. With 720 frames it returns.
+    "corridors": Scene(corridors, paths.round_the_core, 670, 560),
 }
-"""By name: what is seen, from a seed, and the path of the camera, from the phase."""
 
 
 @dataclass(frozen=True)
 class RenderOptions:
     """What follows the `?` of a synthetic sequence's name.
 
-    frames:   how many; the path is a round of 160 that goes on with another sway
+    frames:   how many; a path goes on round after round, with another sway. Without it, the scene's own number
     seed:     of textures and noise
     noise:    standard deviation, grey levels of 255
     blur:     standard deviation of a Gaussian, pixels
@@ -48,7 +68,7 @@ class RenderOptions:
     blank:    1 for grey images instead of rendered ones, where only the poses matter
     """
 
-    frames: int = FRAMES_PER_ROUND
+    frames: int
     seed: int = 0
     noise: float = 2.0
     blur: float = 0.5
@@ -60,9 +80,9 @@ class SyntheticSequence(Sequence):
     """A scene rendered when a frame is asked for; the same name gives the same bytes."""
 
     def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
-        options = RenderOptions() if options is None else options
-        _, path = SCENES[scene]
-        T_wc = path(paths.phases(options.frames, FRAMES_PER_ROUND))
+        path, frames_per_round = SCENES[scene].path, SCENES[scene].frames_per_round
+        options = RenderOptions(SCENES[scene].frames) if options is None else options
+        T_wc = path(paths.phases(options.frames, frames_per_round))
         timestamps = torch.arange(options.frames, dtype=torch.float64) / FRAME_RATE
         centre = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         camera = Camera.pinhole(FOCAL, FOCAL, *centre, size=SIZE)
@@ -74,7 +94,7 @@ class SyntheticSequence(Sequence):
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5)
-        image = _renderer(SCENES[self.name][0], options.seed).render(self._poses_cw[index])
+        image = _renderer(SCENES[self.name].build, options.seed).render(self._poses_cw[index])
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
         image *= 1.0 + options.exposure * np.sin(0.1 * index)
@@ -95,7 +115,7 @@ def open_synthetic(name: str) -> SyntheticSequence:
     scene, _, query = name.removeprefix("synthetic:").partition("?")
     if scene not in SCENES:
         raise SequenceError(f"{name}: unknown scene `{scene}`; there are {', '.join(SCENES)}")
-    options = RenderOptions()
+    options = RenderOptions(SCENES[scene].frames)
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in asdict(options):
             raise SequenceError(f"{name}: unknown option `{key}`; there are {', '.join(asdict(options))}")
@@ -110,7 +130,7 @@ def open_synthetic(name: str) -> SyntheticSequence:
 
 
 @lru_cache(maxsize=2)
-def _renderer(scene: Callable[[int], list[Rectangle]], seed: int) -> Renderer:
+def _renderer(build: Callable[[int], list[Rectangle]], seed: int) -> Renderer:
     """Textures take seconds to make, so that the last scenes are kept."""
     K = np.array(((FOCAL, 0, (SIZE[0] - 1) / 2), (0, FOCAL, (SIZE[1] - 1) / 2), (0, 0, 1)))
-    return Renderer(scene(seed), K, SIZE)
+    return Renderer(build(seed), K, SIZE)
