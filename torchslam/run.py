@@ -20,6 +20,7 @@ from torchslam.solvers.graph import solve
 from torchslam.values import State, StepResult, Trajectory
 from torchslam.world.history import History, RunGraph
 from torchslam.world.map import Map
+from torchslam.world.world import World
 
 if TYPE_CHECKING:
     from torchslam.slam import SLAM
@@ -29,24 +30,56 @@ if TYPE_CHECKING:
 class Run:
     """The result of a run.
 
-    trajectory:  every posed frame; keyframes: the keyframes alone
-    history:     poses and observations of the frames, from which `graph` is made
+    worlds:      what was built, in the order in which it began; mostly one
     results:     one per processed frame
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
     failure:     why there is no map; empty when there is one
     """
 
-    trajectory: Trajectory
-    keyframes: Trajectory
-    map: Map
-    history: History
+    worlds: tuple[World, ...]
     camera: Camera
     config: Config
     results: list[StepResult]
     skipped: list[str]
     interrupted: bool
     failure: str
+
+    @property
+    def main(self) -> World | None:
+        """The world in which most frames are posed; None where there is no map."""
+        return max(self.worlds, key=lambda world: len(world.history), default=None)
+
+    @property
+    def map(self) -> Map:
+        """Of the main world; empty where there is none."""
+        return Map() if self.main is None else self.main.map
+
+    @property
+    def history(self) -> History:
+        """Poses and observations of the frames of the main world."""
+        return History() if self.main is None else self.main.history
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every posed frame of the main world, after everything that was learned later."""
+        return Trajectory.empty() if self.main is None else self.main.trajectory()
+
+    @property
+    def keyframes(self) -> Trajectory:
+        """The keyframes of the main world alone."""
+        return keyframe_trajectory(self.map)
+
+    @property
+    def online(self) -> Trajectory:
+        """The poses as they were given, frame by frame, in the main world."""
+        number = None if self.main is None else self.main.number
+        given = [result for result in self.results if result.T_cw is not None and result.world == number]
+        if not given:
+            return Trajectory.empty()
+        T_cw = torch.stack([result.T_cw for result in given if result.T_cw is not None])
+        times = torch.tensor([result.timestamp for result in given], dtype=torch.float64)
+        return Trajectory(times, se3_inverse(T_cw))
 
     @property
     def graph(self) -> RunGraph:
@@ -95,19 +128,14 @@ def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupte
             adjust_all(world.map, slam.camera, slam.config.bundle)
             graph = world.history.graph(world.map, slam.camera)
             world.history.take(solve(graph, backward="detached"), graph, world.map)
-    main = slam.worlds.main()
-    has_map = main is not None
     return Run(
-        slam.trajectory(),
-        keyframe_trajectory(slam.map if main is None else main.map),
-        slam.map if main is None else main.map,
-        main.history if main is not None else History(),
+        tuple(slam.worlds),
         slam.camera,
         slam.config,
         results,
         skipped,
         interrupted,
-        "" if has_map else why_no_map(results, skipped),
+        "" if len(slam.worlds) else why_no_map(results, skipped),
     )
 
 

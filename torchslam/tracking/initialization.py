@@ -68,8 +68,8 @@ class Initializer:
     ) -> tuple[Start | None, str]:
         """The relative pose from matches that moved.
 
-        scene_only: they are a part of all matches, and may be a thing that moves before a camera that stands still; only
-        depth tells a scene apart from that.
+        scene_only: they are a part of all matches, and may be a thing that moves before a camera that stands
+        still; only depth tells a scene apart from that.
         """
         settings = self.config.initialization
         pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]

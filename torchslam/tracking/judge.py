@@ -1,4 +1,4 @@
-"""May a pose be believed? By what it rests on: how much agrees with it, how sure it is, whether the motion is possible."""
+"""May a pose be believed? By how much agrees with it, how sure it is, and whether the motion is possible."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeCo
 
 
 def deviations(tracked: Tracked) -> tuple[float, float]:
-    """Standard deviations of the camera's position, as a share of the depth of the scene, and of its rotation, degrees."""
+    """Standard deviations of the position, as a share of the depth of the scene, and of the rotation, in degrees."""
     variances = tracked.covariance.diagonal()
     position = float(variances[:3].sum().clamp(min=0).sqrt()) / max(tracked.depth, 1e-12)
     return position, math.degrees(float(variances[3:].sum().clamp(min=0).sqrt()))

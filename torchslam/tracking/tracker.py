@@ -166,7 +166,7 @@ class Tracker:
     def _refine(
         self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
     ) -> tuple[RefinedPose, Tensor]:
-        """The pose and (n,) who agrees with it: by robust least squares, once on all matches and once on those that agree."""
+        """The pose and (n,) who agrees with it: least squares on all matches, then on those that agree."""
         points_w = slam_map.positions_w[ids]
         mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
