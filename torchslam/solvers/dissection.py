@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # Parts this small are dense fronts: less work than the calls for splitting them further.
-_LEAF_NODES = 24
+_LEAF_NODES = 40
 # A separator leaves at least this share of a part on either side.
 _BALANCE = 0.3
 

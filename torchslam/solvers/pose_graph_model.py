@@ -31,6 +31,10 @@ from torchslam.solvers.sparse_cholesky import (
 )
 
 
+# A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
+_DAMPING_SHARE = 1e-4
+
+
 class Inputs(NamedTuple):
     """All that gradients may flow to: S_cw (B, K, 4, 4), S_ji (B, E, 4, 4), information (B, E, D, D), scale."""
 
@@ -177,6 +181,7 @@ class PoseGraphProblem:
         return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, twist=None)
 
     def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:
+        damping = _DAMPING_SHARE * damping
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         decrease = 0.5 * (xi * model.gradient).sum((-2, -1))
