@@ -41,6 +41,7 @@ from torchslam.geometry.lie import (
 )
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
+from torchslam.geometry.similarity import Similarity, estimate_similarity
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -55,6 +56,7 @@ __all__ = [
     "Camera",
     "MultiViewTriangulation",
     "RelativePose",
+    "Similarity",
     "Triangulation",
     "correct_matches",
     "decompose_essential",
@@ -62,6 +64,7 @@ __all__ = [
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",
+    "estimate_similarity",
     "five_point",
     "homography_from_matches",
     "innovation_covariances",

@@ -30,7 +30,6 @@ from torchslam.solvers.sparse_cholesky import (
     factorize_sparse,
 )
 
-
 # A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
 
