@@ -44,6 +44,7 @@ def make_pairs(
     outliers: float = 0.3,
     noise: float = 0.5,
     log_scale: float = 0.6,
+    baseline: float = 0.8,
     camera_1: Camera = CAMERA,
     camera_2: Camera = CAMERA,
 ) -> Pairs:
@@ -53,9 +54,8 @@ def make_pairs(
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    # A baseline along the image: without one, pixels do not depend on the scale.
     direction = normal(3) * torch.tensor((1.0, 1.0, 0.3))
-    translation = 0.8 * math.exp(0.5 * log_scale) * direction / direction.norm()
+    translation = baseline * math.exp(0.5 * log_scale) * direction / direction.norm()
     xi = torch.cat((translation, 0.08 * normal(3), torch.tensor((log_scale,))))
     S_21 = sim3_exp(xi)
     size = torch.tensor(camera_1.size, dtype=torch.float64)
@@ -130,6 +130,16 @@ def test_an_inlier_fits_in_both_images() -> None:
         torch.testing.assert_close(result.S_21, pairs.S_21, atol=1e-8, rtol=0)
 
 
+@pytest.mark.parametrize("log_scale", [-1.5, 0.0, 1.5])
+def test_scale_where_both_cameras_are_at_one_place(log_scale: float) -> None:
+    """Where no pixel depends on it."""
+    for seed in range(4):
+        pairs = make_pairs(seed, log_scale=log_scale, baseline=0.0)
+        result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA)
+        assert result.success.all()
+        check(result.S_21, pairs.S_21)
+
+
 def test_errors_count_in_their_standard_deviations() -> None:
     """The threshold follows sigma, in each image by itself."""
     pairs = make_pairs(3, outliers=0.0, noise=0.0)
@@ -170,7 +180,7 @@ def test_the_fit_is_a_minimum_of_both_errors(with_scale: bool) -> None:
         _View.of(pairs.points_2, pairs.pixels_1, torch.ones(1, 120).double(), RADIAL, 3.0),
     )
     start = pairs.S_21[:, :3] if with_scale else sim3_exp(torch.zeros(1, 7).double())[:, :3]
-    P, cost = _Problem(*views, pairs.right, with_scale).fit(start, 100, 1e6)
+    P, cost = _Problem(*views, pairs.right, with_scale, 0.3).fit(start, 100, 1e6)
     dims = 7 if with_scale else 6
 
     def error(xi: Tensor) -> Tensor:
@@ -179,7 +189,8 @@ def test_the_fit_is_a_minimum_of_both_errors(with_scale: bool) -> None:
         ).index_put((torch.tensor(0), torch.tensor(3), torch.tensor(3)), torch.ones(()).double())
         there = CAMERA.project(transform(S, pairs.points_1))[0] - pairs.pixels_2
         back = RADIAL.project(transform(sim3_inverse(S), pairs.points_2))[0] - pairs.pixels_1
-        return 0.5 * (there.square().sum() + back.square().sum()) / 9
+        deeper = (transform(S, pairs.points_1)[..., 2] / pairs.points_2[..., 2]).log() / 0.1
+        return 0.5 * sum(x.square().sum() for x in (there, back, deeper)) / 9
 
     xi = torch.zeros(1, dims, dtype=torch.float64, requires_grad=True)
     value = error(xi)

@@ -19,7 +19,8 @@ from torchslam.geometry import (
 from torchslam.solvers import PoseGraph, pose_graph_optimize
 from torchslam.solvers.dissection import dissect
 from torchslam.solvers.pose_graph import _sanitized
-from torchslam.solvers.pose_graph_model import PoseGraphProblem, build_layout
+from torchslam.solvers.pose_graph_layout import build_layout
+from torchslam.solvers.pose_graph_model import PoseGraphProblem
 from torchslam.solvers.sparse_cholesky import build_block_structure, factorize_sparse
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}

@@ -27,6 +27,7 @@ from torchslam.geometry.ransac import (
 
 # 99 % of two-dimensional normal errors are smaller than this many standard deviations.
 _THRESHOLD = 3.035
+_DEPTH_SIGMA = 0.1
 _SAMPLE = 3  # pairs that fix a similarity
 _FIRST_ROUND = 160  # samples
 _CANDIDATES = 2  # hypotheses of each round that are optimised
@@ -60,6 +61,7 @@ def estimate_similarity(
     sigmas_1: Tensor | None = None,
     sigmas_2: Tensor | None = None,
     threshold: float = _THRESHOLD,
+    depth_sigma: float = _DEPTH_SIGMA,
     mask: Tensor | None = None,
     seed: int = 0,
     with_scale: bool = True,
@@ -73,7 +75,10 @@ def estimate_similarity(
     sigmas_1, sigmas_2: (B, N) standard deviations of these in pixels, one if None
     threshold:          reprojection error of an inlier, in standard deviations: of the points of camera 1, moved by
                         S_21, in image 2, and of those of camera 2, moved by its inverse, in image 1
-    mask:               (B, N), rows outside it, or that are not finite, or with a sigma not above zero, are ignored
+    depth_sigma:        relative standard deviation of the depths in camera 2. Where both cameras are at one place, as
+                        where a loop closes, pixels do not depend on the scale; there depths tell it.
+    mask:               (B, N), rows outside it, that are not finite, behind their camera, or with a sigma not above
+                        zero, are ignored
     with_scale:         if not, the scale is one
 
     The same arguments and seed give the same result, which is detached. Too few pairs, points on a line, or pure noise
@@ -81,19 +86,14 @@ def estimate_similarity(
     Sources: Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; Mur-Artal et al.,
     "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, section VII-B; for the minimal solution `umeyama`.
     """
-    shape = points_1.shape[:-1]
-    if points_1.ndim != 3 or any(
-        x.shape != (*shape, size) for x, size in ((points_1, 3), (points_2, 3), (pixels_1, 2), (pixels_2, 2))
-    ):
-        shapes = ", ".join(str(tuple(x.shape)) for x in (points_1, points_2, pixels_1, pixels_2))
+    shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
+    if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):
+        shapes = ", ".join(str(tuple(x.shape)) for x in given)
         raise ValueError(f"points must be (B, N, 3) and pixels (B, N, 2), not {shapes}")
-    given = (points_1, points_2, pixels_1, pixels_2)
     sigmas = tuple(torch.ones_like(points_1[..., 0]) if s is None else s for s in (sigmas_1, sigmas_2))
-    use = torch.ones_like(points_1[..., 0], dtype=torch.bool) if mask is None else mask
-    for values in given:
-        use = use & torch.isfinite(values).all(-1)
-    for sigma in sigmas:
-        use = use & torch.isfinite(sigma) & (sigma > 0)
+    positive = torch.stack((points_1[..., 2], points_2[..., 2], *sigmas), dim=-1)
+    use = (positive > 0).all(-1) & torch.isfinite(torch.cat((*given, positive), dim=-1)).all(-1)
+    use = use if mask is None else use & mask
     B, N = shape
     if B == 0 or N < _SAMPLE:
         S_21 = torch.eye(4, dtype=points_1.dtype, device=points_1.device).expand(B, 4, 4)
@@ -101,11 +101,10 @@ def estimate_similarity(
     points_1, points_2, pixels_1, pixels_2 = (torch.where(use[..., None], x, 0.0).detach() for x in given)
     sigmas = tuple(torch.where(use, sigma, 1.0).detach() for sigma in sigmas)
     with torch.inference_mode():  # less work per operation than without gradients only
-        views = (
-            _View.of(points_1, pixels_2, sigmas[1], camera_2, threshold),
-            _View.of(points_2, pixels_1, sigmas[0], camera_1, threshold),
-        )
-        results = _Problem(*views, use, with_scale).solve(seed, confidence, max_samples)
+        forward = _View.of(points_1, pixels_2, sigmas[1], camera_2, threshold)
+        backward = _View.of(points_2, pixels_1, sigmas[0], camera_1, threshold)
+        problem = _Problem(forward, backward, use, with_scale, threshold * depth_sigma)
+        results = problem.solve(seed, confidence, max_samples)
     S_21, success, squared, score = (result.clone() for result in results)  # fit for graphs
     return Similarity(S_21, (squared < 1) & use & success[:, None], success, score)
 
@@ -158,17 +157,21 @@ class _View:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The data of the search: camera 1's points in camera 2, and the reverse; mask (B, N)."""
+    """The data of the search: camera 1's points in camera 2, and the reverse; mask (B, N).
+
+    depth_sigma: threshold of relative differences in depth
+    """
 
     forward: _View
     backward: _View
     mask: Tensor
     with_scale: bool
+    depth_sigma: float
 
     def select(self, rows: Tensor) -> _Problem:
         """Some of the problems."""
         forward, backward = self.forward.select(rows), self.backward.select(rows)
-        return _Problem(forward, backward, self.mask[rows], self.with_scale)
+        return replace(self, forward=forward, backward=backward, mask=self.mask[rows])
 
     def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """S_21 (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
@@ -186,8 +189,8 @@ class _Problem:
         success = self.is_success((squared < 1) & self.mask)
         score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
         eye = torch.eye(4, dtype=P.dtype, device=P.device)
-        S_21 = rigid(P[..., :3], P[..., 3])
-        return torch.where(success[:, None, None], S_21, eye), success, squared, score
+        S_21 = torch.where(success[:, None, None], rigid(P[..., :3], P[..., 3]), eye)
+        return S_21, success, squared, score
 
     def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
         """The best similarity from `count` minimal samples, locally optimised, its score and its support."""
@@ -225,26 +228,38 @@ class _Problem:
         return torch.maximum(*squared).nan_to_num(torch.inf)
 
     def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
-        """Similarities (B, 3, 4) of least truncated mean squared error of both images, and their costs (B,)."""
+        """Similarities (B, 3, 4) of least truncated squared error in both images and in depth, and their costs (B,)."""
         dims = 7 if self.with_scale else 6
 
         def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
             inverse = _inverse(P)
             moved, there, J, valid = self.forward.residuals(P)
             _, back, J_back, valid_back = self.backward.residuals(inverse)
+            deeper, J_deeper = self.depths(moved)
             # Moving S from the left moves the points of camera 2 against it before the inverse maps them.
-            slopes = (_chain(J, moved), -_chain(J_back @ inverse[:, None, :, :3], self.backward.points))
-            squared = 0.5 * (there.square().sum(-1) + back.square().sum(-1))
+            slopes = (
+                _chain(torch.cat((J, J_deeper), dim=-2), moved),
+                -_chain(J_back @ inverse[:, None, :, :3], self.backward.points),
+            )
+            residual = torch.cat((there, deeper, back), dim=-1)
+            squared = 0.5 * residual.square().sum(-1)  # as large as in each image, where both are alike
             squared = squared.masked_fill(~(valid & valid_back), torch.inf)
             used, cost = truncated_rows(squared[:, None], self.mask, width)
-            rows = torch.cat(
-                (torch.cat(slopes, dim=-2)[..., :dims], torch.cat((there, back), dim=-1)[..., None]), dim=-1
-            )
+            rows = torch.cat((torch.cat(slopes, dim=-2)[..., :dims], residual[..., None]), dim=-1)
             rows = torch.where(used[:, 0, :, None, None], rows, 0.0).flatten(1, 2)
             return 0.5 * torch.bmm(rows.mT, rows), cost[:, 0]
 
         (P,), cost = minimize((P,), evaluate, _retract, iterations)
         return P, cost
+
+    def depths(self, moved: Tensor) -> tuple[Tensor, Tensor]:
+        """Differences (B, N, 1) of the logarithms of depths in camera 2, in thresholds, and their derivatives
+        (B, N, 1, 3) in the moved points (B, N, 3); zero where a depth is not positive.
+        """
+        front = (moved[..., 2:] > 0) & (self.backward.points[..., 2:] > 0)
+        depth, known = (torch.where(front, x[..., 2:], 1.0) for x in (moved, self.backward.points))
+        slope = torch.where(front, 1 / (self.depth_sigma * depth), 0.0)
+        return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
 
     def is_success(self, inliers: Tensor) -> Tensor:
         """Whether the inliers are no accident, and fix the similarity: four or more, not on one line. (B,)."""
@@ -272,7 +287,7 @@ def _inverse(P: Tensor) -> Tensor:
 
 
 def _chain(J: Tensor, points: Tensor) -> Tensor:
-    """Derivatives in [rho, omega, sigma] of what depends on points by J. (..., 2, 3), (..., 3) -> (..., 2, 7)."""
+    """Derivatives in [rho, omega, sigma] of what depends on points by J. (..., R, 3), (..., 3) -> (..., R, 7)."""
     rotation = torch.linalg.cross(points[..., None, :].expand_as(J), J, dim=-1)
     return torch.cat((J, rotation, J @ points[..., None]), dim=-1)
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchslam.geometry.lie import sim3_scale
 from torchslam.solvers.implicit import Backward, attach, check_backward
 from torchslam.solvers.levenberg import Convergence, minimize
-from torchslam.solvers.pose_graph_model import Inputs, PoseGraphProblem, build_layout
+from torchslam.solvers.pose_graph_layout import build_layout
+from torchslam.solvers.pose_graph_model import Inputs, PoseGraphProblem
 from torchslam.solvers.robust import Kernel
 
 # 95 % of the norms of seven standard normal numbers lie below.

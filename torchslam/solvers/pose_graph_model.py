@@ -1,4 +1,4 @@
-"""The least-squares problem behind `pose_graph_optimize`: its layout, its local models, its adjoint.
+"""The least-squares problem behind `pose_graph_optimize`: its local models, its adjoint.
 
 An edge's error is e = log(E) with E = X S_ji^-1, X = S_j S_i^-1. Nodes moved by exp(xi) from the left move E to
 exp(xi_j) exp(-Ad(X) xi_i) E: to first order by eta = xi_j - Ad(X) xi_i, from the left too, so that the derivative of e
@@ -22,13 +22,9 @@ from torchslam.geometry.lie import (
     sim3_log,
     skew,
 )
+from torchslam.solvers.pose_graph_layout import Layout
 from torchslam.solvers.robust import Kernel, Robustified, robustify
-from torchslam.solvers.sparse_cholesky import (
-    BlockStructure,
-    SparseFactor,
-    build_block_structure,
-    factorize_sparse,
-)
+from torchslam.solvers.sparse_cholesky import SparseFactor, factorize_sparse
 
 # A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
@@ -41,92 +37,6 @@ class Inputs(NamedTuple):
     S_ji: Tensor
     information: Tensor
     scale: Tensor
-
-
-@dataclass(frozen=True)
-class Groups:
-    """Rows that are summed by group, in a fixed order."""
-
-    order: Tensor
-    counts: Tensor
-
-    @staticmethod
-    def of(index: Tensor, count: int) -> Groups:
-        return Groups(torch.argsort(index, stable=True), torch.bincount(index, minlength=count))
-
-    def sum(self, values: Tensor) -> Tensor:
-        """(B, N, ...) -> (B, groups, ...)."""
-        shape = (len(self.counts), values.shape[0], *values.shape[2:])
-        flat = values.transpose(0, 1).index_select(0, self.order).flatten(1)
-        total = torch.segment_reduce(flat, "sum", lengths=self.counts, unsafe=True)
-        return total.view(shape).transpose(0, 1)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The discrete part of a pose graph: what counts, what moves, and in which order it is processed.
-
-    i, j:     (E,) int64 nodes of the edges
-    counted:  (B, E) bool; moving: (B, K) bool, nodes that counted edges join with a fixed one
-    linking:  (L,) edges that, in some element, join two moving nodes; turned: (L,) bool, whether the block of the pair
-              of nodes is the transpose of the edge's; by_pair: the edges of each pair; by_node: the edges' ends, first
-              all i, then all j, of each node
-    """
-
-    i: Tensor
-    j: Tensor
-    counted: Tensor
-    moving: Tensor
-    linking: Tensor
-    turned: Tensor
-    by_pair: Groups
-    by_node: Groups
-    structure: BlockStructure
-
-
-def build_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> Layout:
-    """Decide what moves, and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
-    i, j = edges.unbind(-1)
-    num_nodes = fixed.shape[1]
-    moving = _reached(edges, counted, fixed) & ~fixed
-    linking = (counted & moving[:, i] & moving[:, j]).any(0).nonzero().squeeze(-1)
-    low, high = edges[linking].amin(-1), edges[linking].amax(-1)
-    keys, positions = torch.unique(low * num_nodes + high, return_inverse=True)
-    pairs = torch.stack((keys // num_nodes, keys % num_nodes), dim=-1)
-    return Layout(
-        i,
-        j,
-        counted,
-        moving,
-        linking,
-        j[linking] == high,
-        Groups.of(positions, len(pairs)),
-        Groups.of(torch.cat((i, j)), num_nodes),
-        build_block_structure(num_nodes, dims, pairs),
-    )
-
-
-def _reached(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
-    """Which nodes (B, K) counted edges join, over others or not, with a fixed one.
-
-    Every node points to one of its component with a number not above its own; edges hook these onto one another, and
-    pointers are shortened, until nothing changes: about log K rounds.
-    """
-    num_nodes = fixed.shape[1]
-    label = torch.arange(num_nodes, device=fixed.device).expand_as(fixed)
-    ends = edges.T.flatten()
-    while True:
-        at_ends = label[:, ends]
-        low = torch.minimum(*at_ends.chunk(2, dim=1))
-        low = torch.where(counted, low, num_nodes).repeat(1, 2)
-        hooked = label.scatter_reduce(1, at_ends, low, "amin")
-        hooked = hooked.scatter_reduce(1, ends.expand_as(low), low, "amin")
-        shortened = hooked.gather(1, hooked)
-        if torch.equal(shortened, label):
-            break
-        label = shortened
-    has_fixed = torch.zeros_like(label).scatter_reduce(1, label, fixed.long(), "amax")
-    return has_fixed.gather(1, label) > 0
 
 
 class Linearization(NamedTuple):
@@ -145,6 +55,11 @@ class Linearization(NamedTuple):
     squared: Tensor
     kernel: Robustified
     sigma: Tensor
+
+    @property
+    def force(self) -> Tensor:
+        """(B, E, D) the gradient of the cost in eta."""
+        return (self.J.mT @ (self.kernel.weight[..., None] * self.pull)[..., None]).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -201,8 +116,7 @@ class PoseGraphProblem:
     def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
         """The model with the exact Hessian of the cost in the left perturbations."""
         lin = self._linearize(S_cw)
-        force = (lin.J.mT @ (lin.kernel.weight[..., None] * lin.pull)[..., None]).squeeze(-1)
-        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(force))
+        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.force))
 
     def at_minimum(self, minimum: Tensor) -> Tensor:
         """The minimum where nodes move, the inputs, with their graph, where they do not."""
@@ -237,14 +151,9 @@ class PoseGraphProblem:
     ) -> PoseGraphModel:
         """The normal equations from edges' Hessians (B, E, D, D) in eta, and half the bracket's part of the Hessian."""
         layout, carry = self.layout, lin.carry
-        force = (lin.J.mT @ (lin.kernel.weight[..., None] * lin.pull)[..., None]).squeeze(-1)
-        ends = torch.cat(
-            (
-                torch.cat((carry.mT @ hessian @ carry, -carry.mT @ force[..., None]), dim=-1),
-                torch.cat((hessian, force[..., None]), dim=-1),
-            ),
-            dim=1,
-        )
+        force = lin.force
+        at_i = torch.cat((carry.mT @ hessian @ carry, -carry.mT @ force[..., None]), dim=-1)
+        ends = torch.cat((at_i, torch.cat((hessian, force[..., None]), dim=-1)), dim=1)
         moving = layout.moving[..., None]
         nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
         eye = torch.eye(self.dims, dtype=S_cw.dtype, device=S_cw.device)

@@ -139,7 +139,6 @@ def factorize_sparse(
     across = first[..., :, None] * across * second[..., None, :]
     blocks = torch.cat((scaled, across, across.mT), dim=1)
 
-    smallest = torch.finfo(d.dtype).eps ** 0.4 if strict else 0.0
     definite = torch.ones(len(d), dtype=torch.bool, device=d.device)
     remaining: dict[int, list[tuple[Tensor, Tensor]]] = defaultdict(list)
     factors = []
@@ -147,8 +146,8 @@ def factorize_sparse(
         matrix = _assemble(structure.dims, front, blocks, remaining.pop(index, []))
         n = front.size[0]
         lower, info = torch.linalg.cholesky_ex(matrix[:, :n, :n])
-        definite = definite & (info == 0) & (lower.diagonal(dim1=-2, dim2=-1) > smallest).all(-1)
-        if not definite.all():  # unit matrices instead: what follows stays finite, its gradient included
+        if info.any():  # unit matrices instead: what follows stays finite, its gradient included
+            definite = definite & (info == 0)
             unit = torch.eye(n, dtype=d.dtype, device=d.device)
             lower, _ = torch.linalg.cholesky_ex(torch.where(definite[:, None, None], matrix[:, :n, :n], unit))
         # Rows below times the inverse transpose of the triangle.
@@ -157,6 +156,9 @@ def factorize_sparse(
             rest = torch.baddbmm(matrix[:, n:, n:], below, below.mT, alpha=-1)
             remaining[front.parent].append((front.parent_rows, rest))
         factors.append((lower, below))
+    if strict:
+        pivots = torch.cat([lower.diagonal(dim1=-2, dim2=-1) for lower, _ in factors], dim=-1)
+        definite = definite & (pivots > torch.finfo(d.dtype).eps ** 0.4).all(-1)
     return SparseFactor(structure, scale.flatten(1), factors, definite)
 
 
