@@ -245,12 +245,12 @@ def test_optimum_of_gtsam(with_scale: bool) -> None:
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
 def test_optimum_of_scipy(kernel: str) -> None:
     optimize = pytest.importorskip("scipy.optimize")
-    scene = make_scene(nodes=6, batch=1, outliers=1)
+    scene = make_scene(nodes=4, batch=1, outliers=1)
     graph = scene.graph
     start = graph.S_cw[0]
 
     def errors(x: object) -> object:
-        moved = sim3_exp(torch.from_numpy(x).view(5, 7)) @ start[1:]
+        moved = sim3_exp(torch.from_numpy(x).view(3, 7)) @ start[1:]
         S = torch.cat((start[:1], moved))
         i, j = graph.edges.unbind(-1)
         e = sim3_log(S[j] @ sim3_inverse(S[i]) @ sim3_inverse(graph.S_ji[0])) / SIGMAS
@@ -260,11 +260,11 @@ def test_optimum_of_scipy(kernel: str) -> None:
         return e.flatten().numpy()
 
     found = optimize.least_squares(
-        errors, torch.zeros(35).double().numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-12
+        errors, torch.zeros(21).double().numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-12
     )
     solution = pose_graph_optimize(graph, kernel=kernel, scale=2.0, **CONVERGED)
     assert float(solution.cost) == pytest.approx(found.cost, rel=1e-8)
-    expected = sim3_exp(torch.from_numpy(found.x).view(5, 7)) @ start[1:]
+    expected = sim3_exp(torch.from_numpy(found.x).view(3, 7)) @ start[1:]
     torch.testing.assert_close(solution.S_cw[0, 1:], expected, rtol=0, atol=1e-5)
 
 
