@@ -41,6 +41,7 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 	$(BIN)/python -m experiments.benchmarks.features
 	$(BIN)/python -m experiments.benchmarks.geometry
 	$(BIN)/python -m experiments.benchmarks.solvers
+	$(BIN)/python -m experiments.benchmarks.pose_graph
 
 clean:  ## remove results and caches, keep the environment
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -34,6 +34,8 @@ from torchslam.geometry.lie import (
     sim3_adjoint,
     sim3_exp,
     sim3_inverse,
+    sim3_left_jacobian,
+    sim3_left_jacobian_inverse,
     sim3_log,
     sim3_scale,
     skew,
@@ -45,6 +47,7 @@ from torchslam.geometry.lie import (
 )
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
+from torchslam.geometry.similarity import Similarity, estimate_similarity
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -60,6 +63,7 @@ __all__ = [
     "Camera",
     "MultiViewTriangulation",
     "RelativePose",
+    "Similarity",
     "Triangulation",
     "correct_matches",
     "decompose_essential",
@@ -67,7 +71,11 @@ __all__ = [
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",
+<<<<<<< HEAD
     "fits",
+=======
+    "estimate_similarity",
+>>>>>>> w-solvers
     "five_point",
     "homography_from_matches",
     "innovation_covariances",
@@ -86,6 +94,8 @@ __all__ = [
     "sim3_adjoint",
     "sim3_exp",
     "sim3_inverse",
+    "sim3_left_jacobian",
+    "sim3_left_jacobian_inverse",
     "sim3_log",
     "sim3_scale",
     "skew",

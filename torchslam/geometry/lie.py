@@ -170,8 +170,17 @@ def se3_interpolate(T_0: Tensor, T_1: Tensor, fraction: Tensor | float) -> Tenso
     return se3_exp(fraction[..., None] * se3_log(T_1 @ se3_inverse(T_0))) @ T_0
 
 
+def _integration_matrix(nodes: np.ndarray) -> np.ndarray:
+    """M with M @ f(nodes) = the integrals of f from 0 to each node, for nodes on [-1, 1] that stand for [0, 1]."""
+    size = len(nodes)
+    primitives = np.polynomial.legendre.legint(np.eye(size), lbnd=-1, scl=0.5)
+    values = np.polynomial.legendre.legval(nodes, primitives).T
+    return values @ np.linalg.inv(np.polynomial.legendre.legvander(nodes, size - 1))
+
+
 # Gauss-Legendre nodes and weights on [0, 1]; 16 of them integrate the scaled rotation below to 1e-15.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_PARTIAL_WEIGHTS = _integration_matrix(_NODES).tolist()
 _NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()
 
 
@@ -228,6 +237,55 @@ def sim3_adjoint(T: Tensor) -> Tensor:
     zero, column = torch.zeros_like(R), torch.zeros_like(t)
     top = torch.cat((sR, skew(t.squeeze(-1)) @ R, -t), dim=-1)
     middle = torch.cat((zero, R, column), dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 6] = 1.0
+    return torch.cat((top, middle, bottom), dim=-2)
+
+
+def sim3_left_jacobian(xi: Tensor) -> Tensor:
+    """J with exp(xi + d) = exp(J d) exp(xi) to first order. (..., 7) -> (..., 7, 7)."""
+    (W, Q, q), rotation = _sim3_left_jacobian_blocks(xi)
+    return _sim3_jacobian_from_blocks(W, Q, -q, rotation)
+
+
+def sim3_left_jacobian_inverse(xi: Tensor) -> Tensor:
+    """Inverse of the left Jacobian, for angles below 2 pi. (..., 7) -> (..., 7, 7)."""
+    (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)
+    rotation = _so3_left_jacobian_inverse(xi[..., 3:6])
+    W = torch.linalg.inv_ex(W)[0]
+    return _sim3_jacobian_from_blocks(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
+
+
+def _sim3_left_jacobian_blocks(xi: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """W, Q, q and the rotation's Jacobian of J = [W Q -q; 0 J_rotation 0; 0 0 1].
+
+    J is the integral over s in [0, 1] of Ad(exp(s xi)), that is, of [e^(s sigma) R(s), t(s)^ R(s), -t(s); ...], where
+    t(s) itself is the integral of e^(u sigma) R(u) rho over u in [0, s]. All by the quadrature of `sim3_exp`, in the
+    coefficients of I, omega^ and omega^ omega^.
+    """
+    rho, omega, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6:]
+    s, weights, partial = (
+        torch.tensor(values, dtype=xi.dtype, device=xi.device)
+        for values in (_NODES, _WEIGHTS, _PARTIAL_WEIGHTS)
+    )
+    a, b, _, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
+    turn = torch.stack((torch.ones_like(a), s * a, s * s * b), dim=-2)
+    grow = turn * (s * sigma).exp()[..., None, :]
+    travelled = weights * (grow @ partial.mT)
+    around = torch.linalg.cross(omega, rho)
+    spanned = torch.stack((rho, around, torch.linalg.cross(omega, around)), dim=-2)
+    moments = (travelled @ turn.mT).mT @ spanned  # of t(s), with the coefficients of R(s)
+
+    S = skew(omega)
+    powers = torch.stack((torch.eye(3, dtype=xi.dtype, device=xi.device).expand_as(S), S, S @ S), dim=-3)
+    W, rotation = (((f @ weights)[..., None, None] * powers).sum(-3) for f in (grow, turn))
+    return (W, (skew(moments) @ powers).sum(-3), moments[..., 0, :]), rotation
+
+
+def _sim3_jacobian_from_blocks(W: Tensor, Q: Tensor, q: Tensor, rotation: Tensor) -> Tensor:
+    """[W Q q; 0 rotation 0; 0 0 1]. (..., 3, 3), (..., 3, 3), (..., 3), (..., 3, 3) -> (..., 7, 7)."""
+    top = torch.cat((W, Q, q[..., None]), dim=-1)
+    middle = torch.nn.functional.pad(rotation, (3, 1))
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 6] = 1.0
     return torch.cat((top, middle, bottom), dim=-2)

@@ -1,7 +1,8 @@
-"""Differentiable least squares: refinement of poses and of maps, robust, batched, with right gradients."""
+"""Differentiable least squares: poses, maps and pose graphs refined, robust, batched, with right gradients."""
 
 from torchslam.solvers.bundle import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.solvers.pose import RefinedPose, refine_pose
+from torchslam.solvers.pose_graph import PoseGraph, PoseGraphSolution, pose_graph_optimize
 from torchslam.solvers.prior import PosePrior
 from torchslam.solvers.schur import Marginals
 
@@ -9,8 +10,11 @@ __all__ = [
     "BundleProblem",
     "BundleSolution",
     "Marginals",
+    "PoseGraph",
+    "PoseGraphSolution",
     "PosePrior",
     "RefinedPose",
     "bundle_adjust",
+    "pose_graph_optimize",
     "refine_pose",
 ]

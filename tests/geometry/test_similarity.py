@@ -1,0 +1,290 @@
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+from geometry_scenes import CAMERA, rotation_error
+from torch import Tensor
+
+from torchslam.geometry import (
+    Camera,
+    estimate_similarity,
+    sim3_exp,
+    sim3_inverse,
+    sim3_scale,
+    transform,
+    umeyama,
+)
+from torchslam.geometry.similarity import _inverse, _Problem, _View
+
+RADIAL = Camera.radial_tangential(500.0, 520.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
+FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The arguments of `estimate_similarity`, the answer (1, 4, 4), and the right pairs (1, N)."""
+
+    points_1: Tensor
+    points_2: Tensor
+    pixels_1: Tensor
+    pixels_2: Tensor
+    S_21: Tensor
+    right: Tensor
+
+    def inputs(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.points_1, self.points_2, self.pixels_1, self.pixels_2
+
+
+def make_pairs(
+    seed: int,
+    count: int = 120,
+    outliers: float = 0.3,
+    noise: float = 0.5,
+    log_scale: float = 0.6,
+    baseline: float = 0.8,
+    camera_1: Camera = CAMERA,
+    camera_2: Camera = CAMERA,
+) -> Pairs:
+    """Points seen by two cameras whose maps differ in scale, their depths uncertain by `noise` per cent."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    direction = normal(3) * torch.tensor((1.0, 1.0, 0.3))
+    translation = baseline * math.exp(0.5 * log_scale) * direction / direction.norm()
+    xi = torch.cat((translation, 0.08 * normal(3), torch.tensor((log_scale,))))
+    S_21 = sim3_exp(xi)
+    size = torch.tensor(camera_1.size, dtype=torch.float64)
+    pixels_1 = torch.rand(8 * count, 2, generator=generator, dtype=torch.float64) * size
+    rays = camera_1.unproject(pixels_1)
+    depth = 2 + 4 * torch.rand(8 * count, 1, generator=generator, dtype=torch.float64)
+    points_1 = rays / rays[:, 2:] * depth
+    points_2 = transform(S_21, points_1)
+    pixels_2, valid = camera_2.project(points_2)
+    rows = (valid & camera_2.in_image(pixels_2)).nonzero().squeeze(-1)[:count]
+    points_1, points_2, pixels_1, pixels_2 = (x[rows] for x in (points_1, points_2, pixels_1, pixels_2))
+    wrong = torch.arange(count) < int(outliers * count)
+    order = torch.cat((torch.arange(count)[wrong].roll(1), torch.arange(count)[~wrong]))
+    points_2, pixels_2 = points_2[order], pixels_2[order]
+    pixels_1, pixels_2 = pixels_1 + noise * normal(count, 2), pixels_2 + noise * normal(count, 2)
+    points_1, points_2 = (x * (1 + 0.01 * noise * normal(count, 1)) for x in (points_1, points_2))
+    tensors = (points_1, points_2, pixels_1, pixels_2, S_21, ~wrong)
+    return Pairs(*(x[None] for x in tensors))
+
+
+def check(S_21: Tensor, truth: Tensor, degrees: float = 0.3, length: float = 0.03) -> None:
+    scales = sim3_scale(S_21), sim3_scale(truth)
+    assert float((scales[0] / scales[1]).log().abs().max()) < 0.01
+    R, R_true = (S[:, :3, :3] / s[:, None, None] for S, s in zip((S_21, truth), scales, strict=True))
+    assert rotation_error(R, R_true) < degrees
+    assert float((S_21 - truth)[:, :3, 3].norm(dim=-1).max()) < length * float(scales[1].max())
+
+
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
+def test_finds_the_similarity_among_wrong_pairs(camera: Camera, outliers: float) -> None:
+    for seed in range(4):
+        pairs = make_pairs(seed, outliers=outliers, camera_1=camera)
+        result = estimate_similarity(*pairs.inputs(), camera, CAMERA)
+        assert result.success.all()
+        check(result.S_21, pairs.S_21)
+        assert float((result.inliers == pairs.right).double().mean()) > 0.95
+
+
+@pytest.mark.parametrize("log_scale", [-2.0, 0.0, 2.0])
+def test_exact_data_give_the_exact_similarity(log_scale: float) -> None:
+    pairs = make_pairs(0, outliers=0.2, noise=0.0, log_scale=log_scale, camera_2=RADIAL)
+    result = estimate_similarity(*pairs.inputs(), CAMERA, RADIAL)
+    torch.testing.assert_close(result.S_21, pairs.S_21, atol=1e-8, rtol=0)
+    assert torch.equal(result.inliers, pairs.right)
+    assert float(result.score) == pytest.approx(int(pairs.right.sum()))
+
+
+def test_without_scale() -> None:
+    pairs = make_pairs(1, log_scale=0.0)
+    result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA, with_scale=False)
+    assert result.success.all()
+    torch.testing.assert_close(sim3_scale(result.S_21), torch.ones(1).double(), atol=1e-12, rtol=0)
+    check(result.S_21, pairs.S_21)
+    wrong_scale = make_pairs(1, log_scale=0.6)
+    free = estimate_similarity(*wrong_scale.inputs(), CAMERA, CAMERA)
+    fixed = estimate_similarity(*wrong_scale.inputs(), CAMERA, CAMERA, with_scale=False)
+    assert fixed.score < 0.5 * free.score
+
+
+def test_an_inlier_fits_in_both_images() -> None:
+    """Points too near in one of the maps, on the same ray there, fit in that image alone."""
+    pairs = make_pairs(2, outliers=0.0, noise=0.0)
+    for side in (0, 1):
+        inputs = list(pairs.inputs())
+        inputs[side] = inputs[side].clone()
+        inputs[side][:, :20] *= 0.5
+        result = estimate_similarity(*inputs, CAMERA, CAMERA)
+        assert result.success.all()
+        assert not result.inliers[:, :20].any()
+        assert result.inliers[:, 20:].all()
+        torch.testing.assert_close(result.S_21, pairs.S_21, atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("log_scale", [-1.5, 0.0, 1.5])
+def test_scale_where_both_cameras_are_at_one_place(log_scale: float) -> None:
+    """Where no pixel depends on it."""
+    for seed in range(4):
+        pairs = make_pairs(seed, log_scale=log_scale, baseline=0.0)
+        result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA)
+        assert result.success.all()
+        check(result.S_21, pairs.S_21)
+
+
+def test_errors_count_in_their_standard_deviations() -> None:
+    """The threshold follows sigma, in each image by itself."""
+    pairs = make_pairs(3, outliers=0.0, noise=0.0)
+    ones = torch.ones_like(pairs.right, dtype=torch.float64)
+    for side, name in ((2, "sigmas_1"), (3, "sigmas_2")):
+        inputs = list(pairs.inputs())
+        inputs[side] = inputs[side].clone()
+        inputs[side][:, :10, 0] += 4.0
+        sigmas = ones.clone()
+        sigmas[:, :5] = 2.0  # of these 4 pixels are two, of the next five rows four
+        result = estimate_similarity(*inputs, CAMERA, CAMERA, **{name: sigmas})
+        assert result.inliers[0, :10].tolist() == [True] * 5 + [False] * 5
+        assert result.inliers[:, 10:].all()
+        wide = estimate_similarity(*inputs, CAMERA, CAMERA, threshold=5.0, **{name: sigmas})
+        assert wide.inliers.all()
+
+
+def test_the_refinement_beats_the_alignment_of_points() -> None:
+    """Depths are far less certain than pixels, which `umeyama` does not know."""
+    ours, theirs = [], []
+    for seed in range(10):
+        pairs = make_pairs(seed, outliers=0.0, noise=1.0)
+        result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA)
+        _, R, _ = umeyama(pairs.points_1, pairs.points_2)
+        R_true = pairs.S_21[:, :3, :3] / sim3_scale(pairs.S_21)[:, None, None]
+        found = result.S_21[:, :3, :3] / sim3_scale(result.S_21)[:, None, None]
+        ours.append(rotation_error(found, R_true))
+        theirs.append(rotation_error(R, R_true))
+        check(result.S_21, pairs.S_21, degrees=0.5, length=0.1)
+    assert sum(ours) < sum(theirs)
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+def test_the_fit_is_a_minimum_of_both_errors(with_scale: bool) -> None:
+    pairs = make_pairs(4, outliers=0.0, camera_1=RADIAL)
+    views = (
+        _View.of(pairs.points_1, pairs.pixels_2, torch.ones(1, 120).double(), CAMERA, 3.0),
+        _View.of(pairs.points_2, pairs.pixels_1, torch.ones(1, 120).double(), RADIAL, 3.0),
+    )
+    start = pairs.S_21[:, :3] if with_scale else sim3_exp(torch.zeros(1, 7).double())[:, :3]
+    P, cost = _Problem(*views, pairs.right, with_scale, 0.3).fit(start, 100, 1e6)
+    dims = 7 if with_scale else 6
+
+    def error(xi: Tensor) -> Tensor:
+        S = sim3_exp(torch.nn.functional.pad(xi, (0, 7 - dims))) @ torch.nn.functional.pad(
+            P, (0, 0, 0, 1)
+        ).index_put((torch.tensor(0), torch.tensor(3), torch.tensor(3)), torch.ones(()).double())
+        there = CAMERA.project(transform(S, pairs.points_1))[0] - pairs.pixels_2
+        back = RADIAL.project(transform(sim3_inverse(S), pairs.points_2))[0] - pairs.pixels_1
+        deeper = (transform(S, pairs.points_1)[..., 2] / pairs.points_2[..., 2]).log() / 0.1
+        return 0.5 * sum(x.square().sum() for x in (there, back, deeper)) / 9
+
+    xi = torch.zeros(1, dims, dtype=torch.float64, requires_grad=True)
+    value = error(xi)
+    torch.testing.assert_close(value.detach(), cost[0])
+    (gradient,) = torch.autograd.grad(value, xi)
+    assert gradient.abs().max() < 1e-6 * value
+    torch.testing.assert_close(
+        (_inverse(P)[..., :3] @ P[..., :3]), torch.eye(3).double()[None], atol=1e-12, rtol=0
+    )
+
+
+def test_a_batch_holds_independent_problems() -> None:
+    """Good, masked, with NaN rows, too few, on a line, pure noise, sigmas that are none, nothing."""
+    pairs = make_pairs(5)
+    points_1, points_2, pixels_1, pixels_2 = (x.repeat(8, 1, 1) for x in pairs.inputs())
+    mask = torch.ones(8, 120, dtype=torch.bool)
+    sigmas = torch.ones(8, 120, dtype=torch.float64)
+    mask[1, 40:60] = False
+    points_1[1, 40:60], pixels_2[1, 45:50] = 1e12, torch.inf
+    points_2[2, ::7], pixels_1[2, 1::7], sigmas[2, 2::7] = torch.nan, torch.inf, 0.0
+    mask[3, 39:] = False  # three right pairs
+    line = torch.linspace(0, 1, 120, dtype=torch.float64)[:, None] * torch.tensor((1.0, 0.5, 2.0)).double()
+    points_1[4] = torch.tensor((-0.5, 0.2, 2.0)) + line
+    points_2[4] = transform(pairs.S_21[0], points_1[4])
+    pixels_1[4], pixels_2[4] = CAMERA.project(points_1[4])[0], CAMERA.project(points_2[4])[0]
+    order = torch.randperm(120, generator=torch.Generator().manual_seed(0))
+    points_2[5], pixels_2[5] = points_2[5, order], pixels_2[5, order]
+    sigmas[6] = -1.0
+    mask[7] = False
+    result = estimate_similarity(
+        points_1, points_2, pixels_1, pixels_2, CAMERA, CAMERA, sigmas_1=sigmas, mask=mask
+    )
+    assert result.success.tolist() == [True] * 3 + [False] * 5
+    for tensor in (result.S_21, result.score):
+        assert torch.isfinite(tensor).all()
+    assert not result.inliers[~result.success].any()
+    assert not (result.inliers & ~mask).any()
+    check(result.S_21[:3], pairs.S_21.expand(3, 4, 4))
+    torch.testing.assert_close(result.S_21[3:], torch.eye(4).double().expand(5, 4, 4))
+
+
+def test_pure_noise_is_never_a_success() -> None:
+    generator = torch.Generator().manual_seed(0)
+    count = torch.tensor((640.0, 480.0), dtype=torch.float64)
+    pixels = torch.rand(2, 20, 60, 2, generator=generator, dtype=torch.float64) * count
+    rays = CAMERA.unproject(pixels)
+    points = rays * (2 + 4 * torch.rand(2, 20, 60, 1, generator=generator, dtype=torch.float64))
+    result = estimate_similarity(*points, *pixels, CAMERA, CAMERA, max_samples=500)
+    assert not result.success.any()
+
+
+def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
+    problems = [make_pairs(seed) for seed in range(4)]
+    inputs = [torch.cat(part) for part in zip(*(problem.inputs() for problem in problems), strict=True)]
+    batch, again = (estimate_similarity(*inputs, CAMERA, CAMERA, seed=7) for _ in range(2))
+    assert torch.equal(batch.S_21, again.S_21)
+    single = torch.cat([estimate_similarity(*problem.inputs(), CAMERA, CAMERA).S_21 for problem in problems])
+    torch.testing.assert_close(
+        batch.S_21, single, atol=5e-3, rtol=0
+    )  # other samples, nearly the same inliers
+
+
+def test_a_camera_for_each_problem() -> None:
+    problems = [make_pairs(seed) for seed in range(2)]
+    inputs = [torch.cat(part) for part in zip(*(problem.inputs() for problem in problems), strict=True)]
+    cameras = CAMERA.with_params(CAMERA.params.expand(2, -1))
+    together = estimate_similarity(*inputs, cameras, cameras)
+    torch.testing.assert_close(together.S_21, estimate_similarity(*inputs, CAMERA, CAMERA).S_21)
+
+
+def test_result_is_detached() -> None:
+    inputs = [x.requires_grad_() for x in make_pairs(0).inputs()]
+    assert not estimate_similarity(*inputs, CAMERA, CAMERA).S_21.requires_grad
+
+
+def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
+    pairs = make_pairs(6)
+    camera = CAMERA.to(device).to(dtype)
+    result = estimate_similarity(*(x.to(device, dtype) for x in pairs.inputs()), camera, camera)
+    assert (result.S_21.dtype, result.S_21.device.type) == (dtype, device.type)
+    assert result.success.all()
+    check(result.S_21.cpu().double(), pairs.S_21)
+
+
+def test_wrong_shapes_are_named() -> None:
+    points, pixels = torch.zeros(1, 5, 3), torch.zeros(1, 5, 2)
+    with pytest.raises(ValueError, match=r"\(B, N, 3\)"):
+        estimate_similarity(points, points, pixels, pixels[:, 1:], CAMERA, CAMERA)
+
+
+def test_an_empty_batch_or_no_points() -> None:
+    for batch, count in ((0, 10), (2, 0), (2, 2)):
+        points, pixels = torch.zeros(batch, count, 3), torch.zeros(batch, count, 2)
+        result = estimate_similarity(points, points, pixels, pixels, CAMERA, CAMERA)
+        assert result.S_21.shape == (batch, 4, 4)
+        assert result.inliers.shape == (batch, count)
+        assert not result.success.any()

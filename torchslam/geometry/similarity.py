@@ -1,0 +1,300 @@
+"""The similarity between two maps, from pairs of points in the coordinates of two cameras, some of them wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.alignment import umeyama
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.least_squares import State, minimize, small_rotation
+from torchslam.geometry.lie import rigid, transform
+from torchslam.geometry.projections import squared_projections
+from torchslam.geometry.ransac import (
+    SUPPORT_WIDTH,
+    best_models,
+    gather_rows,
+    is_significant,
+    sample_minimal,
+    search,
+    truncated_rows,
+    truncated_score,
+)
+
+# 99 % of two-dimensional normal errors are smaller than this many standard deviations.
+_THRESHOLD = 3.035
+_DEPTH_SIGMA = 0.1
+_SAMPLE = 3  # pairs that fix a similarity
+_FIRST_ROUND = 160  # samples
+_CANDIDATES = 2  # hypotheses of each round that are optimised
+_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
+_FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Similarities between the coordinates of B pairs of cameras.
+
+    S_21:    (B, 4, 4) from camera 1 to camera 2; the identity where nothing was found
+    inliers: (B, N) pairs of points within the threshold of their pixels in both images
+    success: (B,) the inliers are no accident, and not all on one line
+    score:   (B,) sum over the pairs of 1 - min((larger error / threshold)^2, 1)
+    """
+
+    S_21: Tensor
+    inliers: Tensor
+    success: Tensor
+    score: Tensor
+
+
+def estimate_similarity(
+    points_1: Tensor,
+    points_2: Tensor,
+    pixels_1: Tensor,
+    pixels_2: Tensor,
+    camera_1: Camera,
+    camera_2: Camera,
+    sigmas_1: Tensor | None = None,
+    sigmas_2: Tensor | None = None,
+    threshold: float = _THRESHOLD,
+    depth_sigma: float = _DEPTH_SIGMA,
+    mask: Tensor | None = None,
+    seed: int = 0,
+    with_scale: bool = True,
+    confidence: float = 0.9999,
+    max_samples: int = 3000,
+) -> Similarity:
+    """Similarities of B pairs of cameras by RANSAC over three pairs of points, refined in the pixels of both images.
+
+    points_1, points_2: (B, N, 3) the same points in the coordinates of camera 1, and of camera 2
+    pixels_1, pixels_2: (B, N, 2) where the cameras saw them
+    sigmas_1, sigmas_2: (B, N) standard deviations of these in pixels, one if None
+    threshold:          reprojection error of an inlier, in standard deviations: of the points of camera 1, moved by
+                        S_21, in image 2, and of those of camera 2, moved by its inverse, in image 1
+    depth_sigma:        relative standard deviation of the depths in camera 2. Where both cameras are at one place, as
+                        where a loop closes, pixels do not depend on the scale; there depths tell it.
+    mask:               (B, N), rows outside it, that are not finite, behind their camera, or with a sigma not above
+                        zero, are ignored
+    with_scale:         if not, the scale is one
+
+    The same arguments and seed give the same result, which is detached. Too few pairs, points on a line, or pure noise
+    give `success` False for that pair of cameras. Raises ValueError for shapes that do not fit.
+    Sources: Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; Mur-Artal et al.,
+    "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, section VII-B; for the minimal solution `umeyama`.
+    """
+    shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
+    if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):
+        shapes = ", ".join(str(tuple(x.shape)) for x in given)
+        raise ValueError(f"points must be (B, N, 3) and pixels (B, N, 2), not {shapes}")
+    sigmas = tuple(torch.ones_like(points_1[..., 0]) if s is None else s for s in (sigmas_1, sigmas_2))
+    positive = torch.stack((points_1[..., 2], points_2[..., 2], *sigmas), dim=-1)
+    use = (positive > 0).all(-1) & torch.isfinite(torch.cat((*given, positive), dim=-1)).all(-1)
+    use = use if mask is None else use & mask
+    B, N = shape
+    if B == 0 or N < _SAMPLE:
+        S_21 = torch.eye(4, dtype=points_1.dtype, device=points_1.device).expand(B, 4, 4)
+        return Similarity(S_21, torch.zeros_like(use), torch.zeros_like(S_21[:, 0, 0]) > 0, S_21[:, 0, 1])
+    points_1, points_2, pixels_1, pixels_2 = (torch.where(use[..., None], x, 0.0).detach() for x in given)
+    sigmas = tuple(torch.where(use, sigma, 1.0).detach() for sigma in sigmas)
+    with torch.inference_mode():  # less work per operation than without gradients only
+        forward = _View.of(points_1, pixels_2, sigmas[1], camera_2, threshold)
+        backward = _View.of(points_2, pixels_1, sigmas[0], camera_1, threshold)
+        problem = _Problem(forward, backward, use, with_scale, threshold * depth_sigma)
+        results = problem.solve(seed, confidence, max_samples)
+    S_21, success, squared, score = (result.clone() for result in results)  # fit for graphs
+    return Similarity(S_21, (squared < 1) & use & success[:, None], success, score)
+
+
+@dataclass(frozen=True)
+class _View:
+    """One direction: points of the other camera, (B, N, 3), and where this one saw them, pixels (B, N, 2).
+
+    sigmas: (B, N) thresholds in pixels; normalized: (B, N, 2) undistorted; scale: (B, N, 2) thresholds per unit of it
+    """
+
+    points: Tensor
+    pixels: Tensor
+    sigmas: Tensor
+    camera: Camera
+    normalized: Tensor
+    scale: Tensor
+
+    @staticmethod
+    def of(points: Tensor, pixels: Tensor, sigmas: Tensor, camera: Camera, threshold: float) -> _View:
+        camera = camera.with_params(camera.params.detach().expand(len(points), -1))
+        normalized, sigmas = camera.normalize(pixels), threshold * sigmas
+        return _View(
+            points, pixels, sigmas, camera, normalized, camera.pixel_scale(normalized) / sigmas[..., None]
+        )
+
+    def select(self, rows: Tensor) -> _View:
+        """Some of the problems."""
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
+        return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
+
+    def undistorted_errors(self, P: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Squared errors of many mappings (B, M, 3, 4) in thresholds; infinite or NaN behind. (B, M, N)."""
+        points, x, scale = self.points, self.normalized, self.scale
+        if rows is not None:
+            points, x, scale = (gather_rows(values, rows) for values in (points, x, scale))
+        homogeneous = torch.nn.functional.pad(points, (0, 1), value=1.0).mT
+        return squared_projections(P, homogeneous.to(P.dtype), x.to(P.dtype), scale)
+
+    def residuals(self, P: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One mapping (B, 3, 4) each, through the distortion: moved points (B, N, 3), residuals (B, N, 2) in
+        thresholds and their derivatives (B, N, 2, 3) in the moved points, and validity (B, N).
+        """
+        moved = transform(P, self.points)
+        projected, valid, J = self.camera.project_with_point_jacobians(moved)
+        inverse = 1 / self.sigmas[..., None]
+        return moved, (projected - self.pixels) * inverse, J * inverse[..., None], valid
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The data of the search: camera 1's points in camera 2, and the reverse; mask (B, N).
+
+    depth_sigma: threshold of relative differences in depth
+    """
+
+    forward: _View
+    backward: _View
+    mask: Tensor
+    with_scale: bool
+    depth_sigma: float
+
+    def select(self, rows: Tensor) -> _Problem:
+        """Some of the problems."""
+        forward, backward = self.forward.select(rows), self.backward.select(rows)
+        return replace(self, forward=forward, backward=backward, mask=self.mask[rows])
+
+    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """S_21 (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+        generator = torch.Generator().manual_seed(seed)
+        (P,) = search(
+            lambda rows, count: self.select(rows).propose(count, generator),
+            self.mask.sum(-1),
+            _SAMPLE,
+            confidence,
+            _FIRST_ROUND,
+            max_samples,
+        )
+        P, _ = self.fit(P, _FINAL_ITERATIONS, _FINAL_WIDTH)
+        squared = self.larger_errors(P)
+        success = self.is_success((squared < 1) & self.mask)
+        score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+        eye = torch.eye(4, dtype=P.dtype, device=P.device)
+        S_21 = torch.where(success[:, None, None], rigid(P[..., :3], P[..., 3]), eye)
+        return S_21, success, squared, score
+
+    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
+        """The best similarity from `count` minimal samples, locally optimised, its score and its support."""
+        sample = sample_minimal(self.mask, _SAMPLE, count, generator)
+        source, target = (gather_rows(view.points, sample) for view in (self.forward, self.backward))
+        scale, R, t = umeyama(source, target, with_scale=self.with_scale)
+        P = torch.cat((scale[..., None, None] * R, t[..., None]), dim=-1).flatten(2)
+        valid = torch.isfinite(P).all(-1) & (scale > torch.finfo(P.dtype).eps)
+        best = best_models(self.score, P, valid, self.mask, _CANDIDATES, generator)
+        # Samples of equal points have no scale; what stands in for them is finite.
+        safe = torch.eye(3, 4, dtype=P.dtype, device=P.device).flatten()
+        P = gather_rows(torch.where(valid[..., None], P, safe), best).flatten(0, 1).unflatten(-1, (3, 4))
+        rows = torch.arange(len(self.mask), device=P.device)
+        each = self.select(rows.repeat_interleave(_CANDIDATES))
+        P, cost = each.fit(P, _LOCAL_ITERATIONS, 1.0)
+        cost, best = cost.unflatten(0, (-1, _CANDIDATES)).nan_to_num(torch.inf).min(dim=1)
+        P = P.unflatten(0, (-1, _CANDIDATES))[rows, best]
+        near = (self.larger_errors(P) < SUPPORT_WIDTH**2) & self.mask
+        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
+
+    def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
+        """Truncated scores of many similarities on some of the pairs, or all, in float32. (B, M, 12) -> (B, M)."""
+        P = P.unflatten(-1, (3, 4))
+        mask = self.mask if rows is None else self.mask.gather(1, rows)
+        there = self.forward.undistorted_errors(P.float(), rows)
+        back = self.backward.undistorted_errors(_inverse(P).float(), rows)
+        return truncated_score(torch.maximum(there, back), mask)
+
+    def larger_errors(self, P: Tensor) -> Tensor:
+        """The larger of both squared errors in thresholds; infinite where a point cannot be seen. (B, N)."""
+        squared = []
+        for view, mapping in ((self.forward, P), (self.backward, _inverse(P))):
+            _, residual, _, valid = view.residuals(mapping)
+            squared.append(residual.square().sum(-1).masked_fill(~valid, torch.inf))
+        return torch.maximum(*squared).nan_to_num(torch.inf)
+
+    def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
+        """Similarities (B, 3, 4) of least truncated squared error in both images and in depth, and their costs (B,)."""
+        dims = 7 if self.with_scale else 6
+
+        def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
+            inverse = _inverse(P)
+            moved, there, J, valid = self.forward.residuals(P)
+            _, back, J_back, valid_back = self.backward.residuals(inverse)
+            deeper, J_deeper = self.depths(moved)
+            # Moving S from the left moves the points of camera 2 against it before the inverse maps them.
+            slopes = (
+                _chain(torch.cat((J, J_deeper), dim=-2), moved),
+                -_chain(J_back @ inverse[:, None, :, :3], self.backward.points),
+            )
+            residual = torch.cat((there, deeper, back), dim=-1)
+            squared = 0.5 * residual.square().sum(-1)  # as large as in each image, where both are alike
+            squared = squared.masked_fill(~(valid & valid_back), torch.inf)
+            used, cost = truncated_rows(squared[:, None], self.mask, width)
+            rows = torch.cat((torch.cat(slopes, dim=-2)[..., :dims], residual[..., None]), dim=-1)
+            rows = torch.where(used[:, 0, :, None, None], rows, 0.0).flatten(1, 2)
+            return 0.5 * torch.bmm(rows.mT, rows), cost[:, 0]
+
+        (P,), cost = minimize((P,), evaluate, _retract, iterations)
+        return P, cost
+
+    def depths(self, moved: Tensor) -> tuple[Tensor, Tensor]:
+        """Differences (B, N, 1) of the logarithms of depths in camera 2, in thresholds, and their derivatives
+        (B, N, 1, 3) in the moved points (B, N, 3); zero where a depth is not positive.
+        """
+        front = (moved[..., 2:] > 0) & (self.backward.points[..., 2:] > 0)
+        depth, known = (torch.where(front, x[..., 2:], 1.0) for x in (moved, self.backward.points))
+        slope = torch.where(front, 1 / (self.depth_sigma * depth), 0.0)
+        return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
+
+    def is_success(self, inliers: Tensor) -> Tensor:
+        """Whether the inliers are no accident, and fix the similarity: four or more, not on one line. (B,)."""
+        weights = inliers[..., None].to(self.forward.points.dtype)
+        count = self.mask.sum(-1)
+        # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.
+        areas = [
+            (view.sigmas.square() * self.mask).sum(-1) * math.pi / (view.camera.width * view.camera.height)
+            for view in (self.forward, self.backward)
+        ]
+        chance = torch.maximum(*areas).double() / count.clamp_min(1)
+        success = is_significant(inliers.sum(-1), count, _SAMPLE, chance, solutions=1)
+        for view in (self.forward, self.backward):
+            mean = (weights * view.points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
+            centred = weights * (view.points - mean)
+            spread = torch.linalg.eigvalsh(centred.mT @ centred)
+            success = success & (spread[:, 1] > 1e-6 * spread[:, 2])
+        return success
+
+
+def _inverse(P: Tensor) -> Tensor:
+    """Inverse of similarities [sR t]. (..., 3, 4) -> (..., 3, 4)."""
+    linear = P[..., :3].mT / P[..., :1, :3].square().sum(-1, keepdim=True)
+    return torch.cat((linear, -linear @ P[..., 3:]), dim=-1)
+
+
+def _chain(J: Tensor, points: Tensor) -> Tensor:
+    """Derivatives in [rho, omega, sigma] of what depends on points by J. (..., R, 3), (..., 3) -> (..., R, 7)."""
+    rotation = torch.linalg.cross(points[..., None, :].expand_as(J), J, dim=-1)
+    return torch.cat((J, rotation, J @ points[..., None]), dim=-1)
+
+
+def _retract(P: State, step: Tensor) -> State:
+    """Moves [sR t] by [rho, omega] or [rho, omega, sigma] from the left. (B, 3, 4), (B, 6 or 7)."""
+    turn = small_rotation(step[:, 3:6])
+    if step.shape[-1] == 7:
+        turn = turn * step[:, 6, None, None].exp()
+    return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, P[0]),)
