@@ -71,11 +71,8 @@ __all__ = [
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",
-<<<<<<< HEAD
-    "fits",
-=======
     "estimate_similarity",
->>>>>>> w-solvers
+    "fits",
     "five_point",
     "homography_from_matches",
     "innovation_covariances",
