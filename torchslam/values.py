@@ -153,6 +153,8 @@ class Tracked:
     matches:     how many matches the inliers were chosen from
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
     depth:       median depth of the points it sees
+    error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
+    coverage:    share of the image in which the points that were expected are found
     """
 
     T_cw: Tensor
@@ -161,6 +163,8 @@ class Tracked:
     matches: int
     covariance: Tensor
     depth: float
+    error: float
+    coverage: float
 
     @property
     def inliers(self) -> int:

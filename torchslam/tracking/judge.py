@@ -20,6 +20,10 @@ def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeCo
     share = tracked.inliers / max(tracked.matches, 1)
     if share < settings.min_inlier_share:
         return f"only {share:.0%} of {tracked.matches} matches agree with the pose"
+    if tracked.error > settings.max_error:
+        return f"the matches are off by {tracked.error**0.5:.1f} times their noise in the median"
+    if tracked.coverage < settings.min_coverage:
+        return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     position, rotation = deviations(tracked)
     if position > settings.max_position_std:
         return f"the position is known to {position:.3f} of the scene's depth"

@@ -27,6 +27,11 @@ from torchslam.world.map import Map
 from torchslam.world.track import Track
 from torchslam.world.world import World
 
+FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
+CELLS = (8, 6)  # the image as a grid, for what should be spread over it
+PER_CELL = 5  # matches of a cell that RANSAC hears
+MATURE = 3  # frames that found a point, before it is expected to be found
+
 
 class Tracker:
     """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
@@ -123,9 +128,12 @@ class Tracker:
         settings = self.settings
         if len(point_ids) < settings.min_matches:
             return None
+        chosen = spread(
+            view.keypoints[keypoints], slam_map.points["times_found"][point_ids], self.camera.size
+        )
         pose = estimate_absolute_pose(
-            slam_map.positions_w[point_ids][None],
-            view.keypoints[keypoints][None],
+            slam_map.positions_w[point_ids[chosen]][None],
+            view.keypoints[keypoints[chosen]][None],
             self.camera,
             threshold=settings.threshold_px,
             seed=self.seed,
@@ -138,12 +146,20 @@ class Tracker:
         ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
         if len(ids) < settings.min_inliers:
             return None
-        refined, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
+        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
         if int(inliers.sum()) < settings.min_inliers:
             return None
-        T_cw, ids_seen = refined.T_cw[0], ids[inliers]
-        depth = float(transform(T_cw, slam_map.positions_w[ids_seen])[:, 2].median())
-        tracked = Tracked(T_cw, ids_seen, at[inliers], len(ids), refined.covariance[0], depth)
+        T_cw, seen = refined.T_cw[0], ids[inliers]
+        tracked = Tracked(
+            T_cw,
+            seen,
+            at[inliers],
+            matches=len(ids),
+            covariance=refined.covariance[0],
+            depth=float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()),
+            error=float(errors.median()),
+            coverage=coverage(slam_map, near, seen, self.camera.size),
+        )
         slam_map.points["times_visible"][near.ids] += 1
         return tracked
 
@@ -165,10 +181,14 @@ class Tracker:
 
     def _refine(
         self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
-    ) -> tuple[RefinedPose, Tensor]:
-        """The pose and (n,) who agrees with it: least squares on all matches, then on those that agree."""
+    ) -> tuple[RefinedPose, Tensor, Tensor]:
+        """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
+
+        By least squares on what is not far from agreeing with T_cw, then on what agrees with that.
+        """
         points_w = slam_map.positions_w[ids]
-        mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
+        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
+        mask = fits(errors, scales, FAR * self.measurement.chi_square)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
         for kernel, iterations in passes:
             refined = refine_pose(
@@ -187,7 +207,8 @@ class Tracker:
             mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
                 break
-        return refined, mask
+        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
+        return refined, errors / scales**2, mask
 
     def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
@@ -235,3 +256,41 @@ def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
     counts = torch.bincount(local[local >= 0], minlength=len(slam_map.points))
     seen = table[keyframe]
     return int((counts[seen[seen >= 0]] >= min(3, len(local_keyframes))).sum())
+
+
+def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) int64 number of the cell of the image that pixels (n, 2) lie in."""
+    extent = pixels.new_tensor([size[0], size[1]])
+    grid = pixels.new_tensor(CELLS)
+    column, row = torch.minimum((pixels / extent * grid).clamp(min=0), grid - 1).long().unbind(-1)
+    return row * CELLS[0] + column
+
+
+def spread(pixels: Tensor, worth: Tensor, size: tuple[int, int]) -> Tensor:
+    """(m,) rows of matches (n,): of each cell of the image those of most worth, so that each has about one voice.
+
+    Where one thing with much texture moves before a scene with little, most matches are its.
+    """
+    cell = cells(pixels, size)
+    order = torch.argsort(worth, descending=True, stable=True)
+    order = order[torch.argsort(cell[order], stable=True)]
+    ordered = cell[order]
+    counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
+    rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
+    return torch.sort(order[rank < PER_CELL]).values
+
+
+def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells in which several old points were expected that has at least a fifth of them.
+
+    expected: points that should be in the image; seen: (m,) those of them that are where they should be
+    """
+    mature = slam_map.points["times_found"][expected.ids] >= MATURE
+    cell = cells(expected.pixels[mature], size)
+    count = CELLS[0] * CELLS[1]
+    wanted = torch.bincount(cell, minlength=count)
+    found = torch.bincount(cell[torch.isin(expected.ids[mature], seen)], minlength=count)
+    asked = wanted >= 3
+    if not bool(asked.any()):
+        return 1.0
+    return float((5 * found >= wanted)[asked].double().mean())
