@@ -1,0 +1,7 @@
+"""Places that were seen before: which keyframes look like a frame."""
+
+from __future__ import annotations
+
+from torchslam.loops.places import Places, relative_scores
+
+__all__ = ["Places", "relative_scores"]
