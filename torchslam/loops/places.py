@@ -35,7 +35,9 @@ class Places:
     def __init__(self, words: Tensor | None = None) -> None:
         self._words = words
         self._keys = torch.zeros(0, dtype=torch.int64)  # (slots,) NO_KEY where the slot is free
-        self._codes = torch.zeros(0, 0, dtype=torch.int64)  # (W, slots), the code of each word in each keyframe
+        self._codes = torch.zeros(
+            0, 0, dtype=torch.int64
+        )  # (W, slots), the code of each word in each keyframe
         self._used = torch.zeros(0, 0)  # (W, slots) float32, 1 where the keyframe has the word, else 0
         self._slots: dict[int, int] = {}
 
@@ -93,7 +95,9 @@ class Places:
         slots = {key: slot for key, slot in self._slots.items() if key not in set(old)}
         slots |= {new_key: self._slots[old_key] for old_key, new_key in zip(old, new, strict=True)}
         if len(slots) != len(self._slots) or min(slots, default=0) < 0:
-            raise ValueError("new keys must be at least 0 and differ from each other and from the keys that stay")
+            raise ValueError(
+                "new keys must be at least 0 and differ from each other and from the keys that stay"
+            )
         self._slots = slots
         self._keys[list(slots.values())] = self._keys.new_tensor(list(slots))
 
@@ -108,16 +112,15 @@ class Places:
             return self.keys, torch.zeros(len(self), device=self._keys.device)
         used, codes = words_and_codes(_strongest(descriptors, mask), self._words)
         size = len(self._keys)
-        present = self._used[:, :size]
         # A word that no keyframe has yet is taken to be as rare as one that a single one has.
-        rarity = torch.log((len(self) + 1) / present.sum(1).clamp(min=1.0)).square()
-        shared = present.new_zeros(size)
+        rarity = torch.log((len(self) + 1) / self._used.sum(1).clamp(min=1.0)).square()
+        shared = self._used.new_zeros(size)
         for rows in torch.arange(len(used), device=used.device).split(max(1, _CHUNK // size)):
             word = used[rows]
-            alike = likeness(self._codes[word, :size], codes[rows, None])
-            shared += rarity[word] @ alike.mul_(present[word])
+            alike = likeness(self._codes.index_select(0, word), codes[rows, None])
+            shared += rarity[word] @ alike.mul_(self._used.index_select(0, word))
         own = rarity[used].sum()
-        scores = shared / (own * (rarity @ present)).sqrt().clamp(min=1e-12)
+        scores = shared / (own * (rarity @ self._used)).sqrt().clamp(min=1e-12)
         return self._ranked(scores)
 
     def _ranked(self, scores: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,7 +141,9 @@ class Places:
         keys = self.keys
         if self._words is None:
             return {"keys": keys}
-        slots = torch.tensor([self._slots[key] for key in keys.tolist()], dtype=torch.int64, device=keys.device)
+        slots = torch.tensor(
+            [self._slots[key] for key in keys.tolist()], dtype=torch.int64, device=keys.device
+        )
         used = self._used[:, slots] > 0
         codes = self._codes[:, slots].masked_fill(~used, 0)
         return {"keys": keys, "words": self._words, "used": used, "codes": codes}
@@ -170,8 +175,8 @@ class Places:
         return int(torch.nonzero(self._keys == NO_KEY)[0, 0])
 
     def _reserve(self, size: int, device: torch.device) -> None:
-        """Room for `size` keyframes; it at least doubles, so that adding one costs the same however many there are."""
-        capacity = max(_FIRST_CAPACITY, size, 2 * len(self._keys))
+        """Room for `size` keyframes; it grows by a quarter at least, so that adding one costs the same on average."""
+        capacity = max(_FIRST_CAPACITY, size, len(self._keys) * 5 // 4)
         self._keys = _widened(self._keys, capacity, NO_KEY, device)
         self._codes = _widened(self._codes, capacity, 0, device)
         self._used = _widened(self._used, capacity, 0, device)
