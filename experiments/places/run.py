@@ -29,8 +29,8 @@ def main() -> None:
     collection = collect()
     features = collection.features
     rows = []
-    for name, scores in ways(features):
-        rows.append([name, *quality(scores(), collection)])
+    for name, way in ways(features):
+        rows.append([name, *quality(way(), collection)])
         print(*rows[-1], sep="\t", flush=True)
     scores = alternatives.places(features, 500)
     neighbour = scores.diagonal(-1).clamp(min=1e-9)
