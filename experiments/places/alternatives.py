@@ -13,7 +13,7 @@ from torchslam.types import Features
 
 
 def places(features: Features, strongest: int, words: Tensor | None = None) -> Tensor:
-    """torchslam.loops, with so many descriptors of each image (at most the 500 it takes)."""
+    """torchslam.loops, with so many descriptors of each image (at most the 400 it takes)."""
     memory, mask = Places(words), features.mask.clone()
     mask[:, strongest:] = False
     for key in range(len(mask)):
@@ -62,7 +62,7 @@ def own_words(features: Features, num_words: int) -> Tensor:
 
 def first_words(features: Features, image: int) -> Tensor:
     """The descriptors of one image as words, as torchslam.loops does for floats."""
-    return features.descriptors[image][features.mask[image]][:500]
+    return features.descriptors[image][features.mask[image]][:400]
 
 
 def _histograms(words: Tensor, mask: Tensor, size: int) -> Tensor:

@@ -35,7 +35,7 @@ def main() -> None:
     for name, way in ways(features):
         rows.append([name, *quality(way(), collection)])
         print(*rows[-1], sep="\t", flush=True)
-    scores = alternatives.places(features, 500)
+    scores = alternatives.places(features, 400)
     neighbour = scores.diagonal(-1).clamp(min=1e-9)
     relative = torch.cat((scores[:1], scores[1:] / neighbour[:, None]))
     rows.append(["taken, relative to the previous image", *quality(relative, collection)])
@@ -57,13 +57,13 @@ def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:
         ("4096 words, tf-idf", lambda: alternatives.bag_of_words(features, k_majority(rendered, 4096, 8))),
         ("32 hash tables of 14 bits", lambda: alternatives.hash_tables(features, 14, 32)),
         ("150 strongest matched", lambda: alternatives.direct(features, 150, 0.85, 64)),
-        ("taken: 1024 words and codes, 500 strongest", lambda: alternatives.places(features, 500)),
-        ("the same, 300 strongest", lambda: alternatives.places(features, 300)),
+        ("taken: 1024 words and codes, 400 strongest", lambda: alternatives.places(features, 400)),
+        ("the same, 200 strongest", lambda: alternatives.places(features, 200)),
         (
             "the same, words of these very images",
-            lambda: alternatives.places(features, 500, alternatives.own_words(features, 1024)),
+            lambda: alternatives.places(features, 400, alternatives.own_words(features, 1024)),
         ),
-        ("the same, words of one image", lambda: alternatives.places(features, 500, one)),
+        ("the same, words of one image", lambda: alternatives.places(features, 400, one)),
     ]
 
 

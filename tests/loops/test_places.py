@@ -131,10 +131,10 @@ def test_only_the_strongest_count() -> None:
     descriptors, mask = image(0, 700)
     first, second = Places(), Places()
     first.add(0, descriptors, mask)
-    second.add(0, descriptors[:500], mask[:500])
+    second.add(0, descriptors[:400], mask[:400])
     assert same_state(first, second)
     third = Places()
-    third.add(0, descriptors[:499], mask[:499])
+    third.add(0, descriptors[:399], mask[:399])
     assert not same_state(first, third)
 
 

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from torchslam.loops.codes import binary, likeness, rendered_words, words_and_codes
 
-STRONGEST = 500  # descriptors of an image that count: as good as all of them, at half the cost
+STRONGEST = (
+    400  # descriptors of an image that count: nearly as good as all of them, at less than half the cost
+)
 NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
@@ -35,9 +37,7 @@ class Places:
     def __init__(self, words: Tensor | None = None) -> None:
         self._words = words
         self._keys = torch.zeros(0, dtype=torch.int64)  # (slots,) NO_KEY where the slot is free
-        self._codes = torch.zeros(
-            0, 0, dtype=torch.int64
-        )  # (W, slots), the code of each word in each keyframe
+        self._codes = torch.zeros(0, 0, dtype=torch.int64)  # (W, slots), of each word in each keyframe
         self._used = torch.zeros(0, 0)  # (W, slots) float32, 1 where the keyframe has the word, else 0
         self._slots: dict[int, int] = {}
 
