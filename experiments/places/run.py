@@ -14,7 +14,7 @@ from experiments.places import alternatives
 from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
-from torchslam.loops import Places
+from torchslam.loops import Places, relative_scores
 from torchslam.loops.codes import rendered_words
 from torchslam.types import Features
 
@@ -36,14 +36,23 @@ def main() -> None:
         rows.append([name, *quality(way(), collection)])
         print(*rows[-1], sep="\t", flush=True)
     scores = alternatives.places(features, 400)
-    neighbour = scores.diagonal(-1).clamp(min=1e-9)
-    relative = torch.cat((scores[:1], scores[1:] / neighbour[:, None]))
+    relative = relative_to_previous(scores, collection)
     rows.append(["taken, relative to the previous image", *quality(relative, collection)])
     cut = len(collection.ranges["lookalike"])
     check = checks(features[:cut], scores[:cut, :cut])
     text = "\n".join([table(HEADER, rows), costs(features), check])
     print(text)
     write_between(Path(__file__).parent / "README.md", text)
+
+
+def relative_to_previous(scores: Tensor, collection: Collection) -> Tensor:
+    """Each row of scores (N, N) as a share of the score with the image before it; zero for first images."""
+    relative = torch.zeros_like(scores)
+    keys = torch.arange(len(scores))
+    for where in collection.ranges.values():
+        for row in where[1:]:
+            relative[row] = relative_scores(keys, scores[row], keys[row - 1 : row])
+    return relative
 
 
 def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:

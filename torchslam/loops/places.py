@@ -20,6 +20,7 @@ STRONGEST = (
 NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
+_LEAST_EXPECTED = 0.02  # images of the same place score 0.05 to 0.2, of different ones less
 _FIRST_CAPACITY = 64
 _MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
 
@@ -187,10 +188,10 @@ def relative_scores(keys: Tensor, scores: Tensor, reference: Tensor) -> Tensor:
 
     The reference are keyframes that show the same place for certain, such as the previous one: their score says what
     to expect here, where an image is dark or its texture repeats (Galvez-Lopez and Tardos: DBoW2, 2012). Zero for all
-    where no reference has a score above zero, since then nothing can be said.
+    where no reference has a score of 0.02, since a share of next to nothing says nothing.
     """
     expected = torch.where(torch.isin(keys, reference), scores, 0.0).amax() if len(keys) > 0 else scores.sum()
-    return torch.where(expected > 0, scores / expected.clamp(min=1e-12), 0.0)
+    return torch.where(expected >= _LEAST_EXPECTED, scores / expected.clamp(min=_LEAST_EXPECTED), 0.0)
 
 
 def _strongest(descriptors: Tensor, mask: Tensor) -> Tensor:
