@@ -108,7 +108,7 @@ class SLAM:
             tracked = self.tracker.track(world, view)
         if tracked is None:
             return self._lose(world, view)
-        doubt = why_doubt(tracked, expected, self.config.judge)
+        doubt = why_doubt(tracked, expected, world.track.error, self.config.judge)
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
@@ -130,6 +130,7 @@ class SLAM:
             keyframe = self.mapper.insert(world.map, view, tracked)
             self._remember(world.map, keyframe)
             self.tracker.follow(world, keyframe)
+        world.map.points["times_found"][tracked.point_ids] += 1
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
@@ -146,6 +147,7 @@ class SLAM:
             return self._result(view, doubt or self.probation.reason, world, tracked)
         held = self.probation.release()
         for earlier in held:
+            world.map.points["times_found"][earlier[1].point_ids] += 1
             world.history.add(*earlier)
         if self.probation.came_back:
             first, located, _, _ = held[0]
@@ -234,6 +236,7 @@ class SLAM:
         tracked = self.tracker.track(world, view)
         if tracked is None:
             return False
+        world.map.points["times_found"][tracked.point_ids] += 1
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return tracked.inliers > 0.5 * tracked.matches
 

@@ -43,7 +43,7 @@ class Relocalizer:
             tracked = self.tracker.locate(
                 world.map, view, self._matches(world.map, keyframe, view), world.map.points_seen_by(near)
             )
-            if tracked is not None and not why_doubt(tracked, None, self.judge):
+            if tracked is not None and not why_doubt(tracked, None, tracked.error, self.judge):
                 return world, tracked
             tried.append((world, near))
         return None

@@ -27,10 +27,11 @@ from torchslam.world.map import Map
 from torchslam.world.track import Track
 from torchslam.world.world import World
 
+ERROR_MEMORY = 0.1  # share of the newest frame in the error of the way: that of the last ten or so
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
 PER_CELL = 5  # matches of a cell that RANSAC hears
-MATURE = 3  # frames that found a point, before it is expected to be found
+SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
 
 
 class Tracker:
@@ -53,7 +54,10 @@ class Tracker:
         T_cw = world.map.T_cw[keyframe]
         seen = world.map.keyframes["point_ids"][keyframe]
         world.track = replace(
-            self._around(world.map, keyframe, T_cw), velocity=world.track.velocity, seen_last=seen[seen >= 0]
+            self._around(world.map, keyframe, T_cw),
+            velocity=world.track.velocity,
+            seen_last=seen[seen >= 0],
+            error=world.track.error,
         )
 
     def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> Track:
@@ -76,6 +80,7 @@ class Tracker:
             seen_last=local_points[:0],
             local_keyframes=local_keyframes,
             local_points=local_points,
+            error=0.0,
         )
 
     def predict(self, world: World) -> Tensor:
@@ -128,9 +133,8 @@ class Tracker:
         settings = self.settings
         if len(point_ids) < settings.min_matches:
             return None
-        chosen = spread(
-            view.keypoints[keypoints], slam_map.points["times_found"][point_ids], self.camera.size
-        )
+        chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
+        chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
         pose = estimate_absolute_pose(
             slam_map.positions_w[point_ids[chosen]][None],
             view.keypoints[keypoints[chosen]][None],
@@ -228,7 +232,7 @@ class Tracker:
         slam_map, track = world.map, world.track
         track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
         track.seen_last = tracked.point_ids
-        slam_map.points["times_found"][tracked.point_ids] += 1
+        track.error += ERROR_MEMORY * (tracked.error - track.error)
         slam_map.points["last_seen"][tracked.point_ids] = view.index
         shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
         best = int(track.local_keyframes[shared.argmax()])
@@ -236,13 +240,15 @@ class Tracker:
             track.T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[best])
         else:
             world.track = replace(
-                self._around(slam_map, best, tracked.T_cw), velocity=track.velocity, seen_last=track.seen_last
+                self._around(slam_map, best, tracked.T_cw),
+                velocity=track.velocity,
+                seen_last=track.seen_last,
+                error=track.error,
             )
 
     def start_at(self, world: World, view: View, tracked: Tracked) -> None:
         """Begin a track anew, wherever in the map: at a frame that was located without one."""
         best = int(world.map.observers(tracked.point_ids).argmax())
-        world.map.points["times_found"][tracked.point_ids] += 1
         world.map.points["last_seen"][tracked.point_ids] = view.index
         world.track = replace(
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
@@ -266,14 +272,22 @@ def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return row * CELLS[0] + column
 
 
-def spread(pixels: Tensor, worth: Tensor, size: tuple[int, int]) -> Tensor:
-    """(m,) rows of matches (n,): of each cell of the image those of most worth, so that each has about one voice.
+def trusted(times_found: Tensor, least: int) -> Tensor:
+    """(m,) rows of matches (n,) with points that many frames have found; all where they are fewer than `least`.
+
+    What moves by itself agrees with the scene for a while at most: its points do not grow old.
+    """
+    old = torch.nonzero(times_found >= SENIOR)[:, 0]
+    return old if len(old) >= least else torch.arange(len(times_found), device=times_found.device)
+
+
+def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(m,) rows of pixels (n, 2), a few of each cell of the image: each cell has a voice.
 
     Where one thing with much texture moves before a scene with little, most matches are its.
     """
     cell = cells(pixels, size)
-    order = torch.argsort(worth, descending=True, stable=True)
-    order = order[torch.argsort(cell[order], stable=True)]
+    order = torch.argsort(cell, stable=True)
     ordered = cell[order]
     counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
     rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
@@ -285,12 +299,12 @@ def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, 
 
     expected: points that should be in the image; seen: (m,) those of them that are where they should be
     """
-    mature = slam_map.points["times_found"][expected.ids] >= MATURE
-    cell = cells(expected.pixels[mature], size)
+    old = slam_map.points["times_found"][expected.ids] >= SENIOR
+    cell = cells(expected.pixels[old], size)
     count = CELLS[0] * CELLS[1]
     wanted = torch.bincount(cell, minlength=count)
-    found = torch.bincount(cell[torch.isin(expected.ids[mature], seen)], minlength=count)
-    asked = wanted >= 3
+    found = torch.bincount(cell[torch.isin(expected.ids[old], seen)], minlength=count)
+    asked = wanted >= 2
     if not bool(asked.any()):
         return 1.0
     return float((5 * found >= wanted)[asked].double().mean())
