@@ -43,7 +43,7 @@ def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
 
 
 def simulated_world(
-    seed: int = 0, frames: int = 13, points: int = 40, number: int = 0, session: int = 0
+    seed: int = 0, frames: int = 14, points: int = 40, number: int = 0, session: int = 0
 ) -> World:
     """Every third frame is a keyframe and sees most of the points; the frames between refer to the one before."""
     generator = torch.Generator().manual_seed(seed)

@@ -49,7 +49,7 @@ def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them
 
 
 def test_a_moved_world_is_as_certain_as_before(world: World) -> None:
-    """Covariances of points by sampling's law R C R^T s^2; those of poses live in the cameras: their unit alone grows."""
+    """Covariances of points turn and grow; those of poses live in the cameras: their unit alone grows."""
     before = copy.deepcopy(world)
     world.move(similarity())
     linear = similarity()[:3, :3]

@@ -14,6 +14,8 @@ from torchslam.stopwatch import Stopwatch
 from torchslam.values import Start, Tracked, View
 from torchslam.world.map import Map
 
+YOUNG = 3  # keyframes after its own for which a point is on trial
+
 
 class Mapper:
     """Grows the map, keyframe by keyframe."""
@@ -66,13 +68,13 @@ class Mapper:
     def cull_recent_points(self, slam_map: Map, keyframe: int) -> None:
         """Kill young points that are rarely found where they should be visible, or that nobody else has seen."""
         points = slam_map.points
-        age = keyframe - points["born"]
-        is_young = points["alive"] & (age <= 3)
-        is_rarely_found = (
-            points["times_found"] < self.config.mapping.min_found_share * points["times_visible"]
-        )
-        is_lonely = (age >= 2) & (points["times_observed"] < 3) & ~points["from_start"]
-        slam_map.kill(torch.nonzero(is_young & (is_rarely_found | is_lonely))[:, 0])
+        young = torch.nonzero(points["born"] >= keyframe - YOUNG)[:, 0]
+        young = young[points["alive"][young]]
+        age = keyframe - points["born"][young]
+        least = self.config.mapping.min_found_share
+        is_rarely_found = points["times_found"][young] < least * points["times_visible"][young]
+        is_lonely = (age >= 2) & (points["times_observed"][young] < 3) & ~points["from_start"][young]
+        slam_map.kill(young[is_rarely_found | is_lonely])
 
 
 def world_scale(start: Start, kind: str) -> float:
