@@ -223,6 +223,21 @@ class Map:
         self._index = None
         return keyframes, points
 
+    def keep_keyframes(self, kept: Tensor, rows: Tensor) -> None:
+        """Keep some keyframes (k,) alone, ascending; a point that was born in old row i was born in rows (K,)[i]."""
+        self.keyframes.keep(kept)
+        self.points["born"][:] = rows[self.points["born"]]
+        self._index = None
+
+    def keep_points(self, kept: Tensor, rows: Tensor) -> None:
+        """Keep some points (n,) alone, ascending, all living ones among them; rows (L,): their new rows, else -1."""
+        self.points.keep(kept)
+        table = self.keyframes["point_ids"]
+        table[:] = torch.where(table >= 0, rows[table], NO_POINT)
+        heirs = self.points["replaced_by"]
+        heirs[:] = torch.where(heirs >= 0, rows[heirs], NO_POINT)
+        self._index = None
+
     # --- changing --------------------------------------------------------------------------------------------
 
     def kill(self, point_ids: Tensor) -> None:
