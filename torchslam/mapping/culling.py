@@ -18,6 +18,7 @@ from torchslam.world.map import Map
 from torchslam.world.world import World
 
 SHARE, OTHERS = 0.9, 3  # of a keyframe's points that so many others must see
+COARSER = 1.0  # an observation at up to so many times the scale is as good
 NEWEST = 8  # keyframes that are never asked: their points are still on trial, and the track starts from them
 AROUND = 20  # keyframes that are asked around each new one
 _LEAST_BATCH, _BATCH_SHARE = (
@@ -65,7 +66,12 @@ def is_covered(slam_map: Map, keyframe: int, goes: Tensor) -> bool:
     """Whether enough others that stay see the points of a keyframe at the same or a finer scale."""
     seen = slam_map.observations(slam_map.ids(keyframe))
     observers, scales = slam_map.scales_of(seen.point_index)
-    counts = (observers >= 0) & (observers != keyframe) & ~goes[observers] & (scales <= seen.scales[:, None])
+    counts = (
+        (observers >= 0)
+        & (observers != keyframe)
+        & ~goes[observers]
+        & (scales <= COARSER * seen.scales[:, None])
+    )
     return float((counts.sum(1) >= OTHERS).double().mean()) >= SHARE if len(seen) else True
 
 

@@ -15,14 +15,22 @@ _LEAST_ROWS, _LEAST_WIDTH = 64, 4
 
 
 class Observers:
-    """For every point the places (keyframe row * N + keypoint) that see it, in rows that are filled from the left."""
+    """For every point the places (keyframe row * N + keypoint) that see it, in rows that are filled from the left.
+
+    A point takes a row when it is seen first and gives it back when nobody sees it: memory goes with the points that
+    are seen, not with all that ever were.
+    """
 
     def __init__(self, table: Tensor) -> None:
         """The index of a table (K, N) of point rows, negative where a keypoint sees nothing."""
         # Half the memory of int64: enough for two million keyframes of a thousand keypoints.
-        self._places = torch.full(
-            (_LEAST_ROWS, _LEAST_WIDTH), NOWHERE, dtype=torch.int32, device=table.device
-        )
+        like = torch.empty(0, dtype=torch.int32, device=table.device)
+        self._places = like.new_full((_LEAST_ROWS, _LEAST_WIDTH), NOWHERE)
+        self._row_of = like.new_zeros(_LEAST_ROWS)  # by point; row 0 is that of all points that nobody sees
+        self._free = torch.arange(_LEAST_ROWS, device=table.device).flip(
+            0
+        )  # rows without a point: a stack, and
+        self._num_free = _LEAST_ROWS - 1  # how high it is
         flat = table.flatten()
         places = torch.nonzero(flat >= 0)[:, 0]
         self.add(flat[places], places)
@@ -35,45 +43,60 @@ class Observers:
 
     def padded(self, point_ids: Tensor) -> Tensor:
         """(n, w) the places that see points (n,), in rows filled from the left, then NOWHERE."""
-        self._reach(point_ids)
-        return self._places[point_ids]
+        return self._places[self._rows(point_ids)]
 
     def add(self, point_ids: Tensor, places: Tensor) -> None:
         """Note that points (n,) are seen at places (n,); a point may stand there several times."""
         if len(point_ids) == 0:
             return
-        self._reach(point_ids)
         order = torch.sort(point_ids, stable=True)
-        point_ids, places = order.values, places[order.indices]
-        ids, counts = torch.unique_consecutive(point_ids, return_counts=True)
-        ranks = torch.arange(len(point_ids), device=ids.device) - (
-            counts.cumsum(0) - counts
-        ).repeat_interleave(counts)
-        filled = (self._places[ids] >= 0).sum(1)
+        ids, counts = torch.unique_consecutive(order.values, return_counts=True)
+        self._take_rows(ids)
+        first = counts.cumsum(0) - counts
+        ranks = torch.arange(len(point_ids), device=ids.device) - first.repeat_interleave(counts)
+        filled = (self.padded(ids) >= 0).sum(1)
         columns = filled.repeat_interleave(counts) + ranks
         self._widen(int(columns.max()) + 1)
-        self._places[point_ids, columns] = places.to(self._places.dtype)
+        self._places[self._rows(order.values), columns] = places[order.indices].to(self._places.dtype)
 
     def remove(self, point_ids: Tensor, places: Tensor) -> None:
         """Note that points (n,) are no longer seen at places (n,)."""
         if len(point_ids) == 0:
             return
-        ids = torch.unique(point_ids)
-        rows = self._places[ids]
-        gone = torch.isin(rows, places.to(rows.dtype))
-        self._places[ids] = torch.sort(rows.masked_fill(gone, NOWHERE), dim=1, descending=True).values
+        rows = self._rows(torch.unique(point_ids))
+        held = self._places[rows]
+        gone = torch.isin(held, places.to(held.dtype))
+        self._places[rows] = torch.sort(held.masked_fill(gone, NOWHERE), dim=1, descending=True).values
 
     def clear(self, point_ids: Tensor) -> None:
         """Note that nobody sees points (n,) any longer."""
-        self._reach(point_ids)
-        self._places[point_ids] = NOWHERE
+        rows = torch.unique(self._rows(point_ids))
+        rows = rows[rows > 0]
+        self._places[rows] = NOWHERE
+        self._row_of[point_ids] = 0
+        self._free[self._num_free : self._num_free + len(rows)] = rows
+        self._num_free += len(rows)
 
-    def _reach(self, point_ids: Tensor) -> None:
-        """Have a row for every point (n,)."""
+    def _rows(self, point_ids: Tensor) -> Tensor:
+        """(n,) where the places of points (n,) are."""
+        if len(point_ids) and int(point_ids.max()) >= len(self._row_of):
+            more = self._row_of.new_zeros(max(len(self._row_of), int(point_ids.max()) + 1))
+            self._row_of = torch.cat([self._row_of, more])
+        return self._row_of[point_ids].long()
+
+    def _take_rows(self, point_ids: Tensor) -> None:
+        """Have a row of its own for every one of distinct points (n,)."""
+        new = point_ids[self._rows(point_ids) == 0]
         rows, width = self._places.shape
-        if len(point_ids) and int(point_ids.max()) >= rows:
-            rows = max(2 * rows, int(point_ids.max()) + 1)
-            self._resize(rows, width)
+        if len(new) > self._num_free:
+            more = max(rows, len(new))
+            self._resize(rows + more, width)
+            fresh = torch.arange(rows, rows + more, device=new.device).flip(0)
+            self._free = torch.cat([fresh, self._free])
+            self._num_free += more
+        left = self._num_free - len(new)
+        self._row_of[new] = self._free[left : self._num_free].to(self._row_of.dtype)
+        self._num_free = left
 
     def _widen(self, width: int) -> None:
         """Have room for this many observations of a point."""
