@@ -65,6 +65,8 @@ def test_coarser_views_do_not_replace_finer_ones() -> None:
     scales = [2.0, 1.0, 2.0, 2.0, 2.0]
     assert which(world_of(standing(5), scales), 1) == []
     assert which(world_of(standing(5), scales), 2) == [2]
+    assert which(world_of(standing(5), [1.2, 1.0, 1.2, 1.2, 1.2]), 1) == [1]  # a level of the pyramid
+    assert which(world_of(standing(5), [1.44, 1.0, 1.44, 1.44, 1.44]), 1) == []
 
 
 def forget(slam_map: Map, keyframe: int, count: int) -> None:

@@ -134,6 +134,25 @@ def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Gener
         assert torch.allclose(slam.map.T_cw[k, :3, 3], scale * truth[:3, 3], atol=1e-3)
 
 
+def test_an_adjustment_that_is_interrupted_leaves_the_map_as_it_was(
+    slam: SLAM, generator: torch.Generator
+) -> None:
+    shake = 0.01 * torch.randn(slam.map.num_keyframes - 1, 6, generator=generator, dtype=torch.float64)
+    slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
+    before = copy.deepcopy(slam.map)
+
+    def interrupt(iteration: int, iterations: int) -> None:
+        assert iterations == CONFIG.bundle.final_iterations
+        if iteration == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjust_all(slam.map, slam.camera, CONFIG.bundle, interrupt)
+    for table, old in ((slam.map.points, before.points), (slam.map.keyframes, before.keyframes)):
+        for name, column in table.columns().items():
+            assert torch.equal(column, old[name]), name
+
+
 def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
     keyframe = slam.map.num_keyframes - 1
     keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])

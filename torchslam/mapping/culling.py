@@ -18,7 +18,7 @@ from torchslam.world.map import Map
 from torchslam.world.world import World
 
 SHARE, OTHERS = 0.9, 3  # of a keyframe's points that so many others must see
-COARSER = 1.0  # an observation at up to so many times the scale is as good
+COARSER = 1.25  # seen one level of the pyramid (a factor of 1.2) coarser is seen as well
 NEWEST = 8  # keyframes that are never asked: their points are still on trial, and the track starts from them
 AROUND = 20  # keyframes that are asked around each new one
 _LEAST_BATCH, _BATCH_SHARE = (
@@ -63,7 +63,7 @@ def redundant(world: World, candidates: Tensor, settings: KeyframesConfig) -> Te
 
 
 def is_covered(slam_map: Map, keyframe: int, goes: Tensor) -> bool:
-    """Whether enough others that stay see the points of a keyframe at the same or a finer scale."""
+    """Whether enough others that stay see the points of a keyframe as finely, or nearly so."""
     seen = slam_map.observations(slam_map.ids(keyframe))
     observers, scales = slam_map.scales_of(seen.point_index)
     counts = (
