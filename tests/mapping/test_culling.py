@@ -7,10 +7,13 @@ import torch
 from torch import Tensor
 
 from tests.world.simulated import CAMERA, path, view_of
-from torchslam.config import KeyframesConfig
+from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
+from torchslam.mapping.mapper import Mapper
+from torchslam.stopwatch import Stopwatch
 from torchslam.values import Tracked, View
+from torchslam.world import compaction
 from torchslam.world.map import Map
 from torchslam.world.track import Track
 from torchslam.world.world import World
@@ -108,6 +111,25 @@ def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> No
     assert cull_keyframes(world, SETTINGS) is None  # nobody new to ask about
 
 
+def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compaction, "LEAST_DEAD", 5)
+    monkeypatch.setattr(compaction, "_PRICE", 1000)
+    world = world_of(standing(30))
+    descriptors = world.map.points["descriptors"][:1].repeat(40, 1)
+    world.map.kill(world.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
+    before, left = world.map.keyframes["frame_index"].clone(), world.map.positions_w[:21].clone()
+    went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
+    assert went is not None
+    assert went.points.tolist() == [*range(21)] + [-1] * 39
+    assert torch.equal(world.map.positions_w, left)
+    stays = went.keyframes >= 0
+    assert torch.equal(world.map.keyframes["frame_index"][went.keyframes[stays]], before[stays])
+    assert torch.equal(went.heirs[stays], went.keyframes[stays])
+    assert int(went.heirs.min()) >= 0
+    assert world.map.num_keyframes < 30
+    assert Mapper(CAMERA, Config(), Stopwatch()).tidy(world) is None
+
+
 def test_a_few_new_keyframes_are_not_worth_the_trouble() -> None:
     assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
     world = world_of(standing(20))
@@ -126,3 +148,8 @@ def test_the_reference_of_the_track_stays() -> None:
 def test_a_camera_on_its_way_keeps_its_keyframes() -> None:
     T_cw = path(200)[::15]
     assert cull_keyframes(world_of(T_cw), SETTINGS) is None
+
+
+def test_a_mapper_that_may_not_cull_keeps_all() -> None:
+    keeping = load_config(None, ["mapping.cull=false"])
+    assert Mapper(CAMERA, keeping, Stopwatch()).tidy(world_of(standing(30))) is None

@@ -33,6 +33,14 @@ class Renumbering:
     points: Tensor
     heirs: Tensor
 
+    def then(self, later: Renumbering) -> Renumbering:
+        """Both, one after the other."""
+        return Renumbering(
+            torch.where(self.keyframes >= 0, later.keyframes[self.keyframes], -1),
+            torch.where(self.points >= 0, later.points[self.points], -1),
+            later.heirs[self.heirs],
+        )
+
 
 def remove_keyframes(world: World, keyframes: Tensor) -> Renumbering:
     """Take keyframes (k,) out of the map; their frames stay in the history, with what the map knew of them last.
