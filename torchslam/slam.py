@@ -114,6 +114,8 @@ class SLAM:
         self.state = State.TRACKING
         why = self._take(world, view, tracked)
         is_keyframe = bool(why)
+        if is_keyframe:
+            self._tidy(world)
         if self.config.stillness.enabled and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
             drop_covered(world, self.stillness.covers)
             why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
@@ -133,6 +135,13 @@ class SLAM:
         world.map.points["times_found"][tracked.point_ids] += 1
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
+
+    def _tidy(self, world: World) -> None:
+        """Let go of what the map can do without; nobody holds rows of it now."""
+        keys = world.map.keys
+        renumbering = self.mapper.tidy(world)
+        if renumbering is not None:
+            self.places.remove(keys[renumbering.keyframes < 0])
 
     def _remember(self, slam_map: Map, keyframe: int) -> None:
         """The place can be recognised from now on."""

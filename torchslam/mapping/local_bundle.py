@@ -8,8 +8,10 @@ from torch import Tensor
 from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.solvers.levenberg import Progress
 from torchslam.values import Observations
 from torchslam.world.map import Map
+from torchslam.world.observers import most
 
 HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
 
@@ -27,30 +29,44 @@ def adjust(
     free = free[free != 0]
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
-    order = torch.sort(shared, descending=True, stable=True)
-    fixed = order.indices[: settings.max_fixed][order.values[: settings.max_fixed] > 0]
+    fixed = most(shared, settings.max_fixed, least=1)
     adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances)
 
 
-def adjust_all(slam_map: Map, camera: Camera, settings: BundleConfig) -> None:
-    """Adjust the whole map, the first keyframe fixed."""
+def adjust_all(
+    slam_map: Map, camera: Camera, settings: BundleConfig, progress: Progress | None = None
+) -> None:
+    """Adjust the whole map, the first keyframe fixed.
+
+    progress: called before each iteration; if it raises, the map stays as it was.
+    """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
-        slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, covariances=False
+        slam_map,
+        everyone[1:],
+        everyone[:1],
+        camera,
+        settings.final_iterations,
+        covariances=False,
+        progress=progress,
     )
 
 
 def adjust_keyframes(
-    slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera, iterations: int, covariances: bool
+    slam_map: Map,
+    free: Tensor,
+    fixed: Tensor,
+    camera: Camera,
+    iterations: int,
+    covariances: bool,
+    progress: Progress | None = None,
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
-    is_point = torch.zeros(len(slam_map.points), dtype=torch.bool, device=free.device)
-    is_point[slam_map.points_seen_by(free)] = True
     seen = slam_map.observations(keyframes)
-    seen = select(seen, is_point[seen.point_index])
-    twice = torch.bincount(seen.point_index, minlength=len(slam_map.points)) >= 2
-    seen = select(seen, twice[seen.point_index])
+    seen = select(seen, torch.isin(seen.point_index, slam_map.points_seen_by(free)))
+    _, which, counts = torch.unique(seen.point_index, return_inverse=True, return_counts=True)
+    seen = select(seen, counts[which] >= 2)
     if len(seen) == 0:
         return
     point_ids, point_index = torch.unique(seen.point_index, return_inverse=True)
@@ -64,7 +80,9 @@ def adjust_keyframes(
         weights=seen.scales**-2,
         fixed_frames=torch.isin(keyframes, fixed),
     )
-    solution = bundle_adjust(problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached")
+    solution = bundle_adjust(
+        problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached", progress=progress
+    )
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w
     if covariances:

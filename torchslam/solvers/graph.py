@@ -19,6 +19,7 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust, refine_pose
 from torchslam.solvers.implicit import Backward
+from torchslam.solvers.levenberg import Progress
 from torchslam.solvers.robust import Kernel
 from torchslam.values import Trajectory
 
@@ -113,6 +114,7 @@ def solve(
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-10,
+    progress: Progress | None = None,
 ) -> GraphSolution:
     """Minimise the robust reprojection errors of a run's graph: keyframes and points, then the frames in between.
 
@@ -135,7 +137,7 @@ def solve(
         graph.weights[rows],
         fixed_frames=(0,),
     )
-    bundle = bundle_adjust(problem, kernel, scale, free_camera, backward, iterations, tolerance)
+    bundle = bundle_adjust(problem, kernel, scale, free_camera, backward, iterations, tolerance, progress)
 
     T_cw = graph.T_cw.detach().index_copy(0, keyframes, bundle.T_cw)
     success = graph.is_keyframe & bundle.success

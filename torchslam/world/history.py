@@ -88,6 +88,58 @@ class History:
         self.frames.append(**frames)
         self.observations.append(**seen)
 
+    def refer(self, heirs: Tensor, slam_map: Map) -> None:
+        """Let frames that refer to keyframe i refer to heirs (K,)[i] from now on, without moving them."""
+        old = self.frames["reference"]
+        moves = torch.nonzero(heirs[old] != old)[:, 0]
+        new = heirs[old[moves]]
+        T_rr = slam_map.T_cw[old[moves]] @ se3_inverse(slam_map.T_cw[new])
+        self.frames["T_cr"][moves] = self.frames["T_cr"][moves] @ T_rr
+        old[moves] = new
+
+    def take_over(self, slam_map: Map, keyframes: Tensor) -> None:
+        """Keep what the map knows of keyframes (k,): their frames see from now on what the keyframes see.
+
+        A keyframe without a frame gets one.
+        """
+        kept = slam_map.keyframes
+        rows = torch.cat([self._frame_of(slam_map, keyframe) for keyframe in keyframes.tolist()])
+        self.frames["T_cr"][rows] = kept["T_cw"][keyframes] @ se3_inverse(
+            slam_map.T_cw[self.frames["reference"][rows]]
+        )
+        stale = torch.isin(self.observations["row"], rows)
+        self.observations.keep(torch.nonzero(~stale)[:, 0])
+        row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
+        seen = slam_map.observations(keyframes)
+        self.observations.append(
+            row=row_of[seen.keyframe_index],
+            point_ids=seen.point_index,
+            keypoints=seen.keypoint_index,
+            pixels=seen.pixels,
+            scales=seen.scales,
+        )
+
+    def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
+        """(1,) the row of the frame that a keyframe was made of, added where it is missing."""
+        own = {
+            name: slam_map.keyframes[name][keyframe][None] for name in ("frame_index", "session", "timestamp")
+        }
+        is_frame = self.frames["frame_index"] == own["frame_index"]
+        row = torch.nonzero(is_frame & (self.frames["session"] == own["session"]))[:1, 0]
+        if len(row):
+            return row
+        eye = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)[None]
+        return self.frames.append(T_cr=eye, reference=slam_map.ids(keyframe), **own)
+
+    def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
+        """Points got the rows (L,), negative where they are gone: merged ones count as their heirs, dead ones not."""
+        if len(self.observations) == 0:
+            return
+        renamed = rows[slam_map.resolve(self.observations["point_ids"])]
+        self.observations["point_ids"][:] = renamed
+        if bool((renamed < 0).any()):
+            self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
+
     def graph(self, slam_map: Map, camera: Camera) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
 
