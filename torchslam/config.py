@@ -150,6 +150,22 @@ class MappingConfig(Settings, section="mapping"):
 
 
 @dataclass(frozen=True)
+class LoopsConfig(Settings, section="loops"):
+    """When a keyframe shows a place that the map knows from another time, or that another world knows."""
+
+    enabled: bool = True
+    candidates: int = setting(3, low=1)  # places compared for each keyframe
+    min_matches: int = setting(40, low=6)  # points of the other place that the keyframe must see
+    min_pairs: int = setting(20, low=3)  # of these, known to the keyframe's own map as well
+    min_confirming: int = setting(2, low=0)  # keyframes beside it that must see the other place too
+    # how far a map may have drifted: from the length of the way between, in degrees, as a factor
+    max_drift: float = setting(0.2, above=0)
+    max_drift_deg: float = setting(20.0, above=0, high=180)
+    max_drift_scale: float = setting(2.0, low=1)
+    adjust: bool = True  # the whole map after a loop was closed or worlds were joined
+
+
+@dataclass(frozen=True)
 class BundleConfig(Settings, section="bundle"):
     enabled: bool = True
     window: int = setting(8, low=2)  # keyframes whose poses are free
@@ -175,6 +191,7 @@ class Config(Settings):
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    loops: LoopsConfig = field(default_factory=LoopsConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
 
 

@@ -15,7 +15,9 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, image_extractor
 from torchslam.geometry import Camera
+from torchslam.loops.closing import close_loop, join
 from torchslam.loops.places import Places
+from torchslam.loops.recognition import Recall, Recognizer
 from torchslam.mapping.culling import drop_covered
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
@@ -65,6 +67,8 @@ class SLAM:
         self.places = Places()
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
+        self.recognizer = Recognizer(self.camera, self.config, self.worlds, self.places)
+        self.recalls: list[Recall] = []
         self._seek()
 
     # --- the way of a frame ----------------------------------------------------------------------------------
@@ -115,6 +119,7 @@ class SLAM:
         why = self._take(world, view, tracked)
         is_keyframe = bool(why)
         if is_keyframe:
+            world = self._recall(world)
             self._tidy(world)
         if self.config.stillness.enabled and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
             drop_covered(world, self.stillness.covers)
@@ -135,6 +140,26 @@ class SLAM:
         world.map.points["times_found"][tracked.point_ids] += 1
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
+
+    def _recall(self, world: World) -> World:
+        """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
+        if not self.config.loops.enabled:
+            return world
+        with self.clock("loops"):
+            keyframe = world.map.num_keyframes - 1
+            found = self.recognizer.recognize(world, keyframe)
+            if found is None:
+                return world
+            self.recalls.append(found.recall)
+            if found.is_loop:
+                close_loop(found, self.camera, self.config)
+            else:
+                self.settle()
+                world, keyframe = join(found, self.camera, self.config)
+                self.worlds.forget(found.world if world is found.other else found.other)
+                self.world = world
+            self.tracker.follow(world, keyframe)
+        return world
 
     def _tidy(self, world: World) -> None:
         """Let go of what the map can do without; nobody holds rows of it now."""
