@@ -68,6 +68,7 @@ class SLAM:
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
         self.recognizer = Recognizer(self.camera, self.config, self.worlds, self.places)
+        self.world: World | None = None  # the one that is followed
         self.recalls: list[Recall] = []
         self._seek()
 
@@ -204,7 +205,7 @@ class SLAM:
 
     def _seek(self) -> None:
         """Nothing is followed any more."""
-        self.world: World | None = None
+        self.world = None
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)

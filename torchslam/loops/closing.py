@@ -1,7 +1,7 @@
 """What follows a recognition: a loop is closed, or two worlds become one.
 
-The map bends by a graph of similarities over its keyframes, so that the drift of position, direction and scale is spread
-over the way; then points that are one are merged, and everything is adjusted.
+The map bends by a graph of similarities over its keyframes, so that the drift of position, direction and scale is
+spread over the way; then points that are one are merged, and everything is adjusted.
 Source: Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010.
 """
 
