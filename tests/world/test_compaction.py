@@ -110,6 +110,19 @@ def test_the_graph_keeps_what_removed_keyframes_saw_last(world: World) -> None:
     assert all(pairs(old)[key] == pixel for key, pixel in pairs(new).items())
 
 
+@pytest.mark.parametrize("forgotten", [0, 5])
+def test_the_history_of_the_other_frames_is_untouched(world: World, forgotten: int) -> None:
+    keypoints = torch.nonzero(world.map.keyframes["point_ids"][3] >= 0)[:forgotten, 0]
+    world.map.forget(torch.full_like(keypoints, 3), keypoints)
+    before = copy.deepcopy(world.history)
+    own = torch.isin(before.observations["row"], 3 * GONE)  # every third frame is a keyframe
+    world.remove(GONE)
+    kept = ~torch.isin(world.history.observations["row"], 3 * GONE)
+    for name, column in world.history.observations.columns().items():
+        assert torch.equal(column[kept], before.observations[name][~own]), name
+    assert int((~kept).sum()) == int(own.sum()) - forgotten
+
+
 def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(world: World) -> None:
     generator = torch.Generator().manual_seed(5)
     T_cw = path(FRAMES + 1)[-1]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torchslam.world.world import World
 
 LEAST_DEAD = 4096  # rows of dead points that are not worth the trouble
-_PRICE = 16  # rows of the history that may be rewritten per row of a dead point
+_PRICE = 64  # rows of the history that may be rewritten per row of a dead point
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ def remove_keyframes(world: World, keyframes: Tensor) -> Renumbering:
     _leave_points(slam_map, goes, heirs)
     kept = torch.nonzero(~goes)[:, 0]
     rows = torch.where(goes, -1, torch.cumsum(~goes, 0) - 1)
-    slam_map.keep_keyframes(kept, rows[heirs])
+    slam_map.keyframes.keep(kept)
+    slam_map.points["born"][:] = rows[heirs][slam_map.points["born"]]
+    slam_map.reindex()
     if len(history):
         history.frames["reference"][:] = rows[history.frames["reference"]]
     alive, track = slam_map.points["alive"], world.track
@@ -117,7 +119,10 @@ def drop_dead_points(world: World) -> Renumbering:
     kept = torch.nonzero(alive)[:, 0]
     rows = torch.where(alive, torch.cumsum(alive, 0) - 1, NO_POINT)
     world.history.renumber_points(slam_map, rows)
-    slam_map.keep_points(kept, rows)
+    slam_map.points.keep(kept)
+    for column in (slam_map.keyframes["point_ids"], slam_map.points["replaced_by"]):
+        column[:] = torch.where(column >= 0, rows[column], NO_POINT)
+    slam_map.reindex()
     local, last = rows[track.local_points], rows[track.seen_last]
     world.track = replace(track, local_points=local[local >= 0], seen_last=last[last >= 0])
     everyone = torch.arange(slam_map.num_keyframes, device=rows.device)

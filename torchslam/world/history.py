@@ -107,17 +107,27 @@ class History:
         self.frames["T_cr"][rows] = kept["T_cw"][keyframes] @ se3_inverse(
             slam_map.T_cw[self.frames["reference"][rows]]
         )
-        stale = torch.isin(self.observations["row"], rows)
-        self.observations.keep(torch.nonzero(~stale)[:, 0])
+        is_kept = torch.zeros(len(self), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
         seen = slam_map.observations(keyframes)
-        self.observations.append(
+        self._overwrite(
+            torch.nonzero(is_kept[self.observations["row"]])[:, 0],
             row=row_of[seen.keyframe_index],
             point_ids=seen.point_index,
             keypoints=seen.keypoint_index,
             pixels=seen.pixels,
             scales=seen.scales,
         )
+
+    def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
+        """Put fresh observations in the place of stale rows (n,), ascending: nothing is copied as long as they fit."""
+        count = min(len(stale), len(fresh["row"]))
+        for name, values in fresh.items():
+            self.observations[name][stale[:count]] = values[:count]
+        if count < len(stale):
+            is_left = torch.ones(len(self.observations), dtype=torch.bool, device=stale.device)
+            self.observations.keep(torch.nonzero(is_left.index_fill(0, stale[count:], False))[:, 0])
+        self.observations.append(**{name: values[count:] for name, values in fresh.items()})
 
     def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
         """(1,) the row of the frame that a keyframe was made of, added where it is missing."""

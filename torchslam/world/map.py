@@ -90,8 +90,6 @@ class Map:
         R_cw = self.T_cw[:, :3, :3]
         return R_cw.mT @ self.keyframes["covariances"][:, :3, :3] @ R_cw
 
-    # --- growing ---------------------------------------------------------------------------------------------
-
     def add_keyframe(self, view: View, T_cw: Tensor) -> int:
         """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
         ids = self.keyframes.append(
@@ -142,8 +140,6 @@ class Map:
             alive=torch.ones(n, dtype=torch.bool, device=like.device),
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
-
-    # --- observations ----------------------------------------------------------------------------------------
 
     def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
         """Note that keypoints (n,) of a keyframe, which see nothing yet, see points (n,)."""
@@ -238,22 +234,11 @@ class Map:
         rows = other.keyframes.columns()
         rows["point_ids"] = torch.where(rows["point_ids"] >= 0, rows["point_ids"] + points, NO_POINT)
         self.keyframes.append(**rows)
-        self._index = None
+        self.reindex()
         return keyframes, points
 
-    def keep_keyframes(self, kept: Tensor, rows: Tensor) -> None:
-        """Keep some keyframes (k,) alone, ascending; a point that was born in old row i was born in rows (K,)[i]."""
-        self.keyframes.keep(kept)
-        self.points["born"][:] = rows[self.points["born"]]
-        self._index = None
-
-    def keep_points(self, kept: Tensor, rows: Tensor) -> None:
-        """Keep some points (n,) alone, ascending, all living ones among them; rows (L,): their new rows, else -1."""
-        self.points.keep(kept)
-        table = self.keyframes["point_ids"]
-        table[:] = torch.where(table >= 0, rows[table], NO_POINT)
-        heirs = self.points["replaced_by"]
-        heirs[:] = torch.where(heirs >= 0, rows[heirs], NO_POINT)
+    def reindex(self) -> None:
+        """To be called when rows were renumbered."""
         self._index = None
 
     # --- changing --------------------------------------------------------------------------------------------
