@@ -226,6 +226,7 @@ class SLAM:
             return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
+            self.stillness.add(self.initializer.still)
             if start is not None:
                 reason = self._begin(start)
         if reason:
