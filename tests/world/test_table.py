@@ -65,3 +65,15 @@ def test_rows_that_are_kept_stand_in_the_asked_order() -> None:
     table.keep(torch.tensor([7, 2]))
     assert table["number"].tolist() == [7.0, 2.0]
     assert table.append(number=torch.ones(1)).tolist() == [2]
+
+
+@pytest.mark.parametrize(("kept", "moves"), [(40, False), (20, True)])
+def test_memory_is_given_back_where_most_is_empty(kept: int, moves: bool) -> None:
+    table = Table(NUMBER)
+    table.append(number=torch.arange(64.0))
+    place = table["number"].data_ptr()
+    table.keep(torch.arange(64).flip(0)[:kept])
+    assert table["number"].tolist() == list(range(63, 63 - kept, -1))
+    assert (table["number"].data_ptr() != place) is moves
+    table.append(number=torch.ones(1))
+    assert table["number"].tolist()[-2:] == [64.0 - kept, 1.0]

@@ -163,7 +163,10 @@ class History:
         slot = torch.full((len(self),), -1, device=point_ids.device)
         slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
         heirs = slam_map.resolve(self.observations["point_ids"])
-        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & torch.isin(heirs, point_ids))[:, 0]
+        # A flag per point: `isin` would sort all that was ever seen.
+        is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
+        is_seen[point_ids] = True
+        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
         own = {name: self.observations[name][rows] for name in ("row", "keypoints", "pixels", "scales")}
         keyframes = slam_map.keyframes
         return RunGraph(
