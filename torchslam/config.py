@@ -108,6 +108,8 @@ class JudgeConfig(Settings, section="judge"):
 
     min_inlier_share: float = setting(0.5, low=0, high=1)  # of the matches around the predicted pixels
     max_error: float = setting(1.3, above=0)  # median squared error in units of the noise, over ten frames
+    # of the image, where it has keypoints: what the map explains, over ten frames
+    min_explained: float = setting(0.3, low=0, high=1)
     min_coverage: float = setting(0.2, low=0, high=1)  # of the image, where the map expects something
     # standard deviations; of the position as a share of the median depth of the tracked points
     max_position_std: float = setting(0.017, above=0)

@@ -113,7 +113,7 @@ class SLAM:
             tracked = self.tracker.track(world, view)
         if tracked is None:
             return self._lose(world, view)
-        doubt = why_doubt(tracked, expected, world.track.error, self.config.judge)
+        doubt = why_doubt(tracked, expected, world.track, self.config.judge)
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING

@@ -155,6 +155,7 @@ class Tracked:
     depth:       median depth of the points it sees
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
     coverage:    share of the image in which the points that were expected are found
+    explained:   share of the image with keypoints in which some agree with the map
     """
 
     T_cw: Tensor
@@ -165,6 +166,7 @@ class Tracked:
     depth: float
     error: float
     coverage: float
+    explained: float
 
     @property
     def inliers(self) -> int:

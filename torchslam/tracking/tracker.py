@@ -27,10 +27,11 @@ from torchslam.world.map import Map
 from torchslam.world.track import Track
 from torchslam.world.world import World
 
-ERROR_MEMORY = 0.1  # share of the newest frame in the error of the way: that of the last ten or so
+MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
 PER_CELL = 5  # matches of a cell that RANSAC hears
+CROWD = 8  # matches of a cell that count in full
 SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
 
 
@@ -58,6 +59,7 @@ class Tracker:
             velocity=world.track.velocity,
             seen_last=seen[seen >= 0],
             error=world.track.error,
+            explained=world.track.explained,
         )
 
     def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> Track:
@@ -80,7 +82,6 @@ class Tracker:
             seen_last=local_points[:0],
             local_keyframes=local_keyframes,
             local_points=local_points,
-            error=0.0,
         )
 
     def predict(self, world: World) -> Tensor:
@@ -163,6 +164,7 @@ class Tracker:
             depth=float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()),
             error=float(errors.median()),
             coverage=coverage(slam_map, near, seen, self.camera.size),
+            explained=explained(view, at[inliers], self.camera.size),
         )
         slam_map.points["times_visible"][near.ids] += 1
         return tracked
@@ -193,6 +195,7 @@ class Tracker:
         points_w = slam_map.positions_w[ids]
         errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
         mask = fits(errors, scales, FAR * self.measurement.chi_square)
+        weights = scales**-2 * voices(pixels, self.camera.size)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
         for kernel, iterations in passes:
             refined = refine_pose(
@@ -200,7 +203,7 @@ class Tracker:
                 points_w[None],
                 pixels[None],
                 self.camera,
-                weights=(scales**-2)[None],
+                weights=weights[None],
                 mask=mask[None],
                 kernel=kernel,
                 scale=2.0,
@@ -232,7 +235,8 @@ class Tracker:
         slam_map, track = world.map, world.track
         track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
         track.seen_last = tracked.point_ids
-        track.error += ERROR_MEMORY * (tracked.error - track.error)
+        track.error += MEMORY * (tracked.error - track.error)
+        track.explained += MEMORY * (tracked.explained - track.explained)
         slam_map.points["last_seen"][tracked.point_ids] = view.index
         shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
         best = int(track.local_keyframes[shared.argmax()])
@@ -244,6 +248,7 @@ class Tracker:
                 velocity=track.velocity,
                 seen_last=track.seen_last,
                 error=track.error,
+                explained=track.explained,
             )
 
     def start_at(self, world: World, view: View, tracked: Tracked) -> None:
@@ -292,6 +297,21 @@ def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
     rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
     return torch.sort(order[rank < PER_CELL]).values
+
+
+def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) what each of the pixels (n, 2) counts, so that a crowded cell of the image does not outvote the others."""
+    cell = cells(pixels, size)
+    crowd = torch.bincount(cell, minlength=CELLS[0] * CELLS[1])[cell]
+    return (CROWD / crowd).clamp(max=1.0)
+
+
+def explained(view: View, keypoints: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells with several keypoints in which at least one of keypoints (m,) lies."""
+    count = CELLS[0] * CELLS[1]
+    there = torch.bincount(cells(view.keypoints[view.mask], size), minlength=count) >= 2
+    used = torch.bincount(cells(view.keypoints[keypoints], size), minlength=count) > 0
+    return float(used[there].double().mean()) if bool(there.any()) else 1.0
 
 
 def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
