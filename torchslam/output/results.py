@@ -21,7 +21,7 @@ from torchslam.output.ply import write_ply
 from torchslam.run import Run
 from torchslam.values import StepResult, Trajectory
 from torchslam.world.map import Map
-from torchslam.world.map_file import read_map, write_map
+from torchslam.world.map_file import read_map, write_worlds
 
 TRAJECTORY = "trajectory.txt"
 KEYFRAMES = "keyframes.txt"
@@ -67,7 +67,7 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
     write_trajectory(directory / KEYFRAMES, run.keyframes)
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
-    write_map(directory / MAP, run.map, run.camera)
+    write_worlds(directory / MAP, run.worlds, run.camera, run.sessions)
     _write_point_cloud(directory / POINT_CLOUD, run)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")

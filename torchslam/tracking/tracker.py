@@ -32,7 +32,11 @@ class Tracker:
     """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
 
     It keeps nothing itself: where the camera was is the track of the world.
+
+    counts: whether points remember when and how often they were seen; without it, tracking leaves the map as it is
     """
+
+    counts = True
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera = camera
@@ -55,7 +59,7 @@ class Tracker:
         """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
         near = slam_map.covisible(keyframe, self.settings.local_keyframes)
         local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
-        recent = self.settings.recent_frames
+        recent = self.settings.recent_frames if self.counts else 0
         if recent:
             last_seen = slam_map.points["last_seen"]
             local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["alive"])[
@@ -144,7 +148,8 @@ class Tracker:
         T_cw, ids_seen = refined.T_cw[0], ids[inliers]
         depth = float(transform(T_cw, slam_map.positions_w[ids_seen])[:, 2].median())
         tracked = Tracked(T_cw, ids_seen, at[inliers], len(ids), refined.covariance[0], depth)
-        slam_map.points["times_visible"][near.ids] += 1
+        if self.counts:
+            slam_map.points["times_visible"][near.ids] += 1
         return tracked
 
     def _project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
@@ -207,8 +212,7 @@ class Tracker:
         slam_map, track = world.map, world.track
         track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
         track.seen_last = tracked.point_ids
-        slam_map.points["times_found"][tracked.point_ids] += 1
-        slam_map.points["last_seen"][tracked.point_ids] = view.index
+        self._count(slam_map, view, tracked)
         shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
         best = int(track.local_keyframes[shared.argmax()])
         if best == track.reference:
@@ -221,11 +225,16 @@ class Tracker:
     def start_at(self, world: World, view: View, tracked: Tracked) -> None:
         """Begin a track anew, wherever in the map: at a frame that was located without one."""
         best = int(world.map.observers(tracked.point_ids).argmax())
-        world.map.points["times_found"][tracked.point_ids] += 1
-        world.map.points["last_seen"][tracked.point_ids] = view.index
+        self._count(world.map, view, tracked)
         world.track = replace(
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
+
+    def _count(self, slam_map: Map, view: View, tracked: Tracked) -> None:
+        """The points that a frame saw remember it."""
+        if self.counts:
+            slam_map.points["times_found"][tracked.point_ids] += 1
+            slam_map.points["last_seen"][tracked.point_ids] = view.index
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
