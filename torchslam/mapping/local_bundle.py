@@ -8,6 +8,7 @@ from torch import Tensor
 from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.solvers.levenberg import Progress
 from torchslam.values import Observations
 from torchslam.world.map import Map
 
@@ -32,16 +33,33 @@ def adjust(
     adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances)
 
 
-def adjust_all(slam_map: Map, camera: Camera, settings: BundleConfig) -> None:
-    """Adjust the whole map, the first keyframe fixed."""
+def adjust_all(
+    slam_map: Map, camera: Camera, settings: BundleConfig, progress: Progress | None = None
+) -> None:
+    """Adjust the whole map, the first keyframe fixed.
+
+    progress: called before each iteration; if it raises, the map stays as it was.
+    """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
-        slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, covariances=False
+        slam_map,
+        everyone[1:],
+        everyone[:1],
+        camera,
+        settings.final_iterations,
+        covariances=False,
+        progress=progress,
     )
 
 
 def adjust_keyframes(
-    slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera, iterations: int, covariances: bool
+    slam_map: Map,
+    free: Tensor,
+    fixed: Tensor,
+    camera: Camera,
+    iterations: int,
+    covariances: bool,
+    progress: Progress | None = None,
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
@@ -64,7 +82,9 @@ def adjust_keyframes(
         weights=seen.scales**-2,
         fixed_frames=torch.isin(keyframes, fixed),
     )
-    solution = bundle_adjust(problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached")
+    solution = bundle_adjust(
+        problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached", progress=progress
+    )
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w
     if covariances:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.solvers.bundle_model import Bundle, Estimate, Inputs, build_layout
 from torchslam.solvers.implicit import Backward, attach, check_backward
-from torchslam.solvers.levenberg import Convergence, minimize
+from torchslam.solvers.levenberg import Convergence, Progress, minimize
 from torchslam.solvers.residuals import usable
 from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
@@ -97,6 +97,7 @@ def bundle_adjust(
     backward: Backward = "implicit",
     iterations: int = 20,
     tolerance: float = 1e-8,
+    progress: Progress | None = None,
 ) -> BundleSolution:
     """Minimise robust reprojection errors over poses, points and, if `free_camera`, the camera's parameters.
 
@@ -104,6 +105,7 @@ def bundle_adjust(
     backward: how gradients reach pixels, weights, camera.params (unless free), scale, fixed poses and fixed points, see
               `implicit.Backward`. The gradient ends at the start values of what moves.
     tolerance: stop where a step promises to lower the cost by less than this share of it
+    progress: called with the number of each iteration and the most there are; what it raises is raised here
 
     Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
     positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
@@ -121,7 +123,7 @@ def bundle_adjust(
 
     with torch.set_grad_enabled(torch.is_grad_enabled() and backward == "unroll"):
         bundle = build(inputs)
-        model, convergence = minimize(bundle, bundle.start, iterations, tolerance)
+        model, convergence = minimize(bundle, bundle.start, iterations, tolerance, progress)
     with torch.no_grad():
         success = bundle.solvable[0] & bundle.factorized(model).reduced.definite
     minimum = Estimate(*(tensor.detach() for tensor in model.estimate))

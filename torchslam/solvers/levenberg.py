@@ -9,6 +9,7 @@ can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -20,6 +21,10 @@ _DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
 _DAMPING_RANGE = (1e-10, 1e8)
 # Below this share of the cost, the decrease that a step promises says that the optimum is close.
 _NEAR = 1e-2
+
+
+Progress = Callable[[int, int], None]
+"""Told before each iteration its number, from 0, and how many there are at most."""
 
 
 class Model(Protocol):
@@ -71,12 +76,16 @@ class Convergence:
 
 
 def minimize(
-    problem: LeastSquares[X, M], start: X, iterations: int, tolerance: float
+    problem: LeastSquares[X, M],
+    start: X,
+    iterations: int,
+    tolerance: float,
+    progress: Progress | None = None,
 ) -> tuple[M, Convergence]:
     """Minimise from `start`; returns the model at the last accepted estimate.
 
     An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, or
-    when the residuals have vanished; it rests from then on.
+    when the residuals have vanished; it rests from then on. What `progress` raises ends the minimisation.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
@@ -86,7 +95,9 @@ def minimize(
     slack = 1 + 100 * rounding
     damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
-    for _ in range(iterations):
+    for iteration in range(iterations):
+        if progress is not None:
+            progress(iteration, iterations)
         estimate, decrease = problem.step(model, damping)
         share = decrease.detach() / model.cost.detach()
         trial = problem.evaluate(estimate, share < _NEAR)
