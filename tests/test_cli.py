@@ -61,6 +61,7 @@ def test_run_writes_all_results(finished: Path) -> None:
     }
     files = {
         "trajectory.txt",
+        "online.txt",
         "keyframes.txt",
         "groundtruth.txt",
         "map.safetensors",
@@ -71,6 +72,8 @@ def test_run_writes_all_results(finished: Path) -> None:
     figures = json.loads((finished / "metrics.json").read_text())
     assert figures["frames"] == 16
     assert len(read_trajectory(finished / "trajectory.txt")) == figures["posed"]
+    assert len(read_trajectory(finished / "online.txt")) == figures["frames"] - figures["initialised_at"]
+    assert figures["online_ate_m"] < 0.05 * figures["path_length_m"]
     assert len(read_trajectory(finished / "keyframes.txt")) == figures["keyframes"]
     assert read_map(finished / "map.safetensors")[0].num_points == figures["points"]
     assert figures["ate_m"] < 0.05 * figures["path_length_m"]
@@ -293,6 +296,10 @@ def test_plot_of_an_incomplete_folder_names_what_is_missing(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "map.safetensors").write_bytes((finished / "map.safetensors").read_bytes())
+    status, _, err = run_and_read(capsys, "plot", str(tmp_path))
+    assert status == 2
+    assert "metrics.json" in err
+    (tmp_path / "metrics.json").write_bytes((finished / "metrics.json").read_bytes())
     status, _, err = run_and_read(capsys, "plot", str(tmp_path))
     assert status == 2
     assert "trajectory.txt" in err

@@ -36,6 +36,7 @@ from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajector
 from torchslam.world.map import Map
 from torchslam.world.map_check import why_not_alike
 from torchslam.world.map_file import Saved, read_worlds, write_worlds
+from torchslam.world.track import Track
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
@@ -90,6 +91,8 @@ class SLAM:
             raise ResultsError(f"{path}: there is no world in it to localise in")
         slam = cls(saved.camera, config, extractor)
         slam.enter(saved, mapping)
+        for world in slam.worlds if mapping else ():
+            world.map.forget_frames()
         return slam
 
     def save(self, path: str | Path) -> None:
@@ -107,8 +110,11 @@ class SLAM:
         for world in self.worlds:
             for keyframe in range(world.map.num_keyframes):
                 self._remember(world.map, keyframe)
-            if mapping:
-                world.map.forget_frames()
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a world is followed that has proved itself, and no frame is held back."""
+        return self.world is not None and self.youth is None and not self.probation
 
     def _enter(self, worlds: Worlds, session: int, mapping: bool) -> None:
         """Begin a session: which worlds there are, and nothing else."""
@@ -246,6 +252,11 @@ class SLAM:
         self.stillness.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
+
+    def resume(self, world: World, track: Track, last_frame: tuple[int, float]) -> None:
+        """Go on in one of the worlds from where the camera was, as if nothing had happened in between."""
+        world.track = track
+        self.world, self.state, self.last_frame = world, State.TRACKING, last_frame
 
     def _find(self, view: View) -> StepResult:
         """Come back to a known place, or else begin a new world; the frame waits until there is a pose for it."""
