@@ -128,6 +128,8 @@ def test_demo_shares_the_way_of_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.commands.demo.SEQUENCE", ROOM)
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "metrics.json").write_text("of an earlier time: the demo writes over it")
     status, out, err = run_and_read(capsys, "demo", "--output", str(tmp_path / "demo"), *FAST)
     assert status == 0
     assert "ATE" in out
@@ -292,6 +294,20 @@ def test_results_that_cannot_be_written_stop_before_the_run(
     assert str(tmp_path / "file") in err
 
 
+def test_a_folder_that_cannot_be_written_to_stops_before_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, content: bytes) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("torchslam.commands.folder.write_whole", refuse)
+    monkeypatch.setattr("torchslam.commands.run.SLAM", None)  # nothing is begun
+    status, _, err = run_and_read(capsys, "run", ROOM, "--output", str(tmp_path))
+    assert status == 2
+    assert "Permission denied" in err
+    assert str(tmp_path) in err
+
+
 def test_plot_of_an_incomplete_folder_names_what_is_missing(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -313,6 +329,13 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["run", ROOM], ["run", ROOM, "-o", "x", "--features", "sift"], ["fly"], []):
+    for arguments in (
+        ["run", ROOM, "-o", "x", "--checkpoint", "-1"],
+        ["run", ROOM, "-o", "x", "--resume", "--overwrite"],
+        ["run", ROOM],
+        ["run", ROOM, "-o", "x", "--features", "sift"],
+        ["fly"],
+        [],
+    ):
         with pytest.raises(SystemExit, match="2"):
             main(arguments)

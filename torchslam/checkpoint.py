@@ -93,8 +93,8 @@ def fingerprint(of: Sequence | Config) -> str:
     """What tells one sequence, or one configuration, from another."""
     if isinstance(of, Config):
         return hashlib.sha256(to_toml(of).encode()).hexdigest()
-    about = [of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.timestamps.tolist()]
-    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), len(of)])
+    return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
 
 
 def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> None:

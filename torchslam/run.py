@@ -90,6 +90,8 @@ class Run:
     def graph(self) -> RunGraph:
         """Everything the worlds know, as one differentiable problem: `torchslam.solve(run.graph)` gives all poses.
 
+        Where there are several worlds, `graph.world` says whose poses can be compared with each other.
+
         Raises InitializationError where there is no map.
         """
         if not self.worlds:

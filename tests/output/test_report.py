@@ -54,7 +54,7 @@ def test_counts_of_several_worlds_and_sessions(run: Run, world: World) -> None:
     assert words["lost"] == "4 frames; 5 had an uncertain pose"
     again = metrics(replace(run, worlds=(world, other), results=results, session=1))
     assert again["world"] == 3
-    assert summary(again)["session"] == "1, in a map of 1 keyframes in all"
+    assert summary(again)["session"] == "1, which made 0 of the keyframes"
 
 
 def test_times(run: Run) -> None:

@@ -198,6 +198,10 @@ def test_worlds_are_solved_each_on_its_own():
     assert torch.equal(solution.success, torch.cat([first.success, second.success]))
     assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
     assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
+    assert torch.equal(solution.world, both.world)
+    for world, alone in ((4, first), (1, second)):
+        assert torch.equal(solution.trajectory_in(world).T_wc, alone.trajectory.T_wc)
+    assert torch.equal(solution.trajectory.T_wc, first.trajectory.T_wc)  # ten frames against seven
     assert torch.equal(solution.T_cw[0], both.T_cw[0])
     assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either
     assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)

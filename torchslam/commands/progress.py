@@ -50,11 +50,12 @@ class ProgressBar:
             self._stopping.begin("the adjustment after this iteration")
             self._bar.close()
             self._adjusting = tqdm(
+                total=iterations,
                 file=sys.stderr,
                 dynamic_ncols=True,
                 bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
             )
-        self._adjusting.total, self._adjusting.n = iterations, iteration + 1
+        self._adjusting.total, self._adjusting.n = iterations, iteration + 1  # worlds begin anew
         self._adjusting.refresh()
         self._stopping.check()
 

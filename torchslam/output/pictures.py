@@ -92,11 +92,14 @@ def _which(results: Results) -> str:
 
 
 def _truth(results: Results) -> Trajectory | None:
-    """The ground truth from the first frame to the last: it may go on where the run did not."""
+    """The ground truth from the first frame to the last, of the world that is shown: elsewhere it may go far away."""
     truth, frames = results.groundtruth, results.frames
     if truth is None:
         return None
-    during = (truth.timestamps >= frames[0].timestamp) & (truth.timestamps <= frames[-1].timestamp)
+    start, end = frames[0].timestamp, frames[-1].timestamp
+    if len(results.metrics["worlds"]) > 1:
+        start, end = results.trajectory.timestamps[[0, -1]].tolist()
+    during = (truth.timestamps >= start) & (truth.timestamps <= end)
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 

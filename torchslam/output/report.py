@@ -122,7 +122,8 @@ def _beside(figures: Mapping[str, Any]) -> dict[str, str]:
     rows = {}
     if figures["session"]:
         (main,) = (world for world in figures["worlds"] if world["world"] == figures["world"])
-        rows["session"] = f"{figures['session']}, in a map of {main['keyframes']} keyframes in all"
+        rows["map"] = f"{main['keyframes']} keyframes, {main['points']} points"
+        rows["session"] = f"{figures['session']}, which made {figures['keyframes']} of the keyframes"
     others = [
         f"world {world['world']}: {world['posed']} frames posed, {world['keyframes']} keyframes"
         for world in figures["worlds"]

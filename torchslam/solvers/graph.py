@@ -112,8 +112,9 @@ class GraphSolution:
     success:   (F,) bool. A frame that its observations do not determine stays where it was, without gradient; if the
                keyframes of a world together are not determined, none of them succeeds.
     moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.
+    world:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
     keyframes: the bundle adjustments of keyframes and points, with their covariances, one per world in the order of
-               `ObservationGraph.worlds`; rows are those of the world's keyframes and of the points they see, in order
+               `ObservationGraph.worlds`; rows are those of the world's keyframes and of the points its frames see
     """
 
     timestamps: Tensor
@@ -122,12 +123,19 @@ class GraphSolution:
     camera: Camera
     success: Tensor
     moved_points: Tensor
+    world: Tensor
     keyframes: tuple[BundleSolution, ...]
 
     @property
     def trajectory(self) -> Trajectory:
-        """Camera to world, ordered by time, differentiable."""
-        order = torch.argsort(self.timestamps, stable=True)
+        """Camera to world, ordered by time, differentiable; of the world with most frames."""
+        worlds, frames = torch.unique(self.world, return_counts=True)
+        return self.trajectory_in(int(worlds[frames.argmax()]))
+
+    def trajectory_in(self, world: int) -> Trajectory:
+        """Camera to world, ordered by time, differentiable; of one world."""
+        rows = (self.world == world).nonzero().squeeze(-1)
+        order = rows[torch.argsort(self.timestamps[rows], stable=True)]
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
@@ -176,7 +184,9 @@ def solve(
         raise ValueError("the graph has no keyframe")
     camera = bundles[0].camera
     T_cw, success = _between(graph, T_cw, points_w, camera, moved, success, *options)
-    return GraphSolution(graph.timestamps, T_cw, points_w, camera, success, moved, tuple(bundles))
+    return GraphSolution(
+        graph.timestamps, T_cw, points_w, camera, success, moved, graph.world, tuple(bundles)
+    )
 
 
 def _problem(graph: ObservationGraph, keyframes: Tensor, rows: Tensor, points: Tensor) -> BundleProblem:
