@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
-from torchslam.values import State, StepResult, Trajectory, View
+from torchslam.run import Run
+from torchslam.values import State, StepResult, Tracked, Trajectory, View
 from torchslam.world.map import Map
+from torchslam.world.track import Track
+from torchslam.world.world import World
 
 KEYPOINTS = 40
 FRAMES = 30
@@ -50,6 +55,34 @@ def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
 
 
 @pytest.fixture
+def world(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> World:
+    """The map and the frames that are tracked, on the trajectory."""
+    made = World(0, Track.nowhere(trajectory.T_wc), slam_map)
+    nothing = torch.zeros(0, dtype=torch.int64)
+    for result in results:
+        if result.T_cw is not None:
+            view = replace(slam_map.view(0), index=result.index, timestamp=result.timestamp)
+            T_cw = se3_inverse(trajectory.T_wc[result.index])
+            seen = Tracked(T_cw, nothing, nothing, 0, torch.eye(6, dtype=torch.float64), 1.0)
+            made.history.add(view, seen, T_cw @ se3_inverse(slam_map.T_cw[0]), 0)
+    return made
+
+
+@pytest.fixture
+def run(world: World, camera: Camera, results: list[StepResult]) -> Run:
+    """A run with one world."""
+    return Run(
+        worlds=(world,),
+        camera=camera,
+        config=Config(),
+        results=results,
+        skipped=["image 31 is not an image"],
+        interrupted=False,
+        failure="",
+    )
+
+
+@pytest.fixture
 def results() -> list[StepResult]:
     """Initialising, tracking with keyframes, lost for a while, tracking again."""
     states = [State.INITIALIZING] * 3 + [State.TRACKING] * 15 + [State.LOST] * 4 + [State.TRACKING] * 8
@@ -81,6 +114,7 @@ def _result(index: int, state: State) -> StepResult:
         timestamp=100.0 + index / 30,
         state=state,
         T_cw=T_cw,
+        world=0 if is_tracking else None,
         is_keyframe=is_keyframe,
         matches=100 + index if is_tracking else 8,
         inliers=90 + index if is_tracking else 0,

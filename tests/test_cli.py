@@ -61,6 +61,7 @@ def test_run_writes_all_results(finished: Path) -> None:
     }
     files = {
         "trajectory.txt",
+        "online.txt",
         "keyframes.txt",
         "groundtruth.txt",
         "map.safetensors",
@@ -71,6 +72,8 @@ def test_run_writes_all_results(finished: Path) -> None:
     figures = json.loads((finished / "metrics.json").read_text())
     assert figures["frames"] == 16
     assert len(read_trajectory(finished / "trajectory.txt")) == figures["posed"]
+    assert len(read_trajectory(finished / "online.txt")) == figures["frames"] - figures["initialised_at"]
+    assert figures["online_ate_m"] < 0.05 * figures["path_length_m"]
     assert len(read_trajectory(finished / "keyframes.txt")) == figures["keyframes"]
     assert read_map(finished / "map.safetensors")[0].num_points == figures["points"]
     assert figures["ate_m"] < 0.05 * figures["path_length_m"]
@@ -125,6 +128,8 @@ def test_demo_shares_the_way_of_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.commands.demo.SEQUENCE", ROOM)
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "metrics.json").write_text("of an earlier time: the demo writes over it")
     status, out, err = run_and_read(capsys, "demo", "--output", str(tmp_path / "demo"), *FAST)
     assert status == 0
     assert "ATE" in out
@@ -289,10 +294,28 @@ def test_results_that_cannot_be_written_stop_before_the_run(
     assert str(tmp_path / "file") in err
 
 
+def test_a_folder_that_cannot_be_written_to_stops_before_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, content: bytes) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("torchslam.commands.folder.write_whole", refuse)
+    monkeypatch.setattr("torchslam.commands.run.SLAM", None)  # nothing is begun
+    status, _, err = run_and_read(capsys, "run", ROOM, "--output", str(tmp_path))
+    assert status == 2
+    assert "Permission denied" in err
+    assert str(tmp_path) in err
+
+
 def test_plot_of_an_incomplete_folder_names_what_is_missing(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "map.safetensors").write_bytes((finished / "map.safetensors").read_bytes())
+    status, _, err = run_and_read(capsys, "plot", str(tmp_path))
+    assert status == 2
+    assert "metrics.json" in err
+    (tmp_path / "metrics.json").write_bytes((finished / "metrics.json").read_bytes())
     status, _, err = run_and_read(capsys, "plot", str(tmp_path))
     assert status == 2
     assert "trajectory.txt" in err
@@ -306,6 +329,13 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["run", ROOM], ["run", ROOM, "-o", "x", "--features", "sift"], ["fly"], []):
+    for arguments in (
+        ["run", ROOM, "-o", "x", "--checkpoint", "-1"],
+        ["run", ROOM, "-o", "x", "--resume", "--overwrite"],
+        ["run", ROOM],
+        ["run", ROOM, "-o", "x", "--features", "sift"],
+        ["fly"],
+        [],
+    ):
         with pytest.raises(SystemExit, match="2"):
             main(arguments)

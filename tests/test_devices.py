@@ -35,7 +35,7 @@ def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
     ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids.cpu()].to(device)).backward()
     assert pixels.grad is not None
     assert camera.params.grad is not None
-    covariances = solution.keyframes.covariance().frames
+    covariances = solution.keyframes[0].covariance().frames
     found = {"T_wc": run.trajectory.T_wc, "camera": camera.params.grad, "covariances": covariances}
     return {name: tensor.detach().cpu() for name, tensor in found.items()}
 

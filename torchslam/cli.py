@@ -1,6 +1,7 @@
 """The command line: `torchslam run | demo | eval | plot | info | download`.
 
-Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised, 130 interrupted.
+Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
+130 and 143 ended by Ctrl-C and by SIGTERM.
 """
 
 from __future__ import annotations

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 
 from torchslam.config import Config
-from torchslam.errors import ConfigError
+from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures, extractor
 from torchslam.geometry import Camera
 from torchslam.values import Features, Frame
@@ -20,6 +21,30 @@ def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extra
     settings = config.features
     module = extractor(settings.kind, settings.num_keypoints, settings.weights or None).to(device)
     return lambda frame: module(frame.image.to(device))
+
+
+def check_size(frame: Frame, camera: Camera) -> None:
+    """Raises FrameError where the image has not the size that the camera has."""
+    height, width = frame.image.shape[-2:]
+    if (width, height) != camera.size:
+        raise FrameError(
+            f"{_name(frame)} has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
+        )
+
+
+def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
+    """Raises FrameError where a frame does not come after the last one, by index and timestamp, or has no time."""
+    if not math.isfinite(frame.timestamp):
+        raise FrameError(f"{_name(frame)} has the time {frame.timestamp}")
+    if last is not None and (frame.index <= last[0] or frame.timestamp <= last[1]):
+        raise FrameError(
+            f"{_name(frame)}, frame {frame.index} at {frame.timestamp} s, does not come after "
+            f"frame {last[0]} at {last[1]} s"
+        )
+
+
+def _name(frame: Frame) -> str:
+    return frame.name or f"frame {frame.index}"
 
 
 def simulated_extractor(config: Config, camera: Camera, T_cw_groundtruth: torch.Tensor) -> Extractor:

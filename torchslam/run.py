@@ -5,18 +5,19 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import ConfigError, FrameError, InitializationError
+from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
 from torchslam.front_end import simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.mapping.local_bundle import adjust_all
-from torchslam.solvers.graph import solve
+from torchslam.solvers.graph import join, solve
+from torchslam.solvers.levenberg import Progress
 from torchslam.values import State, StepResult, Trajectory
 from torchslam.world.history import History, RunGraph
 from torchslam.world.map import Map
@@ -34,7 +35,9 @@ class Run:
     results:     one per processed frame
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
-    failure:     why there is no map; empty when there is one
+    failure:     why no frame has a pose; empty when some have
+    session:     number of the run among those over the same map; frames and trajectories are those of this session
+    sessions:    how many sessions the map has; one that was only localised is none of them
     """
 
     worlds: tuple[World, ...]
@@ -44,11 +47,13 @@ class Run:
     skipped: list[str]
     interrupted: bool
     failure: str
+    session: int = 0
+    sessions: int = 1
 
     @property
     def main(self) -> World | None:
-        """The world in which most frames are posed; None where there is no map."""
-        return max(self.worlds, key=lambda world: len(world.history), default=None)
+        """The world in which most frames of the run are posed; None where there is no map."""
+        return max(self.worlds, key=lambda world: world.history.count(self.session), default=None)
 
     @property
     def map(self) -> Map:
@@ -63,12 +68,12 @@ class Run:
     @property
     def trajectory(self) -> Trajectory:
         """Every posed frame of the main world, after everything that was learned later."""
-        return Trajectory.empty() if self.main is None else self.main.trajectory()
+        return Trajectory.empty() if self.main is None else self.main.trajectory(self.session)
 
     @property
     def keyframes(self) -> Trajectory:
         """The keyframes of the main world alone."""
-        return keyframe_trajectory(self.map)
+        return keyframe_trajectory(self.map, self.session)
 
     @property
     def online(self) -> Trajectory:
@@ -83,51 +88,91 @@ class Run:
 
     @property
     def graph(self) -> RunGraph:
-        """Everything the run saw, as one differentiable problem: `torchslam.solve(run.graph)` gives its trajectory.
+        """Everything the worlds know, as one differentiable problem: `torchslam.solve(run.graph)` gives all poses.
+
+        Where there are several worlds, `graph.world` says whose poses can be compared with each other.
 
         Raises InitializationError where there is no map.
         """
-        if self.failure:
+        if not self.worlds:
             raise InitializationError(self.failure)
-        return self.history.graph(self.map, self.camera)
+        return join([world.history.graph(world.map, self.camera, world.number) for world in self.worlds])
 
 
-def run_sequence(slam: SLAM, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
+@dataclass
+class Progressed:
+    """How far a run has come.
+
+    next:    index of the frame that comes next
+    results: one per processed frame; skipped: the frames that could not be read, in words
+    """
+
+    next: int = 0
+    results: list[StepResult] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+
+def run_sequence(
+    slam: SLAM,
+    sequence: Sequence,
+    progress: Callable[[StepResult], None] | None = None,
+    so_far: Progressed | None = None,
+    adjusting: Progress | None = None,
+) -> Run:
     """Feed every frame of a sequence to the system.
 
-    A frame that cannot be read is skipped with a warning and counted; an interrupt ends the run and keeps what
-    there is.
+    A frame that cannot be read, or that does not fit the camera or the order of time, is skipped with a warning and
+    counted; an interrupt ends the run, or its final adjustment, and keeps what there is.
+
+    so_far:    where to go on, and what is kept up to date after every frame
+    adjusting: told before each iteration of the final adjustments its number and how many there are at most
+
+    Raises TorchslamError where the system has processed frames that `so_far` does not know of.
     """
+    if slam.last_frame is not None and (so_far is None or not so_far.next):
+        raise TorchslamError(
+            "this SLAM has processed frames already: call reset() to begin anew, "
+            "or save() its worlds and SLAM.load() them to go on there"
+        )
+    so_far = Progressed() if so_far is None else so_far
     if slam.extractor is None:
         slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
-    results: list[StepResult] = []
-    skipped: list[str] = []
     interrupted = False
     try:
-        for index in range(len(sequence)):
+        for index in range(so_far.next, len(sequence)):
             try:
-                frame = sequence[index]
+                so_far.results.append(slam.step(sequence[index]))
             except FrameError as error:
                 warnings.warn(f"skipped a frame: {error}", stacklevel=2)
-                skipped.append(str(error))
+                so_far.skipped.append(str(error))
+                so_far.next = index + 1
                 continue
-            results.append(slam.step(frame))
+            so_far.next = index + 1
             if progress is not None:
-                progress(results[-1])
+                progress(so_far.results[-1])
     except KeyboardInterrupt:
         interrupted = True
-    return finish(slam, results, skipped, interrupted)
+    return finish(slam, so_far.results, so_far.skipped, interrupted, adjusting)
 
 
-def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupted: bool) -> Run:
-    """Adjust the whole map if so configured, and gather what the run leaves behind."""
+def finish(
+    slam: SLAM,
+    results: list[StepResult],
+    skipped: list[str],
+    interrupted: bool,
+    adjusting: Progress | None = None,
+) -> Run:
+    """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.no_grad():
         slam.settle()
-    for world in slam.worlds:
-        if slam.config.bundle.enabled and slam.config.bundle.final:
-            adjust_all(world.map, slam.camera, slam.config.bundle)
-            graph = world.history.graph(world.map, slam.camera)
-            world.history.take(solve(graph, backward="detached"), graph, world.map)
+    try:
+        for world in slam.worlds:
+            if slam.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
+                adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
+                graph = world.history.graph(world.map, slam.camera)
+                world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
+    except KeyboardInterrupt:
+        interrupted = True
     return Run(
         tuple(slam.worlds),
         slam.camera,
@@ -135,16 +180,35 @@ def finish(slam: SLAM, results: list[StepResult], skipped: list[str], interrupte
         results,
         skipped,
         interrupted,
-        "" if len(slam.worlds) else why_no_map(results, skipped),
+        why_no_pose(slam, results, skipped),
+        slam.session,
+        slam.sessions,
     )
 
 
-def keyframe_trajectory(slam_map: Map) -> Trajectory:
-    """The keyframes, camera to world, in order of time."""
+def keyframe_rows(slam_map: Map, session: int) -> torch.Tensor:
+    """(k,) the keyframes of one session, in order of time."""
     if slam_map.num_keyframes == 0:
-        return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
-    order = torch.argsort(slam_map.keyframes["timestamp"], stable=True)
-    return Trajectory(slam_map.keyframes["timestamp"][order], se3_inverse(slam_map.T_cw[order]))
+        return torch.zeros(0, dtype=torch.int64)
+    rows = torch.nonzero(slam_map.keyframes["session"] == session)[:, 0]
+    return rows[torch.argsort(slam_map.keyframes["timestamp"][rows], stable=True)]
+
+
+def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
+    """The keyframes of one session, camera to world, in order of time."""
+    rows = keyframe_rows(slam_map, session)
+    if len(rows) == 0:
+        return Trajectory.empty()
+    return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
+
+
+def why_no_pose(slam: SLAM, results: list[StepResult], skipped: list[str]) -> str:
+    """Why no frame of the session has a pose, in one sentence; empty where some have."""
+    if len(slam.worlds) == 0:
+        return why_no_map(results, skipped)
+    if any(world.history.count(slam.session) for world in slam.worlds):
+        return ""
+    return f"none of {len(results)} frames was recognised in the map"
 
 
 def why_no_map(results: list[StepResult], skipped: list[str]) -> str:

@@ -7,13 +7,15 @@ frame -> features -> follow the world at hand (track, judge) -> keyframe? -> map
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import ConfigError
-from torchslam.front_end import Extractor, image_extractor
+from torchslam.errors import ConfigError, ResultsError
+from torchslam.front_end import Extractor, check_order, check_size, image_extractor
 from torchslam.geometry import Camera
 from torchslam.loops.closing import close_loop, join
 from torchslam.loops.places import Places
@@ -34,6 +36,9 @@ from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
 from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
 from torchslam.world.map import Map
+from torchslam.world.map_check import why_not_alike
+from torchslam.world.map_file import Saved, read_worlds, write_worlds
+from torchslam.world.track import Track
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
@@ -45,6 +50,7 @@ class SLAM:
     """Give it frames one after the other; ask it for the map and the trajectory at any time.
 
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
+    `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
     """
 
     def __init__(
@@ -54,7 +60,7 @@ class SLAM:
         self.camera = camera.to(torch.float64)
         if extractor is None and self.config.features.kind != "simulated":
             extractor = image_extractor(self.config, self.camera.params.device)
-        self.extractor = extractor  # None: `run` makes simulated features from the true poses of the sequence
+        self._image_extractor = extractor
         self.clock = Stopwatch()
         self.tracker = Tracker(self.camera, self.config)
         self.relocalizer = Relocalizer(self.tracker, self.config)
@@ -63,7 +69,60 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget everything and wait for a new start."""
-        self.worlds = Worlds(self.camera.params)
+        # None: `run` makes simulated features from the true poses of the sequence
+        self.extractor = self._image_extractor
+        self._enter(Worlds(self.camera.params), session=0, mapping=True)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        config: Config | None = None,
+        extractor: Extractor | None = None,
+        mapping: bool = True,
+        device: torch.device | str = "cpu",
+    ) -> SLAM:
+        """Go on in the worlds of a file that `save` wrote, with its camera: lost at first, in a session of its own.
+
+        mapping: without it, frames are only localised: no keyframe, point or world is made, none is changed
+
+        Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
+        """
+        saved = read_worlds(path, device)
+        if not mapping and len(saved.worlds) == 0:
+            raise ResultsError(f"{path}: there is no world in it to localise in")
+        slam = cls(saved.camera, config, extractor)
+        slam.enter(saved, mapping)
+        for world in slam.worlds if mapping else ():
+            world.map.forget_frames()
+        return slam
+
+    def save(self, path: str | Path) -> None:
+        """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
+        write_worlds(path, self.worlds, self.camera, self.sessions)
+
+    @property
+    def sessions(self) -> int:
+        """How many sessions the worlds know."""
+        return self.session + int(self.mapping)
+
+    def enter(self, saved: Saved, mapping: bool = True) -> None:
+        """Begin a session in saved worlds; `mapping` as in `load`."""
+        self._enter(saved.worlds, saved.sessions, mapping)
+        for world in self.worlds:
+            for keyframe in range(world.map.num_keyframes):
+                self._remember(world.map, keyframe)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a world is followed that has proved itself, and no frame is held back."""
+        return self.world is not None and self.youth is None and not self.probation
+
+    def _enter(self, worlds: Worlds, session: int, mapping: bool) -> None:
+        """Begin a session: which worlds there are, and nothing else."""
+        self.worlds, self.session, self.mapping = worlds, session, mapping
+        self.tracker.counts = mapping
+        self.last_frame: tuple[int, float] | None = None  # index and timestamp
         self.places = Places()
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
@@ -76,7 +135,10 @@ class SLAM:
 
     @torch.no_grad()
     def step(self, frame: Frame) -> StepResult:
-        """Process one frame. A frame without a pose is no error: the result says why there is none."""
+        """Process one frame. A frame without a pose is no error: the result says why there is none.
+
+        Raises FrameError for an image of another size and for a frame that does not come after the last one.
+        """
         view = self._look(frame)
         return self._find(view) if self.world is None else self._follow(self.world, view)
 
@@ -85,14 +147,14 @@ class SLAM:
         return run_sequence(self, sequence, progress)
 
     def trajectory(self) -> Trajectory:
-        """Every posed frame of the main world, by the map as it is now."""
-        world = self.worlds.main()
-        return Trajectory.empty() if world is None else world.trajectory()
+        """Every posed frame of this session in its main world, by the map as it is now."""
+        world = self.worlds.main(self.session)
+        return Trajectory.empty() if world is None else world.trajectory(self.session)
 
     @property
     def map(self) -> Map:
         """Of the world that is followed, or else of the one with most frames; empty where there is none."""
-        world = self.world or self.worlds.main()
+        world = self.world or self.worlds.main(self.session)
         return Map() if world is None else world.map
 
     def _look(self, frame: Frame) -> View:
@@ -100,9 +162,23 @@ class SLAM:
             raise ConfigError(
                 "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
             )
+        check_order(frame, self.last_frame)
+        if self._image_extractor is not None:
+            check_size(frame, self.camera)
         with self.clock("features"):
-            self.seen = View.of(frame, self.extractor(frame), self.camera.params)
+            view = View.of(frame, self.extractor(frame), self.camera.params)
+            self.seen = replace(view, session=self.session)
+            if self.last_frame is None:
+                self._check_kind(self.seen)
+            self.last_frame = frame.index, frame.timestamp
             return self.stillness.clear_of(self.seen)
+
+    def _check_kind(self, view: View) -> None:
+        """Raises ConfigError where the front end is another one than that of the worlds."""
+        for world in self.worlds:
+            wrong = why_not_alike(world.map, view, to_map=self.mapping)
+            if wrong:
+                raise ConfigError(f"the map was made with another front end: {wrong}")
 
     # --- following a world -----------------------------------------------------------------------------------
 
@@ -122,7 +198,8 @@ class SLAM:
         if is_keyframe:
             world = self._recall(world)
             self._tidy(world)
-        if self.config.stillness.enabled and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
+        watch = self.config.stillness.enabled and self.mapping
+        if watch and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
             drop_covered(world, self.stillness.covers)
             why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
         if self.youth is not None:
@@ -133,12 +210,12 @@ class SLAM:
 
     def _take(self, world: World, view: View, tracked: Tracked) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing."""
-        why = why_keyframe(view, tracked, world, self.config.keyframes)
+        why = why_keyframe(view, tracked, world, self.config.keyframes) if self.mapping else ""
         if why:
             keyframe = self.mapper.insert(world.map, view, tracked)
             self._remember(world.map, keyframe)
             self.tracker.follow(world, keyframe)
-        world.map.points["times_found"][tracked.point_ids] += 1
+        self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
@@ -182,7 +259,7 @@ class SLAM:
             return self._result(view, doubt or self.probation.reason, world, tracked)
         held = self.probation.release()
         for earlier in held:
-            world.map.points["times_found"][earlier[1].point_ids] += 1
+            self.tracker.vouch(world.map, earlier[1])
             world.history.add(*earlier)
         if self.probation.came_back:
             first, located, _, _ = held[0]
@@ -213,6 +290,11 @@ class SLAM:
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
 
+    def resume(self, world: World, track: Track, last_frame: tuple[int, float]) -> None:
+        """Go on in one of the worlds from where the camera was, as if nothing had happened in between."""
+        world.track = track
+        self.world, self.state, self.last_frame = world, State.TRACKING, last_frame
+
     def _find(self, view: View) -> StepResult:
         """Come back to a known place, or else begin a new world; the frame waits until there is a pose for it."""
         self.lost_for += 1
@@ -222,7 +304,8 @@ class SLAM:
             if found is not None:
                 return self._return(view, *found)
         self.waiting.add(view)
-        if len(self.worlds) and self.lost_for <= self.config.relocalization.patience:
+        patient = self.lost_for <= self.config.relocalization.patience or not self.mapping
+        if len(self.worlds) and patient:
             return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
@@ -272,7 +355,7 @@ class SLAM:
         tracked = self.tracker.track(world, view)
         if tracked is None:
             return False
-        world.map.points["times_found"][tracked.point_ids] += 1
+        self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return tracked.inliers > 0.5 * tracked.matches
 

@@ -164,9 +164,9 @@ class Tracked:
     matches: int
     covariance: Tensor
     depth: float
-    error: float
-    coverage: float
-    explained: float
+    error: float = 0.0
+    coverage: float = 1.0
+    explained: float = 1.0
 
     @property
     def inliers(self) -> int:

@@ -91,7 +91,7 @@ def measure(name: str, sequence: Sequence) -> dict[str, float]:
         seconds = {"adjust": middle - start, "backward": time.process_time() - middle}
     return seconds | {
         "mib": _peak_mib() - before,
-        "iterations": int(solution.keyframes.convergence.iterations),
+        "iterations": int(solution.keyframes[0].convergence.iterations),
         "ate_m": ate(solution.T_cw[known], T_cw[known]).item(),
     }
 

@@ -87,7 +87,7 @@ def least_cost(graph: ObservationGraph, theta: Tensor) -> LeastCost:
         for component in gradient
     ]
     hessian = torch.stack(rows)
-    moved = 6 * (len(graph.T_cw) - 1) + 3 * int(solution.keyframes.moved_points.sum())
+    moved = 6 * (len(graph.T_cw) - 1) + 3 * int(solution.moved_points.sum())
     return LeastCost(
         cost.detach(),
         gradient.detach(),
@@ -104,7 +104,7 @@ def least_cost(graph: ObservationGraph, theta: Tensor) -> LeastCost:
 
 def _cost(graph: ObservationGraph, solution: GraphSolution, camera: Camera) -> tuple[Tensor, int]:
     """Half the sum of the robust squared reprojection errors, as `bundle_adjust` has it, and how many count."""
-    counted = solution.keyframes.moved_points[graph.point_index]
+    counted = solution.moved_points[graph.point_index]
     frames, points = graph.frame_index[counted], graph.point_index[counted]
     points_c = transform(solution.T_cw[frames], solution.points_w[points][:, None])
     pixels, valid = camera.project(points_c)

@@ -152,3 +152,17 @@ def test_a_batch_is_its_clips() -> None:
     assert len(two.graphs) == len(two.solutions) == 2
     with pytest.raises(ValueError, match="images must be"):
         clip_slam(images[0], walk.camera)
+
+
+def test_a_clip_that_falls_apart_has_the_poses_of_its_main_world() -> None:
+    """It looks ahead in most frames, and back in the others: what cannot be compared is not posed."""
+    poses = torch.cat([arc(22, length=1.0), arc(10, length=1.0)])
+    poses[22:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y
+    walk = Walk(poses)
+    images, truth = clip_of(walk)
+    config = load_config(
+        None, ["relocalization.patience=1", "initialization.min_frames=2", "bundle.final=false"]
+    )
+    poses_found = ClipSLAM(BentEyes(walk, bend=0.0), config=config)(images, walk.camera)
+    assert poses_found.posed.tolist() == [True] * 22 + [False] * 10
+    assert float(ate(poses_found.T_cw, truth, poses_found.posed).detach()) < 0.01

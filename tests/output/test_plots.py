@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 from torchslam.output import plots
 from torchslam.output.plots import style
 from torchslam.output.plots.scene import _wrapped
-from torchslam.values import StepResult, Trajectory
+from torchslam.values import State, StepResult, Trajectory
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -132,6 +133,18 @@ def test_spans_without_a_pose_are_shaded(results: list[StepResult]) -> None:
     lost = spans["lost"]
     assert lost.get_x() == pytest.approx(18 / 30)
     assert lost.get_width() == pytest.approx(4 / 30)
+
+
+def test_uncertain_spans_are_shaded_in_their_own_colour(results: list[StepResult]) -> None:
+    doubtful = [
+        replace(result, state=State.UNCERTAIN) if 6 <= result.index < 9 else result for result in results
+    ]
+    patches = plots.plot_tracking(doubtful).axes[0].patches
+    spans = {patch.get_label(): patch for patch in patches if not patch.get_label().startswith("_")}
+    assert spans.keys() == {"initialising", "lost", "uncertain"}
+    assert spans["uncertain"].get_x() == pytest.approx(6 / 30)
+    assert spans["uncertain"].get_width() == pytest.approx(3 / 30)
+    assert len({patch.get_facecolor() for patch in spans.values()}) == 3
 
 
 def test_error_picture_states_the_rmse(results: list[StepResult]) -> None:

@@ -6,31 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchslam.config import Config
 from torchslam.evaluation import evaluate
-from torchslam.geometry import Camera
 from torchslam.output.report import metrics, summary, table
-from torchslam.run import Run, keyframe_trajectory
-from torchslam.values import State, StepResult, Trajectory
-from torchslam.world.history import History
-from torchslam.world.map import Map
-
-
-@pytest.fixture
-def run(trajectory: Trajectory, slam_map: Map, camera: Camera, results: list[StepResult]) -> Run:
-    posed = torch.tensor([result.T_cw is not None for result in results])
-    return Run(
-        trajectory=Trajectory(trajectory.timestamps[posed], trajectory.T_wc[posed]),
-        keyframes=keyframe_trajectory(slam_map),
-        map=slam_map,
-        history=History(),
-        camera=camera,
-        config=Config(),
-        results=results,
-        skipped=["image 31 is not an image"],
-        interrupted=False,
-        failure="",
-    )
+from torchslam.run import Run
+from torchslam.values import State, Tracked, Trajectory
+from torchslam.world.world import World
 
 
 def test_counts(run: Run) -> None:
@@ -43,6 +23,38 @@ def test_counts(run: Run) -> None:
     assert figures["keyframes"] == 6
     assert figures["points"] == 119
     assert figures["skipped"] == ["image 31 is not an image"]
+    assert (figures["session"], figures["world"]) == (0, 0)
+    counts = {"world": 0, "keyframes": 6, "points": 119, "posed": 23, "uncertain": 0, "lost": 4}
+    assert figures["worlds"] == [counts]
+
+
+def test_counts_of_several_worlds_and_sessions(run: Run, world: World) -> None:
+    """Frames 10 to 14 uncertain in world 0; from frame 22 in world 3, which has as many frames of another session."""
+    other = World(3, world.track)
+    other.map.add_keyframe(replace(world.map.view(0), session=2), world.map.T_cw[0])
+    for index in range(30):
+        view = replace(world.map.view(0), index=index, session=int(index < 22))
+        tracked = Tracked(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
+        other.history.add(view, tracked, torch.eye(4, dtype=torch.float64), 0)
+    results = [
+        replace(
+            result,
+            state=State.UNCERTAIN if 10 <= result.index < 15 else result.state,
+            world=3 if result.index >= 22 else result.world,
+        )
+        for result in run.results
+    ]
+    figures = metrics(replace(run, worlds=(world, other), results=results))
+    assert figures["world"] == 0  # most frames of this session, not of all
+    assert [counts["posed"] for counts in figures["worlds"]] == [23, 8]
+    assert [counts["uncertain"] for counts in figures["worlds"]] == [5, 0]
+    assert [counts["lost"] for counts in figures["worlds"]] == [4, 0]
+    words = summary(figures)
+    assert words["world"] == "0, the main one of 2; world 3: 8 frames posed, 1 keyframes"
+    assert words["lost"] == "4 frames; 5 had an uncertain pose"
+    again = metrics(replace(run, worlds=(world, other), results=results, session=1))
+    assert again["world"] == 3
+    assert summary(again)["session"] == "1, which made 0 of the keyframes"
 
 
 def test_times(run: Run) -> None:
@@ -68,6 +80,11 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
     assert figures["scale"] == pytest.approx(2.0)
     assert figures["ate_se3_m"] > 0.1
     assert figures["path_length_m"] > 0
+    assert "online_ate_m" not in figures
+    truth = Trajectory(trajectory.timestamps, doubled)
+    both = metrics(run, evaluate(run.trajectory, truth), evaluate(trajectory, truth))
+    assert both == figures | {"online_ate_m": pytest.approx(0.0, abs=1e-9)}
+    assert "online ATE" in summary(both)
     assert {"translation_m", "rotation_deg"} <= figures["rpe"].keys()
     assert json.loads(json.dumps(figures)) == figures
     words = table(summary(figures))
@@ -81,12 +98,9 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
 
 
 def test_a_run_without_a_map(run: Run) -> None:
-    nothing = Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
     failed = replace(
         run,
-        trajectory=nothing,
-        keyframes=nothing,
-        map=Map(),
+        worlds=(),
         results=run.results[:3],
         failure="no map was initialised in 3 frames: the camera does not move",
     )

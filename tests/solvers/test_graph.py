@@ -2,10 +2,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from torchslam.errors import TorchslamError
+from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
-from torchslam.solvers.graph import ObservationGraph, solve
+from torchslam.solvers.graph import ObservationGraph, join, solve
+from torchslam.world.history import RunGraph
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 
@@ -95,7 +99,7 @@ def test_every_observation_has_a_gradient_and_free_camera_ends_it():
     graph = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
     solution = solve(graph)
     aligned_error(solution, truth).backward()
-    counted = solution.keyframes.moved_points[graph.point_index]  # points that at least two keyframes see
+    counted = solution.moved_points[graph.point_index]  # points that at least two keyframes see
     assert counted.sum() > 0.7 * len(counted)
     assert torch.equal((pixels.grad != 0).any(-1), counted)
     assert (params.grad != 0).all()
@@ -138,6 +142,131 @@ def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
     loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
     assert loaded.camera.size == (640, 480)
     assert torch.equal(solve(loaded).T_cw, solve(graph).T_cw)
+
+
+def run_graph(graph, start=0):
+    """The graph with names of its rows."""
+    columns = {name: getattr(graph, name) for name in graph.columns()}
+    return RunGraph(
+        **columns,
+        camera=graph.camera,
+        frame_ids=start + torch.arange(len(graph.T_cw)),
+        sessions=torch.arange(len(graph.T_cw)) % 2,
+        point_ids=2 * torch.arange(len(graph.points_w)),
+        keypoint_index=7 + torch.arange(len(graph.pixels)),
+    )
+
+
+def test_a_run_graph_keeps_its_row_numbers(tmp_path):
+    path = tmp_path / "graph.safetensors"
+    graph = run_graph(replace(simulated()[1], world=torch.full((10,), 3)), start=5)
+    graph.save(path)
+    loaded = RunGraph.load(path)
+    assert type(loaded) is RunGraph
+    for name in graph.columns():
+        assert torch.equal(getattr(loaded, name), getattr(graph, name)), name
+    plain = ObservationGraph.load(path)
+    assert type(plain) is ObservationGraph
+    assert torch.equal(plain.world, graph.world)
+    plain.save(path)
+    with pytest.raises(TorchslamError, match="is not an observation graph"):
+        RunGraph.load(path)
+
+
+def test_a_file_from_before_there_were_worlds_has_one(tmp_path):
+    _, graph = simulated()
+    graph.save(tmp_path / "new")
+    with safe_open(tmp_path / "new", framework="pt") as file:
+        metadata, names = file.metadata(), set(file.keys()) - {"world"}
+        save_file({name: file.get_tensor(name) for name in names}, tmp_path / "old", metadata)
+    assert torch.equal(ObservationGraph.load(tmp_path / "old").world, torch.zeros(10, dtype=torch.int64))
+
+
+def two_worlds():
+    """Truths and graphs of two worlds that share a camera, and both as one graph in an order of its own."""
+    (truth_1, one), (truth_2, two) = simulated(seed=0), simulated(frames=7, points=30, seed=1)
+    one, two = replace(one, world=torch.full((10,), 4)), replace(two, world=torch.full((7,), 1))
+    return (truth_1, truth_2), (one, two), join([one, two])
+
+
+def test_worlds_are_solved_each_on_its_own():
+    _, (one, two), both = two_worlds()
+    assert both.worlds == [1, 4]
+    solution, first, second = solve(both), solve(one), solve(two)
+    assert torch.equal(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
+    assert torch.equal(solution.points_w, torch.cat([first.points_w, second.points_w]))
+    assert torch.equal(solution.success, torch.cat([first.success, second.success]))
+    assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
+    assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
+    assert torch.equal(solution.world, both.world)
+    for world, alone in ((4, first), (1, second)):
+        assert torch.equal(solution.trajectory_in(world).T_wc, alone.trajectory.T_wc)
+    assert torch.equal(solution.trajectory.T_wc, first.trajectory.T_wc)  # ten frames against seven
+    assert torch.equal(solution.T_cw[0], both.T_cw[0])
+    assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either
+    assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)
+
+
+def test_rows_of_worlds_may_be_mixed():
+    _, _, both = two_worlds()
+    generator = torch.Generator().manual_seed(3)
+    # Frames stay in order within their world: the first keyframe is the one that is fixed.
+    order = torch.cat([torch.arange(5), torch.arange(10, 14), torch.arange(5, 10), torch.arange(14, 17)])
+    place, rows = torch.argsort(order), torch.randperm(len(both.pixels), generator=generator)
+    shuffled = replace(
+        both,
+        timestamps=both.timestamps[order],
+        T_cw=both.T_cw[order],
+        world=both.world[order],
+        is_keyframe=both.is_keyframe[order],
+        frame_index=place[both.frame_index[rows]],
+        **{name: getattr(both, name)[rows] for name in ("point_index", "pixels", "weights")},
+    )
+    solution, expected = solve(shuffled), solve(both)
+    assert torch.allclose(solution.T_cw, expected.T_cw[order], atol=1e-9)
+    assert torch.allclose(solution.points_w, expected.points_w, atol=1e-8)
+
+
+def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
+    (truth_1, truth_2), (one, two), both = two_worlds()
+
+    def gradients(graph, loss):
+        pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
+        moved = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
+        loss(solve(moved, **CONVERGED).T_cw).backward()
+        return pixels.grad, params.grad
+
+    pixels, params = gradients(both, lambda T_cw: ate(T_cw[:10], truth_1) + ate(T_cw[10:], truth_2))
+    pixels_1, params_1 = gradients(one, lambda T_cw: ate(T_cw, truth_1))
+    pixels_2, params_2 = gradients(two, lambda T_cw: ate(T_cw, truth_2))
+    torch.testing.assert_close(pixels, torch.cat([pixels_1, pixels_2]))
+    torch.testing.assert_close(params, params_1 + params_2)
+    assert (params_1 != 0).all()
+    assert (params_2 != 0).all()
+
+
+def test_worlds_that_cannot_be_solved_are_refused():
+    _, _, both = two_worlds()
+    with pytest.raises(ValueError, match="free camera"):
+        solve(both, free_camera=True)
+    with pytest.raises(ValueError, match="no keyframe"):
+        solve(replace(both, is_keyframe=both.is_keyframe & (both.world == 1)))
+    shared = both.point_index.clone()
+    shared[both.frame_index == 10] = 0
+    with pytest.raises(ValueError, match="seen in two worlds"):
+        solve(replace(both, point_index=shared))
+
+
+def test_joined_run_graphs_keep_their_names():
+    _, graph = simulated()
+    both = join(
+        [run_graph(graph), replace(run_graph(graph, start=100), world=torch.ones(10, dtype=torch.int64))]
+    )
+    assert type(both) is RunGraph
+    assert both.frame_ids.tolist() == [*range(10), *range(100, 110)]
+    assert torch.equal(both.point_ids, torch.cat([2 * torch.arange(50)] * 2))
+    assert torch.equal(both.frame_index[len(graph.pixels) :], graph.frame_index + 10)
+    assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
 
 
 def test_another_file_is_refused(tmp_path):

@@ -13,8 +13,10 @@ from torch import Tensor
 from tests.world.simulated import CAMERA
 from torchslam.values import View
 from torchslam.world.map import NO_POINT, Map
-from torchslam.world.map_file import read_map, write_map
+from torchslam.world.map_file import read_map, write_worlds
 from torchslam.world.observers import Observers, first_of_each, most
+from torchslam.world.track import Track
+from torchslam.world.world import World
 
 KEYPOINTS, DESCRIPTOR = 6, 4
 Change = tuple[str, int, list[int]]
@@ -166,7 +168,9 @@ def test_a_loaded_map_answers_the_same(tmp_path: Path) -> None:
     slam_map = make_map(3, 8)
     for keyframe, ids in ((0, [0, 1, 2]), (1, [1, 2, 3]), (2, [2, 7])):
         slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
-    write_map(tmp_path / "map", slam_map, CAMERA)
+    write_worlds(
+        tmp_path / "map", [World(0, Track.nowhere(torch.zeros(0, dtype=torch.float64)), slam_map)], CAMERA
+    )
     loaded, _ = read_map(tmp_path / "map")
     check(loaded)
     loaded.kill(torch.tensor([2]))

@@ -78,6 +78,14 @@ def _device(text: str) -> torch.device:
     return device
 
 
+def not_negative(text: str) -> int:
+    """A number from 0 on, of an argument."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, not {number}")
+    return number
+
+
 def _positive(text: str) -> int:
     number = int(text)
     if number < 1:

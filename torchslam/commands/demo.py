@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from torchslam.commands import arguments
-from torchslam.commands.run import run
+from torchslam.commands.run import Plan, run
 from torchslam.data import open_sequence
 
 SEQUENCE = "synthetic:room"
@@ -21,4 +21,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    return run(open_sequence(SEQUENCE), arguments.config(options), options.output, options.device)
+    plan = Plan(options.output, options.device, overwrite=True)  # the same room again: nobody's work is lost
+    return run(open_sequence(SEQUENCE), arguments.config(options), plan)

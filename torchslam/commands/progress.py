@@ -1,62 +1,78 @@
-"""The progress bar of a run, and what Ctrl-C does while it is shown."""
+"""The progress bars of a run: over its frames, then over the iterations of the final adjustment."""
 
 from __future__ import annotations
 
-import signal
 import sys
 import warnings
 from collections.abc import Callable
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any
 
 from tqdm import tqdm
 
+from torchslam.commands.stopping import Stopping
 from torchslam.values import StepResult
 
 
 class ProgressBar:
     """Frame, rate, state and points on one line of stderr; warnings are printed above it.
 
-    Ctrl-C takes effect after the frame at hand, when the map is whole; the second one at once.
+    A signal takes effect after the frame, or the iteration, at hand, when the map is whole.
+
+    done: frames that were processed before, by a run that this one goes on with
     """
 
-    def __init__(self, frames: int, count_points: Callable[[], int]) -> None:
+    def __init__(
+        self, frames: int, count_points: Callable[[], int], stopping: Stopping, done: int = 0
+    ) -> None:
         self._count_points = count_points
+        self._stopping = stopping
         self._bar = tqdm(
             total=frames,
+            initial=done,
             unit=" frames",
             file=sys.stderr,
             dynamic_ncols=True,
             bar_format="{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
         )
+        self._adjusting: tqdm | None = None
         self._warnings = warnings.catch_warnings()
-        self._is_stopping = False
 
     def update(self, result: StepResult) -> None:
-        """Move on to the frame of a result. Raises KeyboardInterrupt when Ctrl-C was pressed during it."""
+        """Move on to the frame of a result. Raises KeyboardInterrupt where there is a wish to stop."""
         self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
         self._bar.update(result.index + 1 - self._bar.n)
-        if self._is_stopping:
-            raise KeyboardInterrupt
+        self._stopping.check()
+
+    def adjusting(self, iteration: int, iterations: int) -> None:
+        """Move on to an iteration of the final adjustment. Raises KeyboardInterrupt where there is a wish to stop."""
+        if self._adjusting is None:
+            self._stopping.begin("the adjustment after this iteration")
+            self._bar.close()
+            self._adjusting = tqdm(
+                total=iterations,
+                file=sys.stderr,
+                dynamic_ncols=True,
+                bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
+            )
+        self._adjusting.total, self._adjusting.n = iterations, iteration + 1  # worlds begin anew
+        self._adjusting.refresh()
+        self._stopping.check()
 
     def __enter__(self) -> ProgressBar:
         self._warnings.__enter__()
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = self._show
-        self._handler = signal.signal(signal.SIGINT, self._stop)
+        self._stopping.begin("after this frame")
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        signal.signal(signal.SIGINT, self._handler)
         self._warnings.__exit__(kind, error, trace)
         self._bar.close()
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        self._is_stopping = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        tqdm.write("torchslam: stopping after this frame; again to stop at once", file=sys.stderr)
+        if self._adjusting is not None:
+            self._adjusting.close()
 
     def _show(self, message: Warning | str, *where: Any, **more: Any) -> None:
         tqdm.write(f"torchslam: warning: {message}", file=sys.stderr)

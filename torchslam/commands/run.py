@@ -1,31 +1,55 @@
 """Run SLAM on a sequence and write trajectory, map, figures and pictures.
 
-Exit status: 0 done, 2 an error, 3 no map could be initialised, 130 interrupted (what there is by then is written).
+Exit status: 0 done, 2 an error, 3 no map could be initialised or no frame be localised; 130 and 143 ended by Ctrl-C
+and by SIGTERM (what there is by then is written, and --resume goes on from the last checkpoint).
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
+from torchslam.commands.folder import Checkpoints, prepare
 from torchslam.commands.progress import ProgressBar
+from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
-from torchslam.errors import TrajectoryError
+from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
-from torchslam.output.results import read_results, write_results
-from torchslam.run import Run
+from torchslam.output.results import CHECKPOINT, CONFIG, MAP, read_results, write_results
+from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
+from torchslam.values import StepResult, Trajectory
 
 DONE = 0
 NO_MAP = 3
-INTERRUPTED = 130
+CHECKPOINT_EVERY = 20  # keyframes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where a run reads and writes, beside its sequence.
+
+    output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
+    map:        file of a saved map to go on in, without `mapping` only to localise in it
+    checkpoint: keyframes from one checkpoint to the next; 0: none
+    """
+
+    output: Path
+    device: torch.device
+    overwrite: bool = False
+    resume: bool = False
+    map: Path | None = None
+    mapping: bool = True
+    checkpoint: int = CHECKPOINT_EVERY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,39 +57,126 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
     )
+    existing = parser.add_mutually_exclusive_group()
+    existing.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
+    existing.add_argument(
+        "--resume", action="store_true", help="go on from the folder's checkpoint, if it has one"
+    )
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="DIR|FILE",
+        help="go on in a saved map: its file, or the results it is in, with their configuration unless --config",
+    )
+    parser.add_argument(
+        "--localize", action="store_true", help="with --map: find poses in it, and leave it as it is"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=arguments.not_negative,
+        default=CHECKPOINT_EVERY,
+        metavar="N",
+        help="save the state every N keyframes at the most, for --resume; 0: never (default: %(default)s)",
+    )
     arguments.add_device(parser)
     arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    return run(arguments.sequence(options), arguments.config(options), options.output, options.device)
+    if options.localize and options.map is None:
+        raise ConfigError("--localize needs a --map to find poses in")
+    saved = options.map
+    if saved is not None and saved.is_dir():
+        beside = saved / CONFIG
+        options.config = options.config or (beside if beside.is_file() else None)
+        saved = saved / MAP
+    plan = Plan(
+        output=options.output,
+        device=options.device,
+        overwrite=options.overwrite,
+        resume=options.resume,
+        map=saved,
+        mapping=not options.localize,
+        checkpoint=options.checkpoint,
+    )
+    return run(arguments.sequence(options), arguments.config(options), plan)
 
 
-def run(sequence: Sequence, config: Config, output: Path, device: torch.device) -> int:
+def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
-    output.mkdir(parents=True, exist_ok=True)  # better now than after an hour's run
-    slam = SLAM(sequence.camera.to(device), config)
-    with ProgressBar(len(sequence), lambda: slam.map.num_points) as progress:
-        finished = slam.run(sequence, progress.update)
-    figures = metrics(finished, _evaluate(finished, sequence))
-    write_results(finished, sequence, figures, output)
-    draw(read_results(output), output)
-    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(output)})}")
+    prepare(plan.output, plan.overwrite, plan.resume)
+    slam, so_far = _begin(sequence, config, plan)
+    checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
+    with Stopping() as stopping:
+        bar = ProgressBar(len(sequence), lambda: slam.map.num_points, stopping, so_far.next)
+        with bar as progress:
+
+            def after_frame(result: StepResult) -> None:
+                checkpoints.offer(at_once=stopping.is_wanted)
+                progress.update(result)
+
+            finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
+        stopping.begin("when the results are written")
+        figures = _write(finished, sequence, plan.output)
+    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
-        return INTERRUPTED
+        return stopping.status
+    checkpoints.remove()
     if finished.failure:
         print(f"torchslam: {finished.failure}", file=sys.stderr)
         return NO_MAP
     return DONE
 
 
-def _evaluate(finished: Run, sequence: Sequence) -> Evaluation | None:
+def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progressed]:
+    """The system before the first frame, or after the last one that a checkpoint knows."""
+    checkpoint = plan.output / CHECKPOINT
+    if plan.resume and checkpoint.exists():
+        slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
+        print(f"torchslam: going on at frame {so_far.next} of {len(sequence)}", file=sys.stderr)
+        return slam, so_far
+    if plan.resume:
+        print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
+    if plan.map is None:
+        return SLAM(sequence.camera.to(plan.device), config), Progressed()
+    slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
+    known, mine = slam.camera, sequence.camera.to(torch.float64)
+    if (
+        known.model != mine.model
+        or known.size != mine.size
+        or not torch.equal(known.params.cpu(), mine.params)
+    ):
+        raise ResultsError(
+            f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
+            f"the sequence has {_words(mine.model, mine.params, mine.size)}"
+        )
+    return slam, Progressed()
+
+
+def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
+    numbers = ",".join(f"{number:.9g}" for number in params.tolist())
+    return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
+
+
+def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]:
+    """Evaluate, write, draw; returns the figures."""
+    figures = metrics(
+        finished,
+        _evaluate(finished, finished.trajectory, sequence),
+        _evaluate(finished, finished.online, sequence),
+    )
+    write_results(finished, sequence, figures, output)
+    draw(read_results(output), output)
+    return figures
+
+
+def _evaluate(finished: Run, trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
     """The errors against ground truth, where there is one and the run has poses to compare."""
     if sequence.groundtruth is None or finished.failure:
         return None
     try:
-        return evaluate(finished.trajectory, sequence.groundtruth)
+        return evaluate(trajectory, sequence.groundtruth)
     except TrajectoryError as error:
         print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
         return None

@@ -28,7 +28,7 @@ class ClipPoses:
 
     T_cw:      (T, 4, 4) or (B, T, 4, 4) world to camera, float64, the identity where there is no pose. The world is
                the camera of the clip's first keyframe, its unit of length the median depth of the first map.
-    posed:     (T,) or (B, T) bool
+    posed:     (T,) or (B, T) bool; where a clip falls apart into several worlds, the frames of the main one alone
     graphs:    one per clip: what the system saw, with differentiable pixels and weights; None where no map started
     solutions: one per clip: the minimiser of the graph, with points and covariances; None where no map started
     """
@@ -74,7 +74,8 @@ class ClipSLAM(nn.Module):
 
         The front end works where the images are, everything behind it where the camera is. World and unit are
         arbitrary, and without gradient: take a loss that does not depend on them, as `evaluation.ate` and `rpe`. A
-        clip in which no map starts has no posed frame and a gradient of zero. Raises ValueError for another shape.
+        clip in which no map starts has no posed frame and a gradient of zero. Raises ValueError for another shape,
+        FrameError for images that have not the size that the camera has.
         """
         if images.ndim == 5:
             clips = [self._clip(clip, camera) for clip in images]
@@ -114,4 +115,4 @@ class ClipSLAM(nn.Module):
         slam = SLAM(camera, self.config, lambda frame: features[frame.index : frame.index + 1])
         frames = [Frame(index, float(index), image[None]) for index, image in enumerate(images)]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
-        return None if run.failure else run.graph
+        return None if run.main is None else run.main.history.graph(run.map, run.camera)

@@ -1,4 +1,4 @@
-"""What happened to every frame, as a CSV file: state, matches, inliers, reason and milliseconds per stage."""
+"""What happened to every frame, as a CSV file: state, world, matches, inliers, reason and milliseconds per stage."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from pathlib import Path
 from torchslam.errors import ResultsError
 from torchslam.values import State, StepResult
 
-COLUMNS = ("index", "timestamp", "state", "keyframe", "matches", "inliers", "reason")
+COLUMNS = ("index", "timestamp", "state", "world", "keyframe", "matches", "inliers", "reason")
 STAGE_SUFFIX = "_ms"
 
 
 def write_frames(path: str | Path, results: Sequence[StepResult]) -> None:
-    """Write one row per frame; a stage that did not run in a frame is left empty. Poses are in the trajectory file."""
+    """Write one row per frame; what a frame does not have (a world, a stage) is left empty. Poses are in online.txt."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*COLUMNS, *(stage + STAGE_SUFFIX for stage in stages)])
         for result in results:
             times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
-            row = [result.index, repr(result.timestamp), result.state.value, int(result.is_keyframe)]
-            writer.writerow([*row, result.matches, result.inliers, result.reason, *times])
+            world = "" if result.world is None else result.world
+            row = [result.index, repr(result.timestamp), result.state.value, world]
+            writer.writerow(
+                [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, *times]
+            )
 
 
 def read_frames(path: str | Path) -> list[StepResult]:
@@ -42,6 +45,7 @@ def _result(row: dict[str, str], where: str) -> StepResult:
             timestamp=float(row["timestamp"]),
             state=State(row["state"]),
             T_cw=None,
+            world=int(row["world"]) if row["world"] else None,
             is_keyframe=bool(int(row["keyframe"])),
             matches=int(row["matches"]),
             inliers=int(row["inliers"]),

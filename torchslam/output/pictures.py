@@ -13,6 +13,7 @@ from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import rigid, so3_log, transform
 from torchslam.output import plots
 from torchslam.output.results import PLOTS, Results, example_keyframe
+from torchslam.run import keyframe_rows
 from torchslam.values import Trajectory
 from torchslam.world.map import NO_POINT, Map
 
@@ -43,12 +44,13 @@ def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
         return
     yield from _scenes(results)
     if results.example_image is not None:
-        yield "features", _example(results.map, results.example_image)
+        yield from _example(results.map, results.session, results.example_image)
 
 
 def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     evaluation, truth = _evaluation(results), None
-    trajectory, keyframes, title = results.trajectory, results.keyframes, "Path and map"
+    trajectory, keyframes = results.trajectory, results.keyframes
+    title = f"Path and map{_which(results)}"
     S = torch.eye(4, dtype=trajectory.T_wc.dtype)
     if evaluation is not None:
         yield "errors", _errors(evaluation, results)
@@ -60,18 +62,44 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     points_w = transform(S, results.map.positions_w[ids])
     certainty = [
         S[:3, :3] @ covariances_w @ S[:3, :3].mT
-        for covariances_w in (results.map.centre_covariances_w(), results.map.points["covariances_w"][ids])
+        for covariances_w in (
+            results.map.centre_covariances_w()[keyframe_rows(results.map, results.session)],
+            results.map.points["covariances_w"][ids],
+        )
     ]
-    yield "scene", plots.plot_scene(trajectory, points_w, truth, keyframes, unit, title)
-    yield "top_view", plots.plot_top_view(trajectory, points_w, truth, keyframes, unit, title, *certainty)
+    shown = keyframes if len(keyframes) else None  # a run that only localised: its frames' axes instead
+    yield "scene", plots.plot_scene(trajectory, points_w, truth, shown, unit, title)
+    yield (
+        "top_view",
+        plots.plot_top_view(
+            trajectory,
+            points_w,
+            truth,
+            shown,
+            unit,
+            title,
+            keyframe_covariances_w=certainty[0] if len(keyframes) else None,
+            point_covariances_w=certainty[1],
+        ),
+    )
+
+
+def _which(results: Results) -> str:
+    """Which of several worlds, or which session, a picture shows; nothing where there is one of each."""
+    figures, worlds = results.metrics, len(results.metrics["worlds"])
+    of = f" of world {figures['world']}, the main one of {worlds}" if worlds > 1 else ""
+    return of + (f", session {results.session}" if results.session else "")
 
 
 def _truth(results: Results) -> Trajectory | None:
-    """The ground truth from the first frame to the last: it may go on where the run did not."""
+    """The ground truth from the first frame to the last, of the world that is shown: elsewhere it may go far away."""
     truth, frames = results.groundtruth, results.frames
     if truth is None:
         return None
-    during = (truth.timestamps >= frames[0].timestamp) & (truth.timestamps <= frames[-1].timestamp)
+    start, end = frames[0].timestamp, frames[-1].timestamp
+    if len(results.metrics["worlds"]) > 1:
+        start, end = results.trajectory.timestamps[[0, -1]].tolist()
+    during = (truth.timestamps >= start) & (truth.timestamps <= end)
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
@@ -100,22 +128,29 @@ def _evaluation(results: Results) -> Evaluation | None:
     return evaluate(results.trajectory, results.groundtruth)
 
 
-def _example(slam_map: Map, image: Tensor) -> Figure:
+def _example(slam_map: Map, session: int, image: Tensor) -> Iterator[tuple[str, Figure]]:
     """The keypoints of the example keyframe; tails lead back to the keyframe before it."""
-    keyframe = example_keyframe(slam_map)
+    keyframe = example_keyframe(slam_map, session)
+    if keyframe is None:
+        return
     columns = slam_map.keyframes
     mask, ids = columns["mask"][keyframe], columns["point_ids"][keyframe]
     previous = torch.full((len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype)
-    if keyframe > 0:
-        before = columns["point_ids"][keyframe - 1]
-        previous[before[before >= 0]] = columns["keypoints"][keyframe - 1][before >= 0]
+    rows = keyframe_rows(slam_map, session).tolist()
+    if rows[0] != keyframe:
+        before = rows[rows.index(keyframe) - 1]
+        seen = columns["point_ids"][before]
+        previous[seen[seen >= 0]] = columns["keypoints"][before][seen >= 0]
     # NO_POINT, -1, reads the row at the end.
     counts = torch.cat((slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64)))
-    return plots.plot_features(
-        image,
-        columns["keypoints"][keyframe][mask],
-        (ids > NO_POINT)[mask],
-        previous[ids][mask],
-        counts[ids][mask],
-        title=f"Frame {int(columns['frame_index'][keyframe])}",
+    yield (
+        "features",
+        plots.plot_features(
+            image,
+            columns["keypoints"][keyframe][mask],
+            (ids > NO_POINT)[mask],
+            previous[ids][mask],
+            counts[ids][mask],
+            title=f"Frame {int(columns['frame_index'][keyframe])}",
+        ),
     )

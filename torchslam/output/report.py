@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any
@@ -13,13 +14,17 @@ from torchslam.run import Run
 from torchslam.values import State, StepResult
 
 
-def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:
+def metrics(
+    run: Run, evaluation: Evaluation | None = None, online: Evaluation | None = None
+) -> dict[str, Any]:
     """The figures of a run.
 
-    frames counts all that the run met, unreadable ones included; posed those with a pose in the trajectory; lost
-    those that tracking gave up on; initialised_at is the index of the frame that started the map, or None.
+    frames counts all that the run met, unreadable ones included; posed those with a pose in the trajectory; uncertain
+    those whose pose was given as such, lost those that tracking gave up on; initialised_at is the index of the frame
+    that started the map, or None. posed, keyframes and points are of the main world, whose number is world, as far as
+    this run saw it; worlds has the counts of each world: see `world_counts`. session says which run over the map it is.
     Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
-    truth, the figures of the evaluation are added.
+    truth, the figures of the evaluation are added, and as online_ate_m that of the poses as they were given.
     """
     totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
     start = None if run.failure else _start(run.results)
@@ -27,10 +32,14 @@ def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
         "posed_share_after_initialisation": _posed_share(run, start),
+        "uncertain": sum(result.state is State.UNCERTAIN for result in run.results),
         "lost": sum(result.state is State.LOST for result in run.results),
         "initialised_at": None if start is None else start.index,
         "keyframes": len(run.keyframes),
         "points": run.map.num_points,
+        "session": run.session,
+        "world": None if run.main is None else run.main.number,
+        "worlds": world_counts(run),
         "fps": 1e3 / mean(totals) if totals else 0.0,
         "ms_median": median(totals) if totals else 0.0,
         "ms_p95": float(torch.tensor(totals).quantile(0.95)) if totals else 0.0,
@@ -39,7 +48,35 @@ def metrics(run: Run, evaluation: Evaluation | None = None) -> dict[str, Any]:
         "interrupted": run.interrupted,
         "failure": run.failure,
     }
-    return figures | (evaluation.as_dict() if evaluation is not None else {})
+    if evaluation is not None:
+        figures |= evaluation.as_dict()
+    if online is not None:
+        figures["online_ate_m"] = online.ate_m
+    return figures
+
+
+def world_counts(run: Run) -> list[dict[str, int]]:
+    """Per world its number, keyframes and points, and of this run's frames those posed, uncertain and lost in it.
+
+    A frame is lost in the world in which the frame before it was posed, or lost.
+    """
+    uncertain, lost = Counter[int | None](), Counter[int | None]()
+    last: int | None = None
+    for result in run.results:
+        last = last if result.world is None else result.world
+        uncertain[last] += result.state is State.UNCERTAIN
+        lost[last] += result.state is State.LOST
+    return [
+        {
+            "world": world.number,
+            "keyframes": world.map.num_keyframes,
+            "points": world.map.num_points,
+            "posed": world.history.count(run.session),
+            "uncertain": uncertain[world.number],
+            "lost": lost[world.number],
+        }
+        for world in run.worlds
+    ]
 
 
 def stage_times(results: Sequence[StepResult]) -> dict[str, dict[str, float]]:
@@ -69,12 +106,32 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     rows |= {
         "posed": f"{figures['posed']} ({figures['posed'] / frames:.1%}), "
         f"{figures['posed_share_after_initialisation']:.1%} since the start at frame {figures['initialised_at']}",
-        "lost": f"{figures['lost']} frames",
+        "lost": f"{figures['lost']} frames; {figures['uncertain']} had an uncertain pose",
         "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
+    }
+    rows |= _beside(figures)
+    rows |= {
         "speed": f"{figures['fps']:.1f} frames/s; {figures['ms_median']:.0f} ms a frame (median), "
         f"{figures['ms_p95']:.0f} ms (95th percentile)",
     }
     return rows | accuracy(figures)
+
+
+def _beside(figures: Mapping[str, Any]) -> dict[str, str]:
+    """The worlds beside the main one, and the sessions before this one, in words; nothing where there are none."""
+    rows = {}
+    if figures["session"]:
+        (main,) = (world for world in figures["worlds"] if world["world"] == figures["world"])
+        rows["map"] = f"{main['keyframes']} keyframes, {main['points']} points"
+        rows["session"] = f"{figures['session']}, which made {figures['keyframes']} of the keyframes"
+    others = [
+        f"world {world['world']}: {world['posed']} frames posed, {world['keyframes']} keyframes"
+        for world in figures["worlds"]
+        if world["world"] != figures["world"]
+    ]
+    if others:
+        rows["world"] = f"{figures['world']}, the main one of {len(figures['worlds'])}; {'; '.join(others)}"
+    return rows
 
 
 def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
@@ -83,8 +140,10 @@ def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
         return {}
     length = figures["path_length_m"]
     share = f" ({figures['ate_m'] / length:.2%} of the path)" if length > 0 else ""
+    online = {"online ATE": f"{figures['online_ate_m']:.4f} m RMSE"} if "online_ate_m" in figures else {}
     return {
         "ATE": f"{figures['ate_m']:.4f} m RMSE{share}, Sim(3)-aligned; {figures['ate_se3_m']:.4f} m without the scale",
+        **online,
         "RPE": f"{figures['rpe']['translation_m']:.4f} m, {figures['rpe']['rotation_deg']:.3f}° a frame",
         "scale": f"{figures['scale']:.4f} true metres per map unit",
         "path length": f"{length:.2f} m",
@@ -92,14 +151,15 @@ def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _start(results: Sequence[StepResult]) -> StepResult | None:
-    """The frame that started the map that the run ended with: a map given up before does not count."""
+    """The frame that started the map that the run ended with, a map given up before does not count, or found it."""
     states = [State.INITIALIZING, *(result.state for result in results)]
     starts = [
         result
         for result, before in zip(results, states, strict=False)
         if result.state is State.TRACKING and before is State.INITIALIZING
     ]
-    return starts[-1] if starts else None
+    found = (result for result in results if result.T_cw is not None)
+    return starts[-1] if starts else next(found, None)
 
 
 def _posed_share(run: Run, start: StepResult | None) -> float:

@@ -18,32 +18,37 @@ from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
 from torchslam.output.frames_file import read_frames, write_frames
 from torchslam.output.ply import write_ply
-from torchslam.run import Run
+from torchslam.run import Run, keyframe_rows
 from torchslam.values import StepResult, Trajectory
 from torchslam.world.map import Map
-from torchslam.world.map_file import read_map, write_map
+from torchslam.world.map_file import read_worlds, write_worlds
 
 TRAJECTORY = "trajectory.txt"
+OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the world of that number
+ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
 MAP = "map.safetensors"
+CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"
 EXAMPLE_IMAGE = "example.png"
 PLOTS = "plots"
+NEEDED = ("world", "worlds", "session", "posed", "keyframes")  # of metrics.json, to read and draw the rest
 
 
 @dataclass(frozen=True)
 class Results:
     """What a results folder holds, as far as pictures need it.
 
-    trajectory, keyframes: camera to world, in the units of the map; without poses when no map was initialised
+    trajectory, keyframes: of the main world, camera to world, in the units of its map; without poses where none is
     groundtruth:           in metres, where the sequence had it
+    map:                   of the main world; empty where there is none
     frames:                one per frame, without poses
     metrics:               the content of metrics.json
-    example_image:         (H, W) in [0, 1] of keyframe `example_keyframe(map)`, where it could be read
+    example_image:         (H, W) in [0, 1] of keyframe `example_keyframe(map, session)`, where it could be read
     """
 
     trajectory: Trajectory
@@ -54,6 +59,11 @@ class Results:
     metrics: dict[str, Any]
     example_image: Tensor | None
 
+    @property
+    def session(self) -> int:
+        """Which run over the map it was."""
+        return int(self.metrics["session"])
+
 
 def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directory: Path) -> None:
     """Write everything that a run leaves behind, pictures apart, into a folder that is made if need be.
@@ -61,41 +71,64 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
     figures: of the run, for metrics.json. What an earlier run wrote there is replaced.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    for name in (GROUND_TRUTH, EXAMPLE_IMAGE):
-        (directory / name).unlink(missing_ok=True)
+    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE)]
+    for old in (*stale, *directory.glob(OTHER_TRAJECTORY.format("[0-9]*"))):
+        old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
+    write_trajectory(directory / ONLINE, run.online)
+    for world in run.worlds:
+        if world is not run.main and world.history.count(run.session):
+            write_trajectory(directory / OTHER_TRAJECTORY.format(world.number), world.trajectory(run.session))
     write_trajectory(directory / KEYFRAMES, run.keyframes)
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
-    write_map(directory / MAP, run.map, run.camera)
+    write_worlds(directory / MAP, run.worlds, run.camera, run.sessions)
     _write_point_cloud(directory / POINT_CLOUD, run)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     write_frames(directory / FRAMES, run.results)
-    _write_example_image(directory / EXAMPLE_IMAGE, run.map, sequence)
+    _write_example_image(directory / EXAMPLE_IMAGE, run, sequence)
 
 
 def read_results(directory: Path) -> Results:
     """The results in a folder. Raises ResultsError, TrajectoryError or FrameError for what is missing or damaged."""
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
-    slam_map, _ = read_map(directory / MAP)
-    is_empty = slam_map.num_keyframes == 0
+    saved, figures = read_worlds(directory / MAP), _read_metrics(directory / METRICS)
+    main = [world.map for world in saved.worlds if world.number == figures["world"]]
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
-        trajectory=_no_poses() if is_empty else read_trajectory(directory / TRAJECTORY),
-        keyframes=_no_poses() if is_empty else read_trajectory(directory / KEYFRAMES),
+        trajectory=read_trajectory(directory / TRAJECTORY) if figures["posed"] else Trajectory.empty(),
+        keyframes=read_trajectory(directory / KEYFRAMES) if figures["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
-        map=slam_map,
+        map=main[0] if main else Map(),
         frames=read_frames(directory / FRAMES),
-        metrics=_read_metrics(directory / METRICS),
+        metrics=figures,
         example_image=read_grey(example, str(example))[0, 0] if example.exists() else None,
     )
 
 
-def example_keyframe(slam_map: Map) -> int:
-    """The keyframe that is drawn as an example: in the middle of the run."""
-    return slam_map.num_keyframes // 2
+def results_in(directory: Path) -> list[Path]:
+    """The files in a folder that `write_results` would replace."""
+    names = (
+        METRICS,
+        TRAJECTORY,
+        MAP,
+        KEYFRAMES,
+        ONLINE,
+        GROUND_TRUTH,
+        POINT_CLOUD,
+        CONFIG,
+        FRAMES,
+        EXAMPLE_IMAGE,
+    )
+    return [directory / name for name in names if (directory / name).exists()]
+
+
+def example_keyframe(slam_map: Map, session: int) -> int | None:
+    """The keyframe that is drawn as an example: in the middle of the session; None where it has none."""
+    rows = keyframe_rows(slam_map, session)
+    return int(rows[len(rows) // 2]) if len(rows) else None
 
 
 def _write_point_cloud(path: Path, run: Run) -> None:
@@ -109,10 +142,11 @@ def _write_point_cloud(path: Path, run: Run) -> None:
     write_ply(path, run.map.positions_w[alive], normals_w, counts, run.keyframes.positions_w)
 
 
-def _write_example_image(path: Path, slam_map: Map, sequence: Sequence) -> None:
-    if slam_map.num_keyframes == 0:
+def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
+    keyframe = example_keyframe(run.map, run.session)
+    if keyframe is None:
         return
-    index = int(slam_map.keyframes["frame_index"][example_keyframe(slam_map)])
+    index = int(run.map.keyframes["frame_index"][keyframe])
     try:
         image = sequence.image(index)
     except FrameError:  # simulated features need no image; then there is nothing to draw
@@ -122,12 +156,12 @@ def _write_example_image(path: Path, slam_map: Map, sequence: Sequence) -> None:
 
 def _read_metrics(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        figures = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ResultsError(f"{path}: not valid JSON: {error}") from None
-
-
-def _no_poses() -> Trajectory:
-    return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+    missing = [name for name in NEEDED if not isinstance(figures, dict) or name not in figures]
+    if missing:
+        raise ResultsError(f"{path}: not the figures of a run: {', '.join(missing)} missing")
+    return figures

@@ -7,8 +7,10 @@ minimiser: one linear solve for the keyframes and the points, one small one for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any, Self, TypeVar
 
 import safetensors.torch
 import torch
@@ -24,16 +26,6 @@ from torchslam.solvers.robust import Kernel
 from torchslam.values import Trajectory
 
 _FRAMES_AT_ONCE = 64
-_TENSORS = (
-    "timestamps",
-    "T_cw",
-    "points_w",
-    "frame_index",
-    "point_index",
-    "pixels",
-    "weights",
-    "is_keyframe",
-)
 
 
 @dataclass(frozen=True)
@@ -48,6 +40,7 @@ class ObservationGraph:
     weights:     (O,) inverse variances in px^-2
     camera:      one for all frames
     is_keyframe: (F,) bool; keyframes and points are solved together, the other frames against the points
+    world:       (F,) int64 in which world a frame is; worlds share nothing but the camera. All in world 0 if left out
     """
 
     timestamps: Tensor
@@ -59,27 +52,56 @@ class ObservationGraph:
     weights: Tensor
     camera: Camera
     is_keyframe: Tensor
+    world: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.world) == 0:
+            object.__setattr__(self, "world", torch.zeros_like(self.is_keyframe, dtype=torch.int64))
+
+    @property
+    def worlds(self) -> list[int]:
+        """The worlds that there are, ascending."""
+        return torch.unique(self.world).tolist()
+
+    def part(self, world: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of the frames, the observations and the points of one world; points without observations have none."""
+        frames = (self.world == world).nonzero().squeeze(-1)
+        rows = (self.world[self.frame_index] == world).nonzero().squeeze(-1)
+        return frames, rows, torch.unique(self.point_index[rows])
 
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file."""
-        tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in _TENSORS}
+        tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
         tensors["camera"] = self.camera.params.detach().cpu().contiguous()
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         safetensors.torch.save_file(tensors, path, metadata)
 
-    @staticmethod
-    def load(path: str | Path) -> ObservationGraph:
-        """Read what `save` wrote. Raises TorchslamError where the file is something else."""
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote. Raises TorchslamError where the file is something else.
+
+        A file of a graph that knows more than this class is read without the rest; one from before there were worlds
+        has one.
+        """
         try:
             with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in (*_TENSORS, "camera")}
+                metadata, known = file.metadata() or {}, set(file.keys())
+                names = [name for name in cls.columns() if name in known or name != "world"]
+                tensors = {name: file.get_tensor(name) for name in (*names, "camera")}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
-            return ObservationGraph(camera=camera, **{name: tensors[name] for name in _TENSORS})
-        except (SafetensorError, KeyError) as error:
+            return cls(camera=camera, **{name: tensors[name] for name in names})
+        except (SafetensorError, KeyError, ValueError) as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
+
+    @classmethod
+    def columns(cls) -> list[str]:
+        """The names of all tensors but the camera's."""
+        return [column.name for column in fields(cls) if column.name != "camera"]
+
+
+Graph = TypeVar("Graph", bound=ObservationGraph)
 
 
 @dataclass(frozen=True)
@@ -88,8 +110,11 @@ class GraphSolution:
 
     T_cw:      (F, 4, 4); points_w: (P, 3); camera
     success:   (F,) bool. A frame that its observations do not determine stays where it was, without gradient; if the
-               keyframes together are not determined, none of them succeeds.
-    keyframes: the bundle adjustment of keyframes and points, with its covariances
+               keyframes of a world together are not determined, none of them succeeds.
+    moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.
+    world:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
+    keyframes: the bundle adjustments of keyframes and points, with their covariances, one per world in the order of
+               `ObservationGraph.worlds`; rows are those of the world's keyframes and of the points its frames see
     """
 
     timestamps: Tensor
@@ -97,12 +122,20 @@ class GraphSolution:
     points_w: Tensor
     camera: Camera
     success: Tensor
-    keyframes: BundleSolution
+    moved_points: Tensor
+    world: Tensor
+    keyframes: tuple[BundleSolution, ...]
 
     @property
     def trajectory(self) -> Trajectory:
-        """Camera to world, ordered by time, differentiable."""
-        order = torch.argsort(self.timestamps, stable=True)
+        """Camera to world, ordered by time, differentiable; of the world with most frames."""
+        worlds, frames = torch.unique(self.world, return_counts=True)
+        return self.trajectory_in(int(worlds[frames.argmax()]))
+
+    def trajectory_in(self, world: int) -> Trajectory:
+        """Camera to world, ordered by time, differentiable; of one world."""
+        rows = (self.world == world).nonzero().squeeze(-1)
+        order = rows[torch.argsort(self.timestamps[rows], stable=True)]
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
@@ -118,29 +151,78 @@ def solve(
 ) -> GraphSolution:
     """Minimise the robust reprojection errors of a run's graph: keyframes and points, then the frames in between.
 
-    The first keyframe stays where it is, and so does the scale; a loss should not depend on them, as aligned trajectory
-    errors do not. Options as in `bundle_adjust`; the default kernel ends its quadratic part at 95 % of a Gaussian.
-    Raises ValueError if there is no keyframe.
+    Every world is solved on its own: its first keyframe stays where it is, and so does its scale; a loss should not
+    depend on them, as aligned trajectory errors do not. Options as in `bundle_adjust`; the default kernel ends its
+    quadratic part at 95 % of a Gaussian. Raises ValueError if a world has no keyframe, if a point is seen in two
+    worlds, and for `free_camera` with several worlds, of which each would find a camera of its own.
     """
-    keyframes, others = graph.is_keyframe.nonzero().squeeze(-1), (~graph.is_keyframe).nonzero().squeeze(-1)
-    if len(keyframes) == 0:
+    worlds = graph.worlds
+    if free_camera and len(worlds) > 1:
+        raise ValueError("a free camera needs a graph of one world")
+    solved = graph.points_w.new_zeros(len(graph.points_w), dtype=torch.int64)
+    T_cw, points_w = graph.T_cw.detach(), graph.points_w.detach()
+    success, moved = torch.zeros_like(graph.is_keyframe), torch.zeros_like(solved, dtype=torch.bool)
+    bundles: list[BundleSolution] = []
+    options = (kernel, scale, backward, iterations, tolerance)
+    for world in worlds:
+        frames, rows, points = graph.part(world)
+        solved[points] += 1
+        keyframes = frames[graph.is_keyframe[frames]]
+        problem = _problem(graph, keyframes, rows, points)
+        bundle = bundle_adjust(
+            problem, kernel, scale, free_camera, backward, iterations, tolerance, progress=progress
+        )
+        bundles.append(bundle)
+        T_cw, points_w = (
+            T_cw.index_copy(0, keyframes, bundle.T_cw),
+            points_w.index_copy(0, points, bundle.points_w),
+        )
+        success[keyframes], moved[points] = bundle.success, bundle.moved_points
+    if bool((solved > 1).any()):
+        raise ValueError("a point is seen in two worlds")
+    if not bundles:
         raise ValueError("the graph has no keyframe")
-    slots = torch.cumsum(graph.is_keyframe, 0) - 1
-    rows = graph.is_keyframe[graph.frame_index].nonzero().squeeze(-1)
-    problem = BundleProblem(
+    camera = bundles[0].camera
+    T_cw, success = _between(graph, T_cw, points_w, camera, moved, success, *options)
+    return GraphSolution(
+        graph.timestamps, T_cw, points_w, camera, success, moved, graph.world, tuple(bundles)
+    )
+
+
+def _problem(graph: ObservationGraph, keyframes: Tensor, rows: Tensor, points: Tensor) -> BundleProblem:
+    """The keyframes (k,) of one world and its points (p,), of the observations of its frames, in rows (o,)."""
+    if len(keyframes) == 0:
+        raise ValueError("a world of the graph has no keyframe")
+    slots = torch.full_like(graph.world, -1)
+    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+    rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
+    return BundleProblem(
         graph.T_cw[keyframes],
-        graph.points_w,
+        graph.points_w[points],
         slots[graph.frame_index[rows]],
-        graph.point_index[rows],
+        torch.searchsorted(points, graph.point_index[rows]),
         graph.pixels[rows],
         graph.camera,
         graph.weights[rows],
         fixed_frames=(0,),
     )
-    bundle = bundle_adjust(problem, kernel, scale, free_camera, backward, iterations, tolerance, progress)
 
-    T_cw = graph.T_cw.detach().index_copy(0, keyframes, bundle.T_cw)
-    success = graph.is_keyframe & bundle.success
+
+def _between(
+    graph: ObservationGraph,
+    T_cw: Tensor,
+    points_w: Tensor,
+    camera: Camera,
+    moved: Tensor,
+    success: Tensor,
+    kernel: Kernel,
+    scale: Tensor | float,
+    backward: Backward,
+    iterations: int,
+    tolerance: float,
+) -> tuple[Tensor, Tensor]:
+    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; and who succeeded."""
+    others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
     starts = counts.cumsum(0) - counts
@@ -148,12 +230,12 @@ def solve(
         slot = torch.arange(int(counts[frames].max()), device=frames.device)
         mask = slot < counts[frames, None]
         seen = in_rank[torch.where(mask, starts[frames, None] + slot, 0)]
-        mask = mask & bundle.moved_points[graph.point_index[seen]]
+        mask = mask & moved[graph.point_index[seen]]
         refined = refine_pose(
             graph.T_cw[frames],
-            bundle.points_w[graph.point_index[seen]],
+            points_w[graph.point_index[seen]],
             graph.pixels[seen],
-            bundle.camera,
+            camera,
             graph.weights[seen],
             mask,
             kernel,
@@ -164,4 +246,20 @@ def solve(
         )
         T_cw = T_cw.index_copy(0, frames, refined.T_cw)
         success = success.index_copy(0, frames, refined.success)
-    return GraphSolution(graph.timestamps, T_cw, bundle.points_w, bundle.camera, success, bundle)
+    return T_cw, success
+
+
+def join(graphs: Sequence[Graph]) -> Graph:
+    """One graph of several that are each of a world of their own; they have the camera of the first."""
+    frames, points = (
+        torch.tensor([0, *(len(getattr(graph, name)) for graph in graphs)]).cumsum(0).tolist()
+        for name in ("T_cw", "points_w")
+    )
+    columns: dict[str, Any] = {}
+    for name in graphs[0].columns():
+        parts = [getattr(graph, name) for graph in graphs]
+        if name in ("frame_index", "point_index"):
+            starts = frames if name == "frame_index" else points
+            parts = [part + start for part, start in zip(parts, starts, strict=False)]
+        columns[name] = torch.cat(parts)
+    return replace(graphs[0], **columns)

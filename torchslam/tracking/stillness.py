@@ -39,19 +39,19 @@ class Stillness:
         self.matching = matching
         width, height = camera.size
         shape = (height // _CELL + 1, width // _CELL + 1)
-        self._evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
+        self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
         self._last: _Look | None = None
 
     def clear_of(self, view: View) -> View:
         """The view without the keypoints that are known to stay."""
-        if not bool((self._evidence >= self.settings.min_evidence).any()):
+        if not bool((self.evidence >= self.settings.min_evidence).any()):
             return view
         return replace(view, mask=view.mask & ~self.covers(view.keypoints))
 
     def covers(self, pixels: Tensor) -> Tensor:
         """(n,) bool: pixels (n, 2) that are known to stay."""
         row, column = self._cells(pixels)
-        return self._evidence[row, column] >= self.settings.min_evidence
+        return self.evidence[row, column] >= self.settings.min_evidence
 
     def observe(self, view: View, T_cw: Tensor, depth: float) -> int:
         """Compare a posed frame with an earlier one; returns how many keypoints became known to stay.
@@ -68,12 +68,12 @@ class Stillness:
             return 0  # not far enough yet to tell
         self._last = look
         stayed = self._stayed(last.view, view, must_move)
-        before = int((self._evidence >= self.settings.min_evidence).sum())
+        before = int((self.evidence >= self.settings.min_evidence).sum())
         if len(stayed) < self.settings.min_keypoints:
-            self._evidence[self._evidence < self.settings.min_evidence] = 0
+            self.evidence[self.evidence < self.settings.min_evidence] = 0
             return 0
         self._add(stayed)
-        return int((self._evidence >= self.settings.min_evidence).sum()) - before
+        return int((self.evidence >= self.settings.min_evidence).sum()) - before
 
     def add(self, pixels: Tensor) -> None:
         """Evidence from elsewhere: pixels (m, 2) that stayed while the scene moved."""
@@ -111,15 +111,15 @@ class Stillness:
     def _add(self, pixels: Tensor) -> None:
         """One more piece of evidence for the cells of pixels (m, 2) and those around them, each cell once."""
         row, column = self._cells(pixels)
-        hit = torch.zeros_like(self._evidence)
+        hit = torch.zeros_like(self.evidence)
         for down in (-1, 0, 1):
             for right in (-1, 0, 1):
                 hit[(row + down).clamp(0, hit.shape[0] - 1), (column + right).clamp(0, hit.shape[1] - 1)] = 1
-        self._evidence += hit
+        self.evidence += hit
 
     def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         cells = torch.div(pixels, _CELL, rounding_mode="floor").long()
-        rows, columns = self._evidence.shape
+        rows, columns = self.evidence.shape
         return cells[:, 1].clamp(0, rows - 1), cells[:, 0].clamp(0, columns - 1)
 
 

@@ -39,7 +39,11 @@ class Tracker:
     """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
 
     It keeps nothing itself: where the camera was is the track of the world.
+
+    counts: whether points remember when and how often they were seen; without it, tracking leaves the map as it is
     """
+
+    counts = True
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera = camera
@@ -66,7 +70,7 @@ class Tracker:
         """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
         near = slam_map.covisible(keyframe, self.settings.local_keyframes)
         local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
-        recent = self.settings.recent_frames
+        recent = self.settings.recent_frames if self.counts else 0
         if recent:
             last_seen = slam_map.points["last_seen"]
             local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["alive"])[
@@ -166,7 +170,8 @@ class Tracker:
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
         )
-        slam_map.points["times_visible"][near.ids] += 1
+        if self.counts:
+            slam_map.points["times_visible"][near.ids] += 1
         return tracked
 
     def _project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
@@ -237,7 +242,7 @@ class Tracker:
         track.seen_last = tracked.point_ids
         track.error += MEMORY * (tracked.error - track.error)
         track.explained += MEMORY * (tracked.explained - track.explained)
-        slam_map.points["last_seen"][tracked.point_ids] = view.index
+        self._count(slam_map, view, tracked)
         shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
         best = int(track.local_keyframes[shared.argmax()])
         if best == track.reference:
@@ -254,10 +259,20 @@ class Tracker:
     def start_at(self, world: World, view: View, tracked: Tracked) -> None:
         """Begin a track anew, wherever in the map: at a frame that was located without one."""
         best = int(world.map.observers(tracked.point_ids).argmax())
-        world.map.points["last_seen"][tracked.point_ids] = view.index
+        self._count(world.map, view, tracked)
         world.track = replace(
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
+
+    def vouch(self, slam_map: Map, tracked: Tracked) -> None:
+        """A frame is believed: it speaks for the points that it saw."""
+        if self.counts:
+            slam_map.points["times_found"][tracked.point_ids] += 1
+
+    def _count(self, slam_map: Map, view: View, tracked: Tracked) -> None:
+        """The points that a frame saw remember when that was."""
+        if self.counts:
+            slam_map.points["last_seen"][tracked.point_ids] = view.index
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:

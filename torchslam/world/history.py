@@ -10,21 +10,23 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers.graph import GraphSolution, ObservationGraph
 from torchslam.values import Tracked, Trajectory, View
-from torchslam.world.map import Map
+from torchslam.world.map import Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunGraph(ObservationGraph):
     """The graph of a run, which knows where its rows come from.
 
-    frame_ids:      (F,) frames of the sequence
-    point_ids:      (P,) rows of the map's points
+    frame_ids:      (F,) frames of the sequence of their session
+    sessions:       (F,) which run over the map saw them
+    point_ids:      (P,) rows of the points of the map of their world
     keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end
     """
 
     frame_ids: Tensor
+    sessions: Tensor
     point_ids: Tensor
     keypoint_index: Tensor
 
@@ -56,6 +58,17 @@ class History:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def count(self, session: int | None = None) -> int:
+        """How many frames were posed, in one session or in all."""
+        if session is None or len(self) == 0:
+            return len(self)
+        return int((self.frames["session"] == session).sum())
+
+    @property
+    def keys(self) -> Tensor:
+        """(F,) names of the frames, as of keyframes: session and frame in one."""
+        return key_of(self.frames["session"], self.frames["frame_index"])
 
     def T_cw(self, slam_map: Map) -> Tensor:
         """(F, 4, 4) poses of the frames in the order they were added, by the map as it is now."""
@@ -150,16 +163,14 @@ class History:
         if bool((renamed < 0).any()):
             self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
 
-    def graph(self, slam_map: Map, camera: Camera) -> RunGraph:
+    def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
 
         Keyframes bring all their observations, the other frames those of points that keyframes see.
         """
         seen = slam_map.observations()
         point_ids = torch.unique(seen.point_index)
-        between = torch.nonzero(~torch.isin(self.frames["frame_index"], slam_map.keyframes["frame_index"]))[
-            :, 0
-        ]
+        between = torch.nonzero(~torch.isin(self.keys, slam_map.keys))[:, 0]
         slot = torch.full((len(self),), -1, device=point_ids.device)
         slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
         heirs = slam_map.resolve(self.observations["point_ids"])
@@ -181,18 +192,22 @@ class History:
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),
+            world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
+            sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
             point_ids=point_ids,
             keypoint_index=torch.cat([seen.keypoint_index, own["keypoints"]]),
         )
 
     def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
-        """Move the map and the frames to the solution of their graph; the map keeps how certain it is."""
+        """Move the map and the frames to the solution of their own graph; the map keeps how certain it is."""
+        (bundle,) = solution.keyframes
         count = slam_map.num_keyframes
         slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
         slam_map.points["positions_w"][graph.point_ids] = solution.points_w
         keyframes = torch.arange(count, device=graph.point_ids.device)
-        slam_map.take_covariances(keyframes, graph.point_ids, solution.keyframes.covariance())
-        order = torch.argsort(graph.frame_ids)
-        solved = order[torch.searchsorted(graph.frame_ids[order], self.frames["frame_index"])]
+        slam_map.take_covariances(keyframes, graph.point_ids, bundle.covariance())
+        keys = key_of(graph.sessions, graph.frame_ids)
+        order = torch.argsort(keys)
+        solved = order[torch.searchsorted(keys[order], self.keys)]
         T_rw = slam_map.T_cw[self.frames["reference"]]
         self.frames["T_cr"][:] = solution.T_cw[solved] @ se3_inverse(T_rw)

@@ -54,7 +54,7 @@ class Map:
     @property
     def keys(self) -> Tensor:
         """(K,) names of the keyframes that stay the same however rows are renumbered: session and frame in one."""
-        return (self.keyframes["session"] << SESSION_BITS) + self.keyframes["frame_index"]
+        return key_of(self.keyframes["session"], self.keyframes["frame_index"])
 
     def key(self, keyframe: int) -> int:
         """The name of one keyframe."""
@@ -308,6 +308,11 @@ class Map:
         self.points["angles"][ids] = self.keyframes["angles"][keyframe, keypoint]
         self.points["descriptors"][ids] = self.keyframes["descriptors"][keyframe, keypoint]
 
+    def forget_frames(self) -> None:
+        """Frames are numbered anew: no point was seen by one of them yet."""
+        if len(self.points):
+            self.points["last_seen"][:] = -1
+
     def take_covariances(self, keyframes: Tensor, point_ids: Tensor, marginals: Marginals) -> None:
         """Note how certain keyframes (k,) and points (n,) are; those the marginals hold no answer for keep theirs."""
         for column, rows, covariances in (
@@ -316,3 +321,8 @@ class Map:
         ):
             known = covariances.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
             column[rows[known]] = covariances[known]
+
+
+def key_of(sessions: Tensor, frames: Tensor) -> Tensor:
+    """Names (n,) of the frames (n,) of sessions (n,)."""
+    return (sessions << SESSION_BITS) + frames

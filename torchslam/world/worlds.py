@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from torch import Tensor
 
@@ -17,6 +17,18 @@ class Worlds:
         self._like = like
         self._worlds: list[World] = []
         self._next = 0
+
+    @classmethod
+    def of(cls, worlds: Iterable[World], begun: int, like: Tensor) -> Worlds:
+        """Worlds that there were already; `begun`: how many ever began, so that no number is used again."""
+        made = cls(like)
+        made._worlds, made._next = list(worlds), begun
+        return made
+
+    @property
+    def begun(self) -> int:
+        """How many worlds ever began."""
+        return self._next
 
     def __len__(self) -> int:
         return len(self._worlds)
@@ -35,9 +47,9 @@ class Worlds:
         """Drop a world that was taken back, or that is part of another one now."""
         self._worlds = [other for other in self._worlds if other is not world]
 
-    def main(self) -> World | None:
-        """The world in which most frames are posed, of equals the first; None where there is none."""
-        return max(self._worlds, key=lambda world: len(world.history), default=None)
+    def main(self, session: int | None = None) -> World | None:
+        """The world in which most frames, of one session or of all, are posed, of equals the first; None without."""
+        return max(self._worlds, key=lambda world: world.history.count(session), default=None)
 
     def find(self, key: int) -> tuple[World, int] | None:
         """The world and the row of the keyframe of that name; None where no world has it."""

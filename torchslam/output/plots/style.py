@@ -17,6 +17,7 @@ ESTIMATE = "#3f7aa6"
 GROUND_TRUTH = "#2f2f2f"
 ACCENT = "#c8553d"
 LOST = "#f3d9d2"
+UNCERTAIN = "#e2d2ec"
 INITIALIZING = "#f1ecdf"
 MUTED = "#7a7a7a"
 AXES_RGB = ("#d5493f", "#57a145", "#3f8fe8")  # the camera's x, y, z

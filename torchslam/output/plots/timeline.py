@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-_SHADES = {State.LOST: (style.LOST, "lost"), State.INITIALIZING: (style.INITIALIZING, "initialising")}
+_SHADES = {
+    State.LOST: (style.LOST, "lost"),
+    State.UNCERTAIN: (style.UNCERTAIN, "uncertain"),
+    State.INITIALIZING: (style.INITIALIZING, "initialising"),
+}
 
 
 def plot_errors(
@@ -75,7 +79,7 @@ def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
         median = np.median(inliers[posed]) if posed.any() else 0.0
         axes.set_title(f"{title or 'Tracking'}: {median:.0f} points agree with a pose (median)")
         axes.margins(x=0.0)
-        figure.legend(loc="outside lower center", ncols=5)
+        figure.legend(loc="outside lower center", ncols=6)
     return figure
 
 
@@ -112,7 +116,7 @@ def _origin(seconds: np.ndarray, results: Sequence[StepResult]) -> float:
 
 
 def _shade(axes: Axes, results: Sequence[StepResult], origin: float) -> None:
-    """Shade the spans of frames that have no pose, each kind labelled once."""
+    """Shade the spans of frames that have no pose or an uncertain one, each kind labelled once."""
     labelled: set[State] = set()
     start = 0
     for end in range(1, len(results) + 1):
