@@ -31,6 +31,8 @@ class SimulatedConfig(Settings, section="simulated"):
     noise_px: float = setting(0.0, low=0)
     outliers: float = setting(0.0, low=0, high=1)  # share of the keypoints that lie at a random place
     dropout: float = setting(0.0, low=0, high=1)  # share of the visible points that a frame misses
+    # points have a size: keypoints have scales by their depth, and noise that grows with them; else all scales are one
+    scales: bool = False
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.world.simulated import CAMERA, path, view_of
+from tests.world.simulated import CAMERA, path, tracked_at, view_of
 from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
 from torchslam.mapping.mapper import Mapper
 from torchslam.stopwatch import Stopwatch
-from torchslam.values import Tracked, View
+from torchslam.values import View
 from torchslam.world import compaction
 from torchslam.world.map import Map
 from torchslam.world.track import Track
@@ -42,7 +42,7 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> World:
         if index == 0:
             slam_map.add_points(cloud(), view.descriptors, 0)
         slam_map.observe(keyframe, everyone, everyone)
-        seen = Tracked(pose, everyone, everyone, POINTS)
+        seen = tracked_at(pose, everyone, everyone)
         world.history.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)

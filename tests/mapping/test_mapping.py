@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -22,8 +23,8 @@ from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import Start, Tracked, View
-from torchslam.world.map import NO_POINT
+from torchslam.values import Start, View
+from torchslam.world.map import NO_POINT, Map
 
 OVERRIDES = [
     "features.kind=simulated",
@@ -265,7 +266,7 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
     def why(T_cr: list[float], overlap: float = 1.0) -> str:
         pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference
         slam.world.track.reference_size = int(tracked.inliers / overlap)
-        moved = Tracked(pose, tracked.point_ids, tracked.keypoints, tracked.matches)
+        moved = replace(tracked, T_cw=pose)
         return why_keyframe(view, moved, slam.world, Config().keyframes)
 
     assert why([0.0] * 6) == ""
@@ -278,7 +279,8 @@ def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
     start, _ = start_of((0, 5), WALK, CONFIG)
     assert start is not None
     slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
-    first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam.map, start)
-    seen = [slam.map.points_seen_by(torch.tensor([k])) for k in (first, second)]
+    slam_map = Map()
+    first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
+    seen = [slam_map.points_seen_by(torch.tensor([k])) for k in (first, second)]
     assert torch.equal(*seen)
     assert len(seen[0]) == len(start.points_w)

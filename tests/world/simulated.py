@@ -36,6 +36,25 @@ def view_of(index: int, T_cw: Tensor, points_w: Tensor, generator: torch.Generat
     )
 
 
+def tracked_at(
+    T_cw: Tensor,
+    point_ids: Tensor,
+    keypoints: Tensor,
+    *,
+    matches: int | None = None,
+    **values: float | Tensor,
+) -> Tracked:
+    """A frame tracked at T_cw (4, 4), all of its matches inliers, without a doubt; `values` say otherwise."""
+    certain: dict[str, float | Tensor] = {
+        "covariance": 1e-6 * torch.eye(6, dtype=T_cw.dtype),
+        "depth": 4.0,
+        "error": 1.0,
+        "coverage": 1.0,
+    }
+    count = len(point_ids) if matches is None else matches
+    return Tracked(T_cw, point_ids, keypoints, count, **(certain | values))  # type: ignore[arg-type]
+
+
 def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
     """(count, size, size) covariances."""
     root = torch.randn(count, size, size, generator=generator, dtype=torch.float64)
@@ -65,7 +84,7 @@ def simulated_world(
             slam_map.observe(keyframe, seen, ids[seen])
         seen = seen[ids[seen] >= 0]
         T_cr = T_cw[index] @ se3_inverse(slam_map.T_cw[keyframe])
-        world.history.add(view, Tracked(T_cw[index], ids[seen], seen, len(seen)), T_cr, keyframe)
+        world.history.add(view, tracked_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
     everyone = torch.arange(slam_map.num_keyframes)
     slam_map.refresh(everyone)
     slam_map.keyframes["covariances"][:] = spreads(len(everyone), 6, generator)
