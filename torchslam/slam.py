@@ -17,10 +17,9 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
 from torchslam.geometry import Camera
-from torchslam.loops.closing import close_loop, join
-from torchslam.loops.places import Places
-from torchslam.loops.recognition import Recall, Recognizer
+from torchslam.loops.memory import Memory
 from torchslam.mapping.culling import drop_covered
+from torchslam.mapping.founding import Founder
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
@@ -29,7 +28,7 @@ from torchslam.tracking.backwards import track_back
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
-from torchslam.tracking.relocalization import Candidate, Relocalizer
+from torchslam.tracking.relocalization import Relocalizer
 from torchslam.tracking.stillness import Stillness
 from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
@@ -65,6 +64,7 @@ class SLAM:
         self.tracker = Tracker(self.camera, self.config)
         self.relocalizer = Relocalizer(self.tracker, self.config)
         self.mapper = Mapper(self.camera, self.config, self.clock)
+        self.founder = Founder(self.tracker, self.mapper, self.config.initialization.min_explained)
         self.reset()
 
     def reset(self) -> None:
@@ -111,7 +111,7 @@ class SLAM:
         self._enter(saved.worlds, saved.sessions, mapping)
         for world in self.worlds:
             for keyframe in range(world.map.num_keyframes):
-                self._remember(world.map, keyframe)
+                self.memory.add(world.map, keyframe)
 
     @property
     def is_settled(self) -> bool:
@@ -123,12 +123,10 @@ class SLAM:
         self.worlds, self.session, self.mapping = worlds, session, mapping
         self.tracker.counts = mapping
         self.last_frame: tuple[int, float] | None = None  # index and timestamp
-        self.places = Places()
+        self.memory = Memory(self.camera, self.config, self.worlds)
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
-        self.recognizer = Recognizer(self.camera, self.config, self.worlds, self.places)
         self.world: World | None = None  # the one that is followed
-        self.recalls: list[Recall] = []
         self._seek()
 
     # --- the way of a frame ----------------------------------------------------------------------------------
@@ -213,7 +211,7 @@ class SLAM:
         why = why_keyframe(view, tracked, world, self.config.keyframes) if self.mapping else ""
         if why:
             keyframe = self.mapper.insert(world.map, view, tracked)
-            self._remember(world.map, keyframe)
+            self.memory.add(world.map, keyframe)
             self.tracker.follow(world, keyframe)
         self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
@@ -221,35 +219,22 @@ class SLAM:
 
     def _recall(self, world: World) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
-        if not self.config.loops.enabled:
-            return world
         with self.clock("loops"):
-            keyframe = world.map.num_keyframes - 1
-            found = self.recognizer.recognize(world, keyframe)
+            found = self.memory.recognize(world, world.map.num_keyframes - 1)
             if found is None:
                 return world
-            self.recalls.append(found.recall)
-            if found.is_loop:
-                close_loop(found, self.camera, self.config)
-            else:
+            if not found.is_loop:
                 self.settle()
-                world, keyframe = join(found, self.camera, self.config)
-                self.worlds.forget(found.world if world is found.other else found.other)
-                self.world = world
-            self.tracker.follow(world, keyframe)
-        return world
+            self.world, keyframe = self.memory.take_up(found)
+            self.tracker.follow(self.world, keyframe)
+        return self.world
 
     def _tidy(self, world: World) -> None:
         """Let go of what the map can do without; nobody holds rows of it now."""
         keys = world.map.keys
         renumbering = self.mapper.tidy(world)
         if renumbering is not None:
-            self.places.remove(keys[renumbering.keyframes < 0])
-
-    def _remember(self, slam_map: Map, keyframe: int) -> None:
-        """The place can be recognised from now on."""
-        view = slam_map.view(keyframe)
-        self.places.add(slam_map.key(keyframe), view.descriptors, view.mask)
+            self.memory.remove(keys[renumbering.keyframes < 0])
 
     def _hold(self, world: World, view: View, tracked: Tracked, doubt: str) -> StepResult:
         """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""
@@ -300,7 +285,7 @@ class SLAM:
         self.lost_for += 1
         if len(self.worlds):
             with self.clock("relocalization"):
-                found = self.relocalizer.locate(view, self._candidates(view))
+                found = self.relocalizer.locate(view, self.memory.likely(view))
             if found is not None:
                 return self._return(view, *found)
         self.waiting.add(view)
@@ -316,12 +301,6 @@ class SLAM:
             return self._result(view, reason)
         return self._result(view, STARTED, self.world, is_keyframe=True)
 
-    def _candidates(self, view: View) -> list[Candidate]:
-        """Keyframes that look like the frame, in any world, the likeliest first."""
-        keys, _ = self.places.query(view.descriptors, view.mask)
-        found = (self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.tries].tolist())
-        return [candidate for candidate in found if candidate is not None]
-
     def _return(self, view: View, world: World, tracked: Tracked) -> StepResult:
         """Go on in a world that was recognised; the next frames have to confirm it."""
         self.tracker.start_at(world, view, tracked)
@@ -334,35 +313,23 @@ class SLAM:
 
     def _begin(self, start: Start) -> str:
         """Begin a world with two views; why it is not believed after all, or nothing."""
-        world = self.worlds.begin()
-        first, second = self.mapper.start(world.map, start)
-        self.tracker.follow(world, first)
-        explained = [self._explain(world, earlier) for earlier in self.initializer.views]
-        self.tracker.follow(world, second)
-        if sum(explained) < self.config.initialization.min_explained * len(explained):
+        world, views = self.worlds.begin(), self.initializer.views
+        reason = self.founder.found(world, start, views)
+        if reason:
             self.worlds.forget(world)
-            return f"bad start: it explains {sum(explained)} of {len(explained)} frames"
-        for keyframe in (first, second):
-            self._remember(world.map, keyframe)
-        posed = set(world.history.frames["frame_index"].tolist())
-        views = [view for view in self.initializer.views if view.index in posed]
-        self.waiting.remove(views)
-        self.world, self.youth, self.state = world, Youth(world, views), State.TRACKING
+            return reason
+        for keyframe in range(world.map.num_keyframes):
+            self.memory.add(world.map, keyframe)
+        known = set(world.history.frames["frame_index"].tolist())
+        posed = [view for view in views if view.index in known]
+        self.waiting.remove(posed)
+        self.world, self.youth, self.state = world, Youth(world, posed), State.TRACKING
         return ""
-
-    def _explain(self, world: World, view: View) -> bool:
-        """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
-        tracked = self.tracker.track(world, view)
-        if tracked is None:
-            return False
-        self.tracker.vouch(world.map, tracked)
-        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
-        return tracked.inliers > 0.5 * tracked.matches
 
     def _take_back(self, youth: Youth) -> None:
         """A start that later frames contradict: its frames wait for another one."""
         self.waiting.add(*youth.views)
-        self.places.remove(youth.world.map.keys)
+        self.memory.remove(youth.world.map.keys)
         self.worlds.forget(youth.world)
         self.youth = None
 

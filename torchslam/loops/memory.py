@@ -1,0 +1,59 @@
+"""The memory of places over all worlds: what was seen before, and what follows when it is seen again."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.geometry import Camera
+from torchslam.loops.closing import close_loop, join
+from torchslam.loops.places import Places
+from torchslam.loops.recognition import Recall, Recognition, Recognizer
+from torchslam.tracking.relocalization import Candidate
+from torchslam.values import View
+from torchslam.world.map import Map
+from torchslam.world.world import World
+from torchslam.world.worlds import Worlds
+
+
+class Memory:
+    """Knows the keyframes of all worlds by what they look like."""
+
+    def __init__(self, camera: Camera, config: Config, worlds: Worlds) -> None:
+        self.camera = camera
+        self.config = config
+        self.worlds = worlds
+        self.places = Places()
+        self.recognizer = Recognizer(camera, config, worlds, self.places)
+        self.recalls: list[Recall] = []  # what was recognised so far, for the record
+
+    def add(self, slam_map: Map, keyframe: int) -> None:
+        """The place of a keyframe can be recognised from now on."""
+        view = slam_map.view(keyframe)
+        self.places.add(slam_map.key(keyframe), view.descriptors, view.mask)
+
+    def remove(self, keys: Tensor) -> None:
+        """Keyframes that are gone, by their keys (n,)."""
+        self.places.remove(keys)
+
+    def likely(self, view: View) -> list[Candidate]:
+        """Keyframes that look like a frame, in any world, the likeliest first."""
+        keys, _ = self.places.query(view.descriptors, view.mask)
+        found = (self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.tries].tolist())
+        return [candidate for candidate in found if candidate is not None]
+
+    def recognize(self, world: World, keyframe: int) -> Recognition | None:
+        """The place that a keyframe shows, if it was seen before and that is certain."""
+        if not self.config.loops.enabled:
+            return None
+        return self.recognizer.recognize(world, keyframe)
+
+    def take_up(self, found: Recognition) -> tuple[World, int]:
+        """Close the loop, or make one world of two; returns the world and the row in it of the keyframe that asked."""
+        self.recalls.append(found.recall)
+        if found.is_loop:
+            close_loop(found, self.camera, self.config)
+            return found.world, found.keyframe
+        world, keyframe = join(found, self.camera, self.config)
+        self.worlds.forget(found.world if world is found.other else found.other)
+        return world, keyframe
