@@ -34,6 +34,7 @@ from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
 from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
+from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.map_check import why_not_alike
 from torchslam.world.map_file import Saved, read_worlds, write_worlds
@@ -154,6 +155,12 @@ class SLAM:
         """Of the world that is followed, or else of the one with most frames; empty where there is none."""
         world = self.world or self.worlds.main(self.session)
         return Map() if world is None else world.map
+
+    @property
+    def history(self) -> History:
+        """The posed frames of the same world as `map`."""
+        world = self.world or self.worlds.main(self.session)
+        return History() if world is None else world.history
 
     def _look(self, frame: Frame) -> View:
         if self.extractor is None:
