@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 import signal
 import subprocess
@@ -11,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -57,6 +60,7 @@ def half(config: Config = CONFIG) -> tuple[SLAM, Progressed]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
+    slam.stillness.evidence[3, 4] = 1  # too little to matter
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -83,6 +87,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert slam.world is not None
     assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
     assert resumed.state is State.TRACKING
+    assert torch.nonzero(resumed.stillness.evidence).tolist() == [[3, 4]]
 
 
 def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:
@@ -282,6 +287,47 @@ def test_a_signal_ends_the_final_adjustment(
     assert figures["interrupted"]
     assert figures["frames"] == figures["posed"] == FRAMES
     assert figures["ate_m"] < 0.01
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_second_signal_ends_at_once(
+    tmp_path: Path, cut: type[Cut], number: int, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(number)
+
+    def twice() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
+        time.sleep(1)  # where the signal is taken note of, at the latest
+
+    cut.do = staticmethod(twice)
+    with pytest.raises(SystemExit) as ended:
+        command(tmp_path, "--checkpoint", "2")
+    assert ended.value.code == status
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.safetensors"]
+    assert signal.getsignal(number) is before
+
+
+def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchslam.commands import folder
+
+    taken: list[int] = []
+    slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, is_settled=True)
+    state.worlds = [SimpleNamespace(map=slam_map)]
+    monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
+    checkpoints = folder.Checkpoints(tmp_path, 10, state, Progressed(), WALK)  # type: ignore[arg-type]
+    for count in range(1, 1001):
+        slam_map.num_keyframes = count
+        state.is_settled = count not in (30, 31)
+        checkpoints.offer()
+    assert taken[:4] == [10, 20, 32, 42]
+    gaps = [after - before for before, after in itertools.pairwise(taken)]
+    assert all(
+        gap == max(10, math.ceil(0.05 * after)) for gap, after in zip(gaps[2:], taken[3:], strict=True)
+    )
+    state.mapping = False
+    checkpoints.offer(at_once=True)
+    assert taken[-1] < 1000
 
 
 def test_a_saved_map_is_gone_on_in_and_localised_in(
