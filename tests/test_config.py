@@ -14,6 +14,7 @@ from torchslam.config import (
     Config,
     FeaturesConfig,
     MatchingConfig,
+    MeasurementConfig,
     TrackingConfig,
     load_config,
     to_toml,
@@ -116,7 +117,7 @@ def test_choices_have_one_source() -> None:
         "scale": ("unit", "groundtruth"),
         "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
         "initialization.criterion": ("uncertainty", "parallax"),
-        "tracking.gate": ("chi_square", "mahalanobis"),
+        "measurement.gate": ("chi_square", "mahalanobis"),
         "mapping.partners": ("covisible", "last"),
     }
 
@@ -126,8 +127,8 @@ def test_choices_have_one_source() -> None:
     [
         (lambda: Config(scale="metric"), "^scale must be one of unit, groundtruth, not 'metric'"),
         (
-            lambda: TrackingConfig(gate="xyz"),
-            "^tracking.gate must be one of chi_square, mahalanobis, not 'xyz'",
+            lambda: MeasurementConfig(gate="xyz"),
+            "^measurement.gate must be one of chi_square, mahalanobis, not 'xyz'",
         ),
         (lambda: replace(Config().bundle, window=1), "^bundle.window must be at least 2"),
         (
@@ -172,7 +173,7 @@ def test_a_wrong_value_in_python_is_named(build: Any, message: str) -> None:
         ("initialization.min_explained", 1, 1.001),
         ("tracking.threshold_px", 1e-9, 0),
         ("tracking.wide_radius_factor", 1, 0.999),
-        ("tracking.chi_square", 1e-9, 0),
+        ("measurement.chi_square", 1e-9, 0),
         ("tracking.max_view_angle_deg", 180, 180.1),
         ("tracking.local_keyframes", 1, 0),
         ("tracking.recent_frames", 0, -1),

@@ -17,6 +17,7 @@ from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.slam import FOUND_AGAIN
 from torchslam.tracking.tracker import Tracker
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -35,9 +36,11 @@ def test_exact_features_give_the_exact_trajectory() -> None:
     assert all(r.state is State.TRACKING for r in run.results[-50:])
 
 
-def test_noise_and_outliers_are_withstood() -> None:
+@pytest.mark.parametrize("scales", ["false", "true"])
+def test_noise_and_outliers_are_withstood(scales: str) -> None:
     walk = Walk(arc(60))
-    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    run = run_walk(walk, *noisy, f"simulated.scales={scales}")
     assert len(run.trajectory) == 60
     result = evaluate(run.trajectory, walk.groundtruth)
     assert result.ate_m < 0.01 * result.path_length_m
@@ -94,7 +97,13 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     states = [r.state for r in run.results]
     assert states[35:40] == [State.LOST] * 5
     assert all(r.T_cw is None for r in run.results[35:40])
-    assert states[40:] == [State.TRACKING] * 20
+    confirmed = 40 + Config().relocalization.confirmations
+    assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
+    assert run.results[40].reason == FOUND_AGAIN
+    assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
+    assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
+    assert len(run.worlds) == 1
+    assert {r.world for r in run.results if r.T_cw is not None} == {0}
     assert len(run.trajectory) == 55
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
@@ -151,8 +160,10 @@ def test_every_frame_looks_at_a_bounded_part_of_the_map() -> None:
     )
     slam.run(walk)
     assert slam.map.num_keyframes > 15
-    assert len(slam.tracker.local_keyframes) <= Config().tracking.local_keyframes + 1
-    assert len(slam.tracker.local_points) < 0.5 * slam.map.num_points
+    assert slam.world is not None
+    track = slam.world.track
+    assert len(track.local_keyframes) <= Config().tracking.local_keyframes + 1
+    assert len(track.local_points) < 0.5 * slam.map.num_points
 
 
 def test_a_rendered_room_is_tracked() -> None:
@@ -268,14 +279,14 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "measurement.gate=mahalanobis")
     assert len(run.trajectory) == 40
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
-    tracker = Tracker(run.camera, run.config, run.map)
+    tracker = Tracker(run.camera, run.config)
     ids = run.map.points_seen_by(torch.tensor([1]))
     T_cw, scales = run.map.T_cw[1], torch.ones(len(ids), dtype=torch.float64)
     pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
-    assert tracker._agrees(T_cw, ids, pixels, scales).all()
+    assert tracker.agrees(run.map, T_cw, ids, pixels, scales).all()
     run.map.points["covariances_w"][ids] = 0
-    assert not tracker._agrees(T_cw, ids, pixels + 4.0, scales).any()
+    assert not tracker.agrees(run.map, T_cw, ids, pixels + 4.0, scales).any()
     depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
     spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
     run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
-    assert tracker._agrees(T_cw, ids, pixels + 4.0, scales).all()
+    assert tracker.agrees(run.map, T_cw, ids, pixels + 4.0, scales).all()

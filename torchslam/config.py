@@ -31,6 +31,8 @@ class SimulatedConfig(Settings, section="simulated"):
     noise_px: float = setting(0.0, low=0)
     outliers: float = setting(0.0, low=0, high=1)  # share of the keypoints that lie at a random place
     dropout: float = setting(0.0, low=0, high=1)  # share of the visible points that a frame misses
+    # points have a size: keypoints have scales by their depth, and noise that grows with them; else all scales are one
+    scales: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,10 @@ class JudgeConfig(Settings, section="judge"):
     """When a pose is uncertain: it makes no keyframe and no point until later frames confirm it."""
 
     min_inlier_share: float = setting(0.5, low=0, high=1)  # of the matches around the predicted pixels
+    max_error: float = setting(1.3, above=0)  # median squared error in units of the noise, over ten frames
+    # of the image, where it has keypoints: what the map explains, over ten frames
+    min_explained: float = setting(0.3, low=0, high=1)
+    min_coverage: float = setting(0.2, low=0, high=1)  # of the image, where the map expects something
     # standard deviations; of the position as a share of the median depth of the tracked points
     max_position_std: float = setting(0.017, above=0)
     max_rotation_std_deg: float = setting(0.9, above=0)
@@ -148,6 +154,22 @@ class MappingConfig(Settings, section="mapping"):
 
 
 @dataclass(frozen=True)
+class LoopsConfig(Settings, section="loops"):
+    """When a keyframe shows a place that the map knows from another time, or that another world knows."""
+
+    enabled: bool = True
+    candidates: int = setting(3, low=1)  # places compared for each keyframe
+    min_matches: int = setting(40, low=6)  # points of the other place that the keyframe must see
+    min_pairs: int = setting(20, low=3)  # of these, known to the keyframe's own map as well
+    min_confirming: int = setting(2, low=0)  # keyframes beside it that must see the other place too
+    # how far a map may have drifted: from the length of the way between, in degrees, as a factor
+    max_drift: float = setting(0.2, above=0)
+    max_drift_deg: float = setting(20.0, above=0, high=180)
+    max_drift_scale: float = setting(2.0, low=1)
+    adjust: bool = True  # the whole map after a loop was closed or worlds were joined
+
+
+@dataclass(frozen=True)
 class BundleConfig(Settings, section="bundle"):
     enabled: bool = True
     window: int = setting(8, low=2)  # keyframes whose poses are free
@@ -173,6 +195,7 @@ class Config(Settings):
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    loops: LoopsConfig = field(default_factory=LoopsConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
 
 

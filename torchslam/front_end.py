@@ -60,6 +60,7 @@ def simulated_extractor(config: Config, camera: Camera, T_cw_groundtruth: torch.
         noise_px=settings.noise_px,
         outliers=settings.outliers,
         dropout=settings.dropout,
+        scales=settings.scales,
         seed=config.seed,
     )
 

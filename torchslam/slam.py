@@ -17,7 +17,9 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
 from torchslam.geometry import Camera
+from torchslam.loops.closing import close_loop, join
 from torchslam.loops.places import Places
+from torchslam.loops.recognition import Recall, Recognizer
 from torchslam.mapping.culling import drop_covered
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
@@ -124,6 +126,9 @@ class SLAM:
         self.places = Places()
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
         self.waiting = Waiting(self.config.initialization.max_waiting)
+        self.recognizer = Recognizer(self.camera, self.config, self.worlds, self.places)
+        self.world: World | None = None  # the one that is followed
+        self.recalls: list[Recall] = []
         self._seek()
 
     # --- the way of a frame ----------------------------------------------------------------------------------
@@ -184,12 +189,15 @@ class SLAM:
             tracked = self.tracker.track(world, view)
         if tracked is None:
             return self._lose(world, view)
-        doubt = why_doubt(tracked, expected, self.config.judge)
+        doubt = why_doubt(tracked, expected, world.track, self.config.judge)
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
         why = self._take(world, view, tracked)
         is_keyframe = bool(why)
+        if is_keyframe:
+            world = self._recall(world)
+            self._tidy(world)
         watch = self.config.stillness.enabled and self.mapping
         if watch and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
             drop_covered(world, self.stillness.covers)
@@ -207,8 +215,36 @@ class SLAM:
             keyframe = self.mapper.insert(world.map, view, tracked)
             self._remember(world.map, keyframe)
             self.tracker.follow(world, keyframe)
+        self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
+
+    def _recall(self, world: World) -> World:
+        """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
+        if not self.config.loops.enabled:
+            return world
+        with self.clock("loops"):
+            keyframe = world.map.num_keyframes - 1
+            found = self.recognizer.recognize(world, keyframe)
+            if found is None:
+                return world
+            self.recalls.append(found.recall)
+            if found.is_loop:
+                close_loop(found, self.camera, self.config)
+            else:
+                self.settle()
+                world, keyframe = join(found, self.camera, self.config)
+                self.worlds.forget(found.world if world is found.other else found.other)
+                self.world = world
+            self.tracker.follow(world, keyframe)
+        return world
+
+    def _tidy(self, world: World) -> None:
+        """Let go of what the map can do without; nobody holds rows of it now."""
+        keys = world.map.keys
+        renumbering = self.mapper.tidy(world)
+        if renumbering is not None:
+            self.places.remove(keys[renumbering.keyframes < 0])
 
     def _remember(self, slam_map: Map, keyframe: int) -> None:
         """The place can be recognised from now on."""
@@ -223,6 +259,7 @@ class SLAM:
             return self._result(view, doubt or self.probation.reason, world, tracked)
         held = self.probation.release()
         for earlier in held:
+            self.tracker.vouch(world.map, earlier[1])
             world.history.add(*earlier)
         if self.probation.came_back:
             first, located, _, _ = held[0]
@@ -245,7 +282,7 @@ class SLAM:
 
     def _seek(self) -> None:
         """Nothing is followed any more."""
-        self.world: World | None = None
+        self.world = None
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)
@@ -272,6 +309,7 @@ class SLAM:
             return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
+            self.stillness.add(self.initializer.still)
             if start is not None:
                 reason = self._begin(start)
         if reason:
@@ -317,6 +355,7 @@ class SLAM:
         tracked = self.tracker.track(world, view)
         if tracked is None:
             return False
+        self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return tracked.inliers > 0.5 * tracked.matches
 

@@ -153,6 +153,9 @@ class Tracked:
     matches:     how many matches the inliers were chosen from
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
     depth:       median depth of the points it sees
+    error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
+    coverage:    share of the image in which the points that were expected are found
+    explained:   share of the image with keypoints in which some agree with the map
     """
 
     T_cw: Tensor
@@ -161,6 +164,9 @@ class Tracked:
     matches: int
     covariance: Tensor
     depth: float
+    error: float = 0.0
+    coverage: float = 1.0
+    explained: float = 1.0
 
     @property
     def inliers(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.front_end import simulated_extractor
 from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
 from torchslam.mapping.mapper import Mapper, world_scale
@@ -20,8 +22,9 @@ from torchslam.mapping.new_points import has_consistent_scale, match_along_epipo
 from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
 from torchslam.tracking.initialization import Initializer
-from torchslam.values import Start, Tracked, View
-from torchslam.world.map import NO_POINT
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import Start, View
+from torchslam.world.map import NO_POINT, Map
 
 OVERRIDES = [
     "features.kind=simulated",
@@ -90,7 +93,7 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
 
 
 def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
-    tracked = slam.tracker.track(view_of(slam, 20))
+    tracked = slam.tracker.track(slam.world, view_of(slam, 20))
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
@@ -99,19 +102,22 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
     "override", ["tracking.predict=false", "tracking.guided=false", "tracking.recent_frames=10"]
 )
 def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
-    slam.tracker.config = load_config(None, ["features.kind=simulated", override])
-    slam.tracker.follow(slam.map.num_keyframes - 1)
-    tracked = slam.tracker.track(view_of(slam, 20))
+    tracker = Tracker(slam.camera, load_config(None, ["features.kind=simulated", override]))
+    tracker.follow(slam.world, slam.map.num_keyframes - 1)
+    tracked = tracker.track(slam.world, view_of(slam, 20))
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
 
-def test_relocalization_anywhere_in_the_map(slam: SLAM) -> None:
-    slam.tracker.lost_for = 1
-    tracked = slam.tracker.track(view_of(slam, 2))
+def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
+    view = view_of(slam, 2)
+    anywhere = match_points(slam.map, slam.map.living_points(), view, CONFIG.matching)
+    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere[0][:0])
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
-    assert slam.tracker.reference <= 2
+    slam.tracker.start_at(slam.world, view, tracked)
+    assert slam.world.track.reference <= 2
+    assert torch.allclose(slam.world.T_cw, tracked.T_cw)
 
 
 def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Generator) -> None:
@@ -127,6 +133,25 @@ def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Gener
         truth = walk_from_start(slam, int(slam.map.keyframes["frame_index"][k]))
         assert torch.allclose(slam.map.T_cw[k, :3, :3], truth[:3, :3], atol=1e-4)
         assert torch.allclose(slam.map.T_cw[k, :3, 3], scale * truth[:3, 3], atol=1e-3)
+
+
+def test_an_adjustment_that_is_interrupted_leaves_the_map_as_it_was(
+    slam: SLAM, generator: torch.Generator
+) -> None:
+    shake = 0.01 * torch.randn(slam.map.num_keyframes - 1, 6, generator=generator, dtype=torch.float64)
+    slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
+    before = copy.deepcopy(slam.map)
+
+    def interrupt(iteration: int, iterations: int) -> None:
+        assert iterations == CONFIG.bundle.final_iterations
+        if iteration == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjust_all(slam.map, slam.camera, CONFIG.bundle, interrupt)
+    for table, old in ((slam.map.points, before.points), (slam.map.keyframes, before.keyframes)):
+        for name, column in table.columns().items():
+            assert torch.equal(column, old[name]), name
 
 
 def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
@@ -153,7 +178,7 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
     )
     slam.map.observe(keyframe, seen, doubles)
     slam.map.refresh(torch.tensor([keyframe]))
-    slam.mapper.fuse(keyframe, slam.map.covisible(keyframe, 5, min_shared=5))
+    fuse(slam.map, keyframe, slam.map.covisible(keyframe, 5, min_shared=5), slam.camera, CONFIG)
     assert torch.equal(slam.map.resolve(doubles), slam.map.resolve(originals))
 
 
@@ -162,7 +187,7 @@ def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
     born = torch.nonzero((slam.map.points["born"] >= newest - 2) & slam.map.points["alive"])[:3, 0]
     assert len(born) > 0
     slam.map.points["times_visible"][born] += 1000
-    slam.mapper.cull_recent_points(newest)
+    slam.mapper.cull_recent_points(slam.map, newest)
     assert not slam.map.points["alive"][born].any()
 
 
@@ -233,16 +258,16 @@ def test_scale_from_ground_truth_needs_ground_truth() -> None:
 
 
 def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
-    tracked = slam.tracker.track(view_of(slam, 20))
+    tracked = slam.tracker.track(slam.world, view_of(slam, 20))
     assert tracked is not None
-    reference = slam.map.T_cw[slam.tracker.reference]
+    reference = slam.map.T_cw[slam.world.track.reference]
     view = View(**{**view_of(slam, 20).__dict__, "index": 100})
 
     def why(T_cr: list[float], overlap: float = 1.0) -> str:
         pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference
-        slam.tracker.reference_size = int(tracked.inliers / overlap)
-        moved = Tracked(pose, tracked.point_ids, tracked.keypoints, tracked.matches)
-        return why_keyframe(view, moved, slam.tracker, slam.map, Config().keyframes)
+        slam.world.track.reference_size = int(tracked.inliers / overlap)
+        moved = replace(tracked, T_cw=pose)
+        return why_keyframe(view, moved, slam.world, Config().keyframes)
 
     assert why([0.0] * 6) == ""
     assert why([2.0, 0, 0, 0, 0, 0]).startswith("moved")
@@ -254,7 +279,8 @@ def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
     start, _ = start_of((0, 5), WALK, CONFIG)
     assert start is not None
     slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
-    first, second = Mapper(slam.camera, CONFIG, slam.map, slam.clock).start(start)
-    seen = [slam.map.points_seen_by(torch.tensor([k])) for k in (first, second)]
+    slam_map = Map()
+    first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
+    seen = [slam_map.points_seen_by(torch.tensor([k])) for k in (first, second)]
     assert torch.equal(*seen)
     assert len(seen[0]) == len(start.points_w)

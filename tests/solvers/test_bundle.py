@@ -48,8 +48,21 @@ def test_tiles_do_not_change_the_answer(bundle_scene, monkeypatch):
     one = bundle_adjust(scene.problem)
     monkeypatch.setattr(schur, "_TILE_POINTS", 5)
     many = bundle_adjust(scene.problem)
-    torch.testing.assert_close(one.T_cw, many.T_cw)
-    torch.testing.assert_close(one.points_w, many.points_w)
+    monkeypatch.setattr(schur, "_MANY_FRAMES", 7)
+    monkeypatch.setattr(schur, "_TILE_POINTS_OF_MANY", 3)
+    lower = bundle_adjust(scene.problem)
+    for other in (many, lower):
+        torch.testing.assert_close(one.T_cw, other.T_cw)
+        torch.testing.assert_close(one.points_w, other.points_w)
+
+
+def test_tiles_are_lower_where_many_frames_see_the_same(monkeypatch):
+    monkeypatch.setattr(schur, "_MANY_FRAMES", 4)
+    for frames, height in ((4, schur._TILE_POINTS), (5, schur._TILE_POINTS_OF_MANY)):
+        slots = torch.arange(frames).repeat_interleave(1000)
+        structure = schur.build_structure(slots, torch.arange(1000).repeat(frames), frames, 1000)
+        assert structure.tiles[0].points.stop == height
+        assert structure.tiles[-1].points.stop == 1000
 
 
 def test_order_of_the_observations_does_not_matter(bundle_scene, generator):

@@ -70,3 +70,9 @@ def test_what_is_not_solvable_stays():
     model, report = minimize(problem, STARTS, iterations=60, tolerance=1e-14)
     assert torch.equal(model.x[1], STARTS[1])
     assert report.iterations[1] == 0
+
+
+def test_tells_its_progress_before_each_iteration():
+    told = []
+    _, report = minimize(Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: told.append(now))
+    assert told == [(iteration, 60) for iteration in range(int(report.iterations.max()))]

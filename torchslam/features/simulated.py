@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.values import Features
 
 DESCRIPTOR_BYTES = 32
+LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB
 
 
 class SimulatedFeatures:
@@ -21,6 +24,9 @@ class SimulatedFeatures:
     noise_px:   standard deviation of the keypoints
     outliers:   share of the keypoints that lie at a uniformly random place of the image
     dropout:    share of the visible points that a frame misses
+    scales:     whether points have a size and a direction. Then a keypoint has the scale at which its point appears
+                from that depth, in steps of the pyramid's factor, and is seen within the pyramid alone; its noise
+                grows with its scale, and its angle turns with the camera. Without it all scales are one.
     Each frame draws from a generator seeded by (seed, frame), so frames can be asked for in any order. The scene lies
     on the CPU, whose generator draws the same everywhere; features go where the frame's pose is.
     """
@@ -37,31 +43,33 @@ class SimulatedFeatures:
         noise_px: float = 0.0,
         outliers: float = 0.0,
         dropout: float = 0.0,
+        scales: bool = False,
         seed: int = 0,
     ) -> None:
         self.camera, T_cw = camera.to("cpu"), T_cw.cpu()
-        self.num_keypoints = num_keypoints
+        self.num_keypoints, self.scales = num_keypoints, scales
         self.noise_px, self.outliers, self.dropout, self.seed = noise_px, outliers, dropout, seed
         T_wc = se3_inverse(T_cw)
         centres = T_wc[:, :3, 3]
         extent = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max()) or 1.0
         self.depth_range = (depth_near * extent, depth_far * extent)
         generator = torch.Generator().manual_seed(seed)
-        self.points_w = self._scatter(T_wc, points_per_view, generator)
+        self.sizes = T_cw.new_zeros(0)  # (P,) metres
+        self.directions_w = T_cw.new_zeros(0, 3)  # (P, 3) unit vectors along their texture
+        self.points_w = T_cw.new_zeros(0, 3)
+        self._scatter(T_wc, points_per_view, generator)
         # Where more are visible than a frame may have keypoints, the same ones win in every frame.
         self.strengths = torch.rand(len(self.points_w), generator=generator)
         self.descriptors = torch.randint(
             0, 256, (len(self.points_w), DESCRIPTOR_BYTES), generator=generator, dtype=torch.uint8
         )
 
-    def _scatter(self, T_wc: Tensor, per_view: int, generator: torch.Generator) -> Tensor:
-        """(P, 3) points such that every view holds about `per_view`: views are filled up in the order of the frames."""
+    def _scatter(self, T_wc: Tensor, per_view: int, generator: torch.Generator) -> None:
+        """Points such that every view holds about `per_view`: views are filled up in the order of the frames."""
         width, height = self.camera.size
         near, far = self.depth_range
-        points_w = T_wc.new_zeros(0, 3)
         for pose in T_wc:
-            visible = self._visible(se3_inverse(pose), points_w)[1].sum() if len(points_w) else 0
-            missing = per_view - int(visible)
+            missing = per_view - int(self._visible(se3_inverse(pose))[1].sum())
             if missing <= 0:
                 continue
             pixels = torch.rand(missing, 2, generator=generator, dtype=pose.dtype) * pose.new_tensor(
@@ -69,44 +77,64 @@ class SimulatedFeatures:
             )
             depth = near * (far / near) ** torch.rand(missing, 1, generator=generator, dtype=pose.dtype)
             rays = self.camera.unproject(pixels)
-            points_w = torch.cat([points_w, transform(pose, rays / rays[:, 2:] * depth)])
-        return points_w
+            self.points_w = torch.cat([self.points_w, transform(pose, rays / rays[:, 2:] * depth)])
+            if self.scales:
+                self._shape(pose, depth[:, 0], generator)
 
-    def _visible(self, T_cw: Tensor, points_w: Tensor) -> tuple[Tensor, Tensor]:
-        points_c = transform(T_cw, points_w)
+    def _shape(self, T_wc: Tensor, depth: Tensor, generator: torch.Generator) -> None:
+        """Give new points at a depth (n,) sizes, seen from T_wc (4, 4) at any level, and directions in its image."""
+        draw = torch.rand(2, len(depth), generator=generator, dtype=depth.dtype)
+        sizes = FACTOR ** ((LEVELS - 1) * draw[0]) * depth / self.camera.focal
+        angle = 2 * torch.pi * draw[1]
+        directions_c = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+        self.sizes = torch.cat([self.sizes, sizes])
+        self.directions_w = torch.cat([self.directions_w, directions_c @ T_wc[:3, :3].mT])
+
+    def _visible(self, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(P, 2) pixels, (P,) whether a point is seen, (P,) its level in the pyramid, (P,) its angle."""
+        points_c = transform(T_cw, self.points_w)
         pixels, valid = self.camera.project(points_c)
         # Far points stay visible for a while after the trajectory has moved on; very near ones do not.
         near, far = self.depth_range
         depth = points_c[:, 2]
-        return pixels, valid & self.camera.in_image(pixels) & (depth > 0.5 * near) & (depth < 2 * far)
+        visible = valid & self.camera.in_image(pixels) & (depth > 0.5 * near) & (depth < 2 * far)
+        if not self.scales:
+            return pixels, visible, torch.zeros_like(depth), torch.zeros_like(depth)
+        appears = self.sizes * self.camera.focal / depth.clamp(min=0.1 * near)
+        level = (appears.log() / math.log(FACTOR)).round()
+        # How the image of a point moves when the point moves along its direction.
+        along = self.directions_w @ T_cw[:3, :3].mT
+        image = depth[:, None] * along[:, :2] - along[:, 2:] * points_c[:, :2]
+        angle = torch.atan2(image[:, 1], image[:, 0])
+        return pixels, visible & (level >= 0) & (level < LEVELS), level, angle
 
     def __call__(self, T_cw: Tensor, frame_index: int) -> Features:
         """Features (batch of one) of the frame with this true pose (4, 4)."""
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + frame_index) % 2**63)
         device, T_cw = T_cw.device, T_cw.cpu()
         width, height = self.camera.size
-        pixels, visible = self._visible(T_cw, self.points_w)
+        pixels, visible, level, angle = self._visible(T_cw)
         ids = torch.nonzero(visible)[:, 0]
         ids = ids[torch.rand(len(ids), generator=generator) >= self.dropout]
         strongest = torch.argsort(self.strengths[ids], descending=True)[: self.num_keypoints]
         ids = ids[strongest[torch.randperm(len(strongest), generator=generator)]]
-        keypoints = pixels[ids] + self.noise_px * torch.randn(
-            len(ids), 2, generator=generator, dtype=pixels.dtype
-        )
+        scales = FACTOR ** level[ids]
+        noise = torch.randn(len(ids), 2, generator=generator, dtype=pixels.dtype)
+        keypoints = pixels[ids] + self.noise_px * scales[:, None] * noise
         anywhere = torch.rand(len(ids), 2, generator=generator, dtype=pixels.dtype)
         is_outlier = torch.rand(len(ids), 1, generator=generator) < self.outliers
         keypoints = torch.where(is_outlier, anywhere * pixels.new_tensor([width - 1, height - 1]), keypoints)
-        return self._padded(keypoints, self.descriptors[ids]).to(device)
+        return self._padded(keypoints, scales, angle[ids], self.descriptors[ids]).to(device)
 
-    def _padded(self, keypoints: Tensor, descriptors: Tensor) -> Features:
+    def _padded(self, keypoints: Tensor, scales: Tensor, angles: Tensor, descriptors: Tensor) -> Features:
         n, N = len(keypoints), self.num_keypoints
         mask = torch.arange(N) < n
         ones = torch.ones(1, N, dtype=keypoints.dtype)
         return Features(
             torch.cat([keypoints, keypoints.new_zeros(N - n, 2)])[None],
             ones,
-            ones,
-            torch.zeros_like(ones),
+            torch.cat([scales, scales.new_ones(N - n)])[None],
+            torch.cat([angles, angles.new_zeros(N - n)])[None],
             torch.cat([descriptors, descriptors.new_zeros(N - n, DESCRIPTOR_BYTES)])[None],
             mask[None],
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import se3_inverse, so3_log, transform
@@ -22,10 +23,8 @@ def why_keyframe(view: View, tracked: Tracked, world: World, settings: Keyframes
     if age < max(1, settings.min_interval):
         return ""
     around = torch.cat([track.local_keyframes, track.local_keyframes.new_tensor([newest])])
-    T_ck = tracked.T_cw @ se3_inverse(slam_map.T_cw[around])
     depth = transform(tracked.T_cw, slam_map.positions_w[tracked.point_ids])[:, 2].median()
-    translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
-    rotation = torch.rad2deg(torch.linalg.vector_norm(so3_log(T_ck[:, :3, :3]), dim=-1))
+    translation, rotation = apart(tracked.T_cw, slam_map.T_cw[around], depth)
     has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
     overlap = tracked.inliers / max(track.reference_size, 1)
     if bool((has_moved | has_turned).all()):
@@ -35,3 +34,10 @@ def why_keyframe(view: View, tracked: Tracked, world: World, settings: Keyframes
     if overlap < settings.min_overlap:
         return f"sees {overlap:.0%} of the points of its reference keyframe"
     return ""
+
+
+def apart(T_cw: Tensor, T_kw: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """(k,), (k,) how far cameras T_kw (k, 4, 4) are from T_cw (4, 4): shares of a depth (), and degrees."""
+    T_ck = T_cw @ se3_inverse(T_kw)
+    translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
+    return translation, torch.rad2deg(torch.linalg.vector_norm(so3_log(T_ck[:, :3, :3]), dim=-1))

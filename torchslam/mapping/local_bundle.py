@@ -11,6 +11,7 @@ from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.values import Observations
 from torchslam.world.map import Map
+from torchslam.world.observers import most
 
 HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
 
@@ -28,8 +29,7 @@ def adjust(
     free = free[free != 0]
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
-    order = torch.sort(shared, descending=True, stable=True)
-    fixed = order.indices[: settings.max_fixed][order.values[: settings.max_fixed] > 0]
+    fixed = most(shared, settings.max_fixed, least=1)
     adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances)
 
 
@@ -63,12 +63,10 @@ def adjust_keyframes(
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
-    is_point = torch.zeros(len(slam_map.points), dtype=torch.bool, device=free.device)
-    is_point[slam_map.points_seen_by(free)] = True
     seen = slam_map.observations(keyframes)
-    seen = select(seen, is_point[seen.point_index])
-    twice = torch.bincount(seen.point_index, minlength=len(slam_map.points)) >= 2
-    seen = select(seen, twice[seen.point_index])
+    seen = select(seen, torch.isin(seen.point_index, slam_map.points_seen_by(free)))
+    _, which, counts = torch.unique(seen.point_index, return_inverse=True, return_counts=True)
+    seen = select(seen, counts[which] >= 2)
     if len(seen) == 0:
         return
     point_ids, point_index = torch.unique(seen.point_index, return_inverse=True)

@@ -7,12 +7,17 @@ import torch
 from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, se3_inverse, triangulation_covariance
+from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Start, Tracked, View
+from torchslam.world.compaction import Renumbering
 from torchslam.world.map import Map
+from torchslam.world.world import World
+
+YOUNG = 3  # keyframes after its own for which a point is on trial
 
 
 class Mapper:
@@ -63,16 +68,29 @@ class Mapper:
                 adjust(slam_map, keyframe, self.camera, self.config.bundle, covariances=wanted)
         return keyframe
 
+    def tidy(self, world: World) -> Renumbering | None:
+        """Take out what the world can do without: redundant keyframes, rows of dead points; returns where rows went.
+
+        To be called when a keyframe was inserted and nobody holds rows of the map: after the frame went into the
+        history. None if all rows stay.
+        """
+        with self.clock("mapping"):
+            culled = cull_keyframes(world, self.config.keyframes) if self.config.mapping.cull else None
+            compacted = world.compact()
+        if culled is None or compacted is None:
+            return culled or compacted
+        return culled.then(compacted)
+
     def cull_recent_points(self, slam_map: Map, keyframe: int) -> None:
         """Kill young points that are rarely found where they should be visible, or that nobody else has seen."""
         points = slam_map.points
-        age = keyframe - points["born"]
-        is_young = points["alive"] & (age <= 3)
-        is_rarely_found = (
-            points["times_found"] < self.config.mapping.min_found_share * points["times_visible"]
-        )
-        is_lonely = (age >= 2) & (points["times_observed"] < 3) & ~points["from_start"]
-        slam_map.kill(torch.nonzero(is_young & (is_rarely_found | is_lonely))[:, 0])
+        young = torch.nonzero(points["born"] >= keyframe - YOUNG)[:, 0]
+        young = young[points["alive"][young]]
+        age = keyframe - points["born"][young]
+        least = self.config.mapping.min_found_share
+        is_rarely_found = points["times_found"][young] < least * points["times_visible"][young]
+        is_lonely = (age >= 2) & (points["times_observed"][young] < 3) & ~points["from_start"][young]
+        slam_map.kill(young[is_rarely_found | is_lonely])
 
 
 def world_scale(start: Start, kind: str) -> float:

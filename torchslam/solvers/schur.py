@@ -18,8 +18,10 @@ from torch import Tensor
 
 from torchslam.solvers.linear import DefiniteFactor, factorize
 
-# Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call.
-_TILE_POINTS = 512
+# Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
+# frames see a place again and again, a tile has a column for each of them: fewer points share them better.
+_TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 128
+_MANY_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -78,18 +80,19 @@ def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, n
     linked = frame_ends[-1] if frame_ends else 0
     slots, points = frame_slots[:linked], point_index[:linked]
 
-    tile_of = points // _TILE_POINTS
+    height = _TILE_POINTS if num_frames <= _MANY_FRAMES else _TILE_POINTS_OF_MANY
+    tile_of = points // height
     keys, positions = torch.unique(tile_of * max(num_frames, 1) + slots, return_inverse=True)
-    num_tiles = -(-num_points // _TILE_POINTS)
+    num_tiles = -(-num_points // height)
     sizes = torch.bincount(keys // max(num_frames, 1), minlength=num_tiles)  # frames per tile
     first = sizes.cumsum(0) - sizes
-    starts = torch.arange(num_tiles, device=points.device) * _TILE_POINTS
-    lengths = (num_points - starts).clamp_max(_TILE_POINTS)
+    starts = torch.arange(num_tiles, device=points.device) * height
+    lengths = (num_points - starts).clamp_max(height)
     storage = 3 * sizes * lengths
     offsets = storage.cumsum(0) - storage
 
     axis = torch.arange(3, device=points.device)
-    row_in_tile = (points % _TILE_POINTS)[:, None] * 3 + axis
+    row_in_tile = (points % height)[:, None] * 3 + axis
     coupling = offsets[tile_of][:, None] + row_in_tile * sizes[tile_of][:, None]
     coupling = coupling + (positions - first[tile_of])[:, None]
 

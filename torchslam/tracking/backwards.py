@@ -29,7 +29,7 @@ def track_back(
     for view in views:
         expected = None if world.track.velocity is None else tracker.predict(world)
         tracked = tracker.track(world, view)
-        if tracked is None or why_doubt(tracked, expected, judge):
+        if tracked is None or why_doubt(tracked, expected, world.track, judge):
             misses += 1
             if misses == MISSES:
                 break

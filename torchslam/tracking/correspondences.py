@@ -58,7 +58,7 @@ def project_points(
     max_view_angle_deg: float,
     scale_range: tuple[float, float],
 ) -> Projected:
-    """The points (n,) in front of the camera, inside the image and seen from a similar side as before.
+    """The living points of (n,) in front of the camera, inside the image and seen from a similar side as before.
 
     Expected scales stay in `scale_range`, those that the detector has.
     """
@@ -69,6 +69,7 @@ def project_points(
     distance = torch.linalg.vector_norm(rays_w, dim=-1)
     cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance.clamp(min=1e-12)
     least = math.cos(math.radians(max_view_angle_deg))
+    valid &= points["alive"][ids]  # a track may still name points that died since
     kept = torch.nonzero(valid & camera.in_image(pixels) & (cosine > least))[:, 0]
     ids = ids[kept]
     scales = (points["reach"][ids] / distance[kept].clamp(min=1e-12)).clamp(*scale_range)

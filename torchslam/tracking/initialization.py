@@ -10,9 +10,12 @@ from torch import Tensor
 from torchslam.config import Config, InitializationConfig
 from torchslam.geometry import (
     Camera,
+    RelativePose,
     Triangulation,
+    essential_from_pose,
     estimate_relative_pose,
     fits,
+    sampson_errors,
     squared_reprojection_errors,
     transform,
     triangulate,
@@ -20,6 +23,11 @@ from torchslam.geometry import (
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.tracking.correspondences import match_views
 from torchslam.values import Start, View
+
+STILL_PX = 1.0  # matches that moved less stay in place
+STILL_SHARE = 0.1  # of the matches, from which on it is asked whether they belong to the scene
+GONE_SHARE = 0.35  # of the keypoints that match where the camera stands still, at least
+EXPLAINED_SHARE = 0.5  # of them that the motion of the others must explain
 
 
 class Initializer:
@@ -29,6 +37,9 @@ class Initializer:
         self.camera = camera
         self.config = config
         self.views: list[View] = []  # the reference and what came after it
+        self.still = camera.params.new_zeros(
+            0, 2
+        )  # pixels that the last view showed not to move with the scene
         self.planar_views = 0  # in which a plane explained the matches
 
     @property
@@ -37,6 +48,7 @@ class Initializer:
 
     def step(self, view: View) -> tuple[Start | None, str]:
         """A start, or None and the reason in words."""
+        self.still = self.still[:0]
         if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
             self.views = [view]
             return None, "took a reference frame"
@@ -54,7 +66,14 @@ class Initializer:
         motion = torch.linalg.vector_norm(view.keypoints[second] - self.reference.keypoints[first], dim=-1)
         moved = float(motion.median())
         if moved >= settings.min_motion_px:
-            return self._relate_moving(view, first, second, scene_only=False)
+            scene = self._scene(view, first, second, motion)
+            if scene is None:
+                return None, "some of the image stays in place, and it is not clear what moves"
+            return self._relate_moving(view, first[scene], second[scene], scene_only=False)
+        if len(first) < GONE_SHARE * int(self.reference.mask.sum()):
+            self.still = view.keypoints[second[motion < STILL_PX]]
+            self.views = [view]
+            return None, "what still matches stays in place, the rest has gone: took a new reference frame"
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
         moving = motion >= settings.min_motion_px
         if int(moving.sum()) < settings.min_matches:
@@ -72,15 +91,7 @@ class Initializer:
         still; only depth tells a scene apart from that.
         """
         settings = self.config.initialization
-        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
-        relative = estimate_relative_pose(
-            pixels_1[None],
-            pixels_2[None],
-            self.camera,
-            self.camera,
-            threshold=settings.threshold_px,
-            seed=self.config.seed,
-        )
+        relative = self._relative_pose(view, first, second)
         model = relative.model[0]
         if scene_only and model != "essential":
             return None, f"something may move before a camera that stands still: a {model} explains it"
@@ -95,6 +106,45 @@ class Initializer:
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
         least_share = settings.min_planar_share if model == "homography" else settings.min_good_share
         return self._judge(view, relative.T_21[0], first[inliers], second[inliers], least_share)
+
+    def _scene(self, view: View, first: Tensor, second: Tensor, motion: Tensor) -> Tensor | None:
+        """(n,) bool, which matches belong to the scene: without those that stay in place, unless the motion of the
+        others explains them too, as it does far points and what the camera turns around. None where nobody can tell.
+        """
+        everyone = torch.ones_like(motion, dtype=torch.bool)
+        still = motion < STILL_PX
+        if (
+            int(still.sum()) < STILL_SHARE * len(motion)
+            or int((~still).sum()) < self.config.initialization.min_matches
+        ):
+            return everyone
+        others = self._relative_pose(view, first[~still], second[~still])
+        if others.model[0] != "essential":
+            return None if self._relative_pose(view, first, second).model[0] == "essential" else everyone
+        errors = self._epipolar_errors(view, first[still], second[still], others.T_21[0])
+        explained = errors.abs() < self.config.initialization.threshold_px
+        if float(explained.double().mean()) >= EXPLAINED_SHARE:
+            return everyone
+        self.still = view.keypoints[second[still]]
+        return ~still
+
+    def _epipolar_errors(self, view: View, first: Tensor, second: Tensor, T_21: Tensor) -> Tensor:
+        """(n,) Sampson distances in pixels of matches (n,), (n,) under a motion (4, 4)."""
+        rays_1 = self.camera.unproject(self.reference.keypoints[first])
+        rays_2 = self.camera.unproject(view.keypoints[second])
+        x_1, x_2 = rays_1[:, :2] / rays_1[:, 2:], rays_2[:, :2] / rays_2[:, 2:]
+        return self.camera.focal * sampson_errors(essential_from_pose(T_21[:3, :3], T_21[:3, 3]), x_1, x_2)
+
+    def _relative_pose(self, view: View, first: Tensor, second: Tensor) -> RelativePose:
+        """The motion from the reference frame to a view by matching keypoints (n,), (n,) of the two."""
+        return estimate_relative_pose(
+            self.reference.keypoints[first][None],
+            view.keypoints[second][None],
+            self.camera,
+            self.camera,
+            threshold=self.config.initialization.threshold_px,
+            seed=self.config.seed,
+        )
 
     def _judge(
         self, view: View, T_cw: Tensor, first: Tensor, second: Tensor, least_share: float

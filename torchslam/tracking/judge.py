@@ -10,16 +10,24 @@ from torch import Tensor
 from torchslam.config import JudgeConfig
 from torchslam.geometry import se3_inverse, so3_log
 from torchslam.values import Tracked
+from torchslam.world.track import Track
 
 
-def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeConfig) -> str:
+def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, settings: JudgeConfig) -> str:
     """Why a pose should not be built on, in words; empty when it may be.
 
     predicted_T_cw: (4, 4) where the camera was expected; None where nothing was
+    track: what the frames before it were like
     """
     share = tracked.inliers / max(tracked.matches, 1)
     if share < settings.min_inlier_share:
         return f"only {share:.0%} of {tracked.matches} matches agree with the pose"
+    if track.error > settings.max_error:
+        return f"the matches of the last frames are off by {track.error**0.5:.1f} times their noise in the median"
+    if track.explained < settings.min_explained:
+        return f"the map explains only {track.explained:.0%} of the image"
+    if tracked.coverage < settings.min_coverage:
+        return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     position, rotation = deviations(tracked)
     if position > settings.max_position_std:
         return f"the position is known to {position:.3f} of the scene's depth"

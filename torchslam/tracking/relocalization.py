@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Tracked, View
 from torchslam.world.map import Map
+from torchslam.world.track import Track
 from torchslam.world.world import World
 
 Candidate = tuple[World, int]
@@ -43,7 +45,7 @@ class Relocalizer:
             tracked = self.tracker.locate(
                 world.map, view, self._matches(world.map, keyframe, view), world.map.points_seen_by(near)
             )
-            if tracked is not None and not why_doubt(tracked, None, self.judge):
+            if tracked is not None and not why_doubt(tracked, None, alone(world.track, tracked), self.judge):
                 return world, tracked
             tried.append((world, near))
         return None
@@ -55,3 +57,8 @@ class Relocalizer:
 
     def _matches(self, slam_map: Map, keyframe: int, view: View) -> Iterator[tuple[Tensor, Tensor]]:
         yield match_keyframe(slam_map, keyframe, view, self.matching)
+
+
+def alone(track: Track, tracked: Tracked) -> Track:
+    """What there is to judge a frame by that no others came before: itself."""
+    return replace(track, error=tracked.error, explained=tracked.explained)

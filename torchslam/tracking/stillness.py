@@ -75,6 +75,11 @@ class Stillness:
         self._add(stayed)
         return int((self.evidence >= self.settings.min_evidence).sum()) - before
 
+    def add(self, pixels: Tensor) -> None:
+        """Evidence from elsewhere: pixels (m, 2) that stayed while the scene moved."""
+        if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
+            self._add(pixels)
+
     def _least_motion(self, last: _Look, T_cw: Tensor) -> Tensor:
         """(n,) pixels by which a point of the scene seen at each keypoint moved at least, whatever its depth."""
         pixels = last.view.keypoints[last.view.mask]

@@ -27,6 +27,13 @@ from torchslam.world.map import Map
 from torchslam.world.track import Track
 from torchslam.world.world import World
 
+MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
+FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
+CELLS = (8, 6)  # the image as a grid, for what should be spread over it
+PER_CELL = 5  # matches of a cell that RANSAC hears
+CROWD = 8  # matches of a cell that count in full
+SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
+
 
 class Tracker:
     """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
@@ -52,7 +59,11 @@ class Tracker:
         T_cw = world.map.T_cw[keyframe]
         seen = world.map.keyframes["point_ids"][keyframe]
         world.track = replace(
-            self._around(world.map, keyframe, T_cw), velocity=world.track.velocity, seen_last=seen[seen >= 0]
+            self._around(world.map, keyframe, T_cw),
+            velocity=world.track.velocity,
+            seen_last=seen[seen >= 0],
+            error=world.track.error,
+            explained=world.track.explained,
         )
 
     def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> Track:
@@ -127,9 +138,11 @@ class Tracker:
         settings = self.settings
         if len(point_ids) < settings.min_matches:
             return None
+        chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
+        chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
         pose = estimate_absolute_pose(
-            slam_map.positions_w[point_ids][None],
-            view.keypoints[keypoints][None],
+            slam_map.positions_w[point_ids[chosen]][None],
+            view.keypoints[keypoints[chosen]][None],
             self.camera,
             threshold=settings.threshold_px,
             seed=self.seed,
@@ -142,12 +155,21 @@ class Tracker:
         ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
         if len(ids) < settings.min_inliers:
             return None
-        refined, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
+        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
         if int(inliers.sum()) < settings.min_inliers:
             return None
-        T_cw, ids_seen = refined.T_cw[0], ids[inliers]
-        depth = float(transform(T_cw, slam_map.positions_w[ids_seen])[:, 2].median())
-        tracked = Tracked(T_cw, ids_seen, at[inliers], len(ids), refined.covariance[0], depth)
+        T_cw, seen = refined.T_cw[0], ids[inliers]
+        tracked = Tracked(
+            T_cw,
+            seen,
+            at[inliers],
+            matches=len(ids),
+            covariance=refined.covariance[0],
+            depth=float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()),
+            error=float(errors.median()),
+            coverage=coverage(slam_map, near, seen, self.camera.size),
+            explained=explained(view, at[inliers], self.camera.size),
+        )
         if self.counts:
             slam_map.points["times_visible"][near.ids] += 1
         return tracked
@@ -170,10 +192,15 @@ class Tracker:
 
     def _refine(
         self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
-    ) -> tuple[RefinedPose, Tensor]:
-        """The pose and (n,) who agrees with it: least squares on all matches, then on those that agree."""
+    ) -> tuple[RefinedPose, Tensor, Tensor]:
+        """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
+
+        By least squares on what is not far from agreeing with T_cw, then on what agrees with that.
+        """
         points_w = slam_map.positions_w[ids]
-        mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
+        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
+        mask = fits(errors, scales, FAR * self.measurement.chi_square)
+        weights = scales**-2 * voices(pixels, self.camera.size)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
         for kernel, iterations in passes:
             refined = refine_pose(
@@ -181,7 +208,7 @@ class Tracker:
                 points_w[None],
                 pixels[None],
                 self.camera,
-                weights=(scales**-2)[None],
+                weights=weights[None],
                 mask=mask[None],
                 kernel=kernel,
                 scale=2.0,
@@ -192,7 +219,8 @@ class Tracker:
             mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
                 break
-        return refined, mask
+        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
+        return refined, errors / scales**2, mask
 
     def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
@@ -212,6 +240,8 @@ class Tracker:
         slam_map, track = world.map, world.track
         track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
         track.seen_last = tracked.point_ids
+        track.error += MEMORY * (tracked.error - track.error)
+        track.explained += MEMORY * (tracked.explained - track.explained)
         self._count(slam_map, view, tracked)
         shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
         best = int(track.local_keyframes[shared.argmax()])
@@ -219,7 +249,11 @@ class Tracker:
             track.T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[best])
         else:
             world.track = replace(
-                self._around(slam_map, best, tracked.T_cw), velocity=track.velocity, seen_last=track.seen_last
+                self._around(slam_map, best, tracked.T_cw),
+                velocity=track.velocity,
+                seen_last=track.seen_last,
+                error=track.error,
+                explained=track.explained,
             )
 
     def start_at(self, world: World, view: View, tracked: Tracked) -> None:
@@ -230,10 +264,14 @@ class Tracker:
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
 
-    def _count(self, slam_map: Map, view: View, tracked: Tracked) -> None:
-        """The points that a frame saw remember it."""
+    def vouch(self, slam_map: Map, tracked: Tracked) -> None:
+        """A frame is believed: it speaks for the points that it saw."""
         if self.counts:
             slam_map.points["times_found"][tracked.point_ids] += 1
+
+    def _count(self, slam_map: Map, view: View, tracked: Tracked) -> None:
+        """The points that a frame saw remember when that was."""
+        if self.counts:
             slam_map.points["last_seen"][tracked.point_ids] = view.index
 
 
@@ -244,3 +282,64 @@ def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
     counts = torch.bincount(local[local >= 0], minlength=len(slam_map.points))
     seen = table[keyframe]
     return int((counts[seen[seen >= 0]] >= min(3, len(local_keyframes))).sum())
+
+
+def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) int64 number of the cell of the image that pixels (n, 2) lie in."""
+    extent = pixels.new_tensor([size[0], size[1]])
+    grid = pixels.new_tensor(CELLS)
+    column, row = torch.minimum((pixels / extent * grid).clamp(min=0), grid - 1).long().unbind(-1)
+    return row * CELLS[0] + column
+
+
+def trusted(times_found: Tensor, least: int) -> Tensor:
+    """(m,) rows of matches (n,) with points that many frames have found; all where they are fewer than `least`.
+
+    What moves by itself agrees with the scene for a while at most: its points do not grow old.
+    """
+    old = torch.nonzero(times_found >= SENIOR)[:, 0]
+    return old if len(old) >= least else torch.arange(len(times_found), device=times_found.device)
+
+
+def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(m,) rows of pixels (n, 2), a few of each cell of the image: each cell has a voice.
+
+    Where one thing with much texture moves before a scene with little, most matches are its.
+    """
+    cell = cells(pixels, size)
+    order = torch.argsort(cell, stable=True)
+    ordered = cell[order]
+    counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
+    rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
+    return torch.sort(order[rank < PER_CELL]).values
+
+
+def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) what each of the pixels (n, 2) counts, so that a crowded cell of the image does not outvote the others."""
+    cell = cells(pixels, size)
+    crowd = torch.bincount(cell, minlength=CELLS[0] * CELLS[1])[cell]
+    return (CROWD / crowd).clamp(max=1.0)
+
+
+def explained(view: View, keypoints: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells with several keypoints in which at least one of keypoints (m,) lies."""
+    count = CELLS[0] * CELLS[1]
+    there = torch.bincount(cells(view.keypoints[view.mask], size), minlength=count) >= 2
+    used = torch.bincount(cells(view.keypoints[keypoints], size), minlength=count) > 0
+    return float(used[there].double().mean()) if bool(there.any()) else 1.0
+
+
+def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells in which several old points were expected that has at least a fifth of them.
+
+    expected: points that should be in the image; seen: (m,) those of them that are where they should be
+    """
+    old = slam_map.points["times_found"][expected.ids] >= SENIOR
+    cell = cells(expected.pixels[old], size)
+    count = CELLS[0] * CELLS[1]
+    wanted = torch.bincount(cell, minlength=count)
+    found = torch.bincount(cell[torch.isin(expected.ids[old], seen)], minlength=count)
+    asked = wanted >= 2
+    if not bool(asked.any()):
+        return 1.0
+    return float((5 * found >= wanted)[asked].double().mean())

@@ -101,6 +101,68 @@ class History:
         self.frames.append(**frames)
         self.observations.append(**seen)
 
+    def refer(self, heirs: Tensor, slam_map: Map) -> None:
+        """Let frames that refer to keyframe i refer to heirs (K,)[i] from now on, without moving them."""
+        old = self.frames["reference"]
+        moves = torch.nonzero(heirs[old] != old)[:, 0]
+        new = heirs[old[moves]]
+        T_rr = slam_map.T_cw[old[moves]] @ se3_inverse(slam_map.T_cw[new])
+        self.frames["T_cr"][moves] = self.frames["T_cr"][moves] @ T_rr
+        old[moves] = new
+
+    def take_over(self, slam_map: Map, keyframes: Tensor) -> None:
+        """Keep what the map knows of keyframes (k,): their frames see from now on what the keyframes see.
+
+        A keyframe without a frame gets one.
+        """
+        kept = slam_map.keyframes
+        rows = torch.cat([self._frame_of(slam_map, keyframe) for keyframe in keyframes.tolist()])
+        self.frames["T_cr"][rows] = kept["T_cw"][keyframes] @ se3_inverse(
+            slam_map.T_cw[self.frames["reference"][rows]]
+        )
+        is_kept = torch.zeros(len(self), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
+        row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
+        seen = slam_map.observations(keyframes)
+        self._overwrite(
+            torch.nonzero(is_kept[self.observations["row"]])[:, 0],
+            row=row_of[seen.keyframe_index],
+            point_ids=seen.point_index,
+            keypoints=seen.keypoint_index,
+            pixels=seen.pixels,
+            scales=seen.scales,
+        )
+
+    def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
+        """Put fresh observations in the place of stale rows (n,), ascending: nothing is copied as long as they fit."""
+        count = min(len(stale), len(fresh["row"]))
+        for name, values in fresh.items():
+            self.observations[name][stale[:count]] = values[:count]
+        if count < len(stale):
+            is_left = torch.ones(len(self.observations), dtype=torch.bool, device=stale.device)
+            self.observations.keep(torch.nonzero(is_left.index_fill(0, stale[count:], False))[:, 0])
+        self.observations.append(**{name: values[count:] for name, values in fresh.items()})
+
+    def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
+        """(1,) the row of the frame that a keyframe was made of, added where it is missing."""
+        own = {
+            name: slam_map.keyframes[name][keyframe][None] for name in ("frame_index", "session", "timestamp")
+        }
+        is_frame = self.frames["frame_index"] == own["frame_index"]
+        row = torch.nonzero(is_frame & (self.frames["session"] == own["session"]))[:1, 0]
+        if len(row):
+            return row
+        eye = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)[None]
+        return self.frames.append(T_cr=eye, reference=slam_map.ids(keyframe), **own)
+
+    def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
+        """Points got the rows (L,), negative where they are gone: merged ones count as their heirs, dead ones not."""
+        if len(self.observations) == 0:
+            return
+        renamed = rows[slam_map.resolve(self.observations["point_ids"])]
+        self.observations["point_ids"][:] = renamed
+        if bool((renamed < 0).any()):
+            self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
+
     def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
 
@@ -112,7 +174,10 @@ class History:
         slot = torch.full((len(self),), -1, device=point_ids.device)
         slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
         heirs = slam_map.resolve(self.observations["point_ids"])
-        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & torch.isin(heirs, point_ids))[:, 0]
+        # A flag per point: `isin` would sort all that was ever seen.
+        is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
+        is_seen[point_ids] = True
+        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
         own = {name: self.observations[name][rows] for name in ("row", "keypoints", "pixels", "scales")}
         keyframes = slam_map.keyframes
         return RunGraph(

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchslam.geometry import se3_inverse
 from torchslam.solvers import Marginals
 from torchslam.values import Features, Observations, View
+from torchslam.world.observers import Observers, first_of_each, most
 from torchslam.world.schema import KEYFRAMES, POINTS
 from torchslam.world.table import Table
 
@@ -25,8 +26,7 @@ class Map:
     def __init__(self) -> None:
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
-
-    # --- size and plain access -------------------------------------------------------------------------------
+        self._index: Observers | None = None  # of what the tables hold; None: not made yet
 
     @property
     def num_keyframes(self) -> int:
@@ -90,8 +90,6 @@ class Map:
         R_cw = self.T_cw[:, :3, :3]
         return R_cw.mT @ self.keyframes["covariances"][:, :3, :3] @ R_cw
 
-    # --- growing ---------------------------------------------------------------------------------------------
-
     def add_keyframe(self, view: View, T_cw: Tensor) -> int:
         """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
         ids = self.keyframes.append(
@@ -143,18 +141,35 @@ class Map:
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
 
-    # --- observations ----------------------------------------------------------------------------------------
-
     def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
         """Note that keypoints (n,) of a keyframe, which see nothing yet, see points (n,)."""
+        self._index_of_points.add(point_ids, keyframe * self._keypoints + keypoint_index)
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)
 
     def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
         """Drop observations, given by keyframe (n,) and keypoint (n,)."""
         table = self.keyframes["point_ids"]
-        self._count(table[keyframe_index, keypoint_index], -1)
+        point_ids = table[keyframe_index, keypoint_index]
+        self._index_of_points.remove(point_ids, keyframe_index * self._keypoints + keypoint_index)
+        self._count(point_ids, -1)
         table[keyframe_index, keypoint_index] = NO_POINT
+
+    @property
+    def _keypoints(self) -> int:
+        """How many keypoints a keyframe has room for."""
+        return self.keyframes["point_ids"].shape[1]
+
+    @property
+    def _index_of_points(self) -> Observers:
+        if self._index is None:
+            self._index = Observers(self.keyframes["point_ids"])
+        return self._index
+
+    @property
+    def _observations(self) -> Tensor:
+        """(K N,) the points that keypoints observe, as a flat view: index it with the places of the index."""
+        return self.keyframes["point_ids"].view(-1)
 
     def _count(self, point_ids: Tensor, step: int) -> None:
         self.points["times_observed"].index_add_(0, point_ids, torch.full_like(point_ids, step))
@@ -175,13 +190,16 @@ class Map:
         )
 
     def observers(self, point_ids: Tensor, keyframes: Tensor | None = None) -> Tensor:
-        """(K,) how many of the points (n,) each keyframe observes; or each keyframe of a list (k,)."""
-        wanted = torch.zeros(len(self.points) + 1, dtype=torch.bool, device=point_ids.device)
-        wanted[point_ids] = True
-        table = self.keyframes["point_ids"]
-        return wanted[table if keyframes is None else table[keyframes]].sum(
-            1
-        )  # NO_POINT reads the last entry, which is never set
+        """(K,) how many of the distinct points (n,) each keyframe observes; or each keyframe of a list (k,)."""
+        _, places = self._index_of_points.of(point_ids)
+        counts = torch.bincount(places // self._keypoints, minlength=self.num_keyframes)
+        return counts if keyframes is None else counts[keyframes]
+
+    def scales_of(self, point_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, w) which keyframes observe points (n,), NO_POINT beyond the last one, and (n, w) at which scales."""
+        places = self._index_of_points.padded(point_ids).long()
+        keyframes = torch.where(places >= 0, places // self._keypoints, NO_POINT)
+        return keyframes, self.keyframes["scales"][keyframes, places % self._keypoints]
 
     def view(self, keyframe: int) -> View:
         """What a keyframe saw."""
@@ -199,8 +217,7 @@ class Map:
         seen = self.keyframes["point_ids"][keyframe]
         shared = self.observers(seen[seen >= 0])
         shared[keyframe] = 0
-        order = torch.sort(shared, descending=True, stable=True)
-        return order.indices[:count][order.values[:count] >= min_shared]
+        return most(shared, count, min_shared)
 
     def points_seen_by(self, keyframes: Tensor) -> Tensor:
         """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""
@@ -217,7 +234,12 @@ class Map:
         rows = other.keyframes.columns()
         rows["point_ids"] = torch.where(rows["point_ids"] >= 0, rows["point_ids"] + points, NO_POINT)
         self.keyframes.append(**rows)
+        self.reindex()
         return keyframes, points
+
+    def reindex(self) -> None:
+        """To be called when rows were renumbered."""
+        self._index = None
 
     # --- changing --------------------------------------------------------------------------------------------
 
@@ -225,31 +247,35 @@ class Map:
         """Mark points (n,) dead and drop their observations."""
         if len(point_ids) == 0:
             return
+        _, places = self._index_of_points.of(point_ids)
+        self._index_of_points.clear(point_ids)
+        self._observations.scatter_(0, places, NO_POINT)
         self.points["alive"][point_ids] = False
         self.points["times_observed"][point_ids] = 0
-        doomed = torch.zeros(len(self.points) + 1, dtype=torch.bool, device=point_ids.device)
-        doomed[point_ids] = True
-        table = self.keyframes["point_ids"]
-        table[doomed[table]] = NO_POINT
 
     def replace(self, old: Tensor, new: Tensor) -> None:
         """Merge points: every observation of old (n,) becomes one of new (n,); old are dead from now on.
 
         Several may be merged into one; none of the new points may be among the old. A keyframe that saw both keeps
-        one observation.
+        one observation: that of the new point, or that at the first keypoint.
         """
         if len(old) == 0:
             return
-        renamed = torch.arange(len(self.points) + 1, device=old.device)
-        renamed[-1] = NO_POINT
-        renamed[old] = new
-        table = self.keyframes["point_ids"]
-        touched = torch.nonzero((renamed[table] != table).any(1))[:, 0]
-        rows = table[touched]
-        table[touched] = without_repetitions(renamed[rows], preferred=renamed[rows] == rows)
-        self._count(rows[rows >= 0], -1)
-        self._count(table[touched][table[touched] >= 0], 1)
-        self.points["alive"][old] = False
+        index, count = self._index_of_points, len(self.points)
+        heirs = torch.unique(new)
+        which, held = index.of(heirs)
+        taken = (held // self._keypoints) * count + heirs[
+            which
+        ]  # keyframes and the heirs that they see already
+        which, places = index.of(old)
+        order = torch.argsort(places)  # of several keypoints the first comes first
+        places, inherited = places[order], new[which[order]]
+        wanted = (places // self._keypoints) * count + inherited
+        kept = first_of_each(wanted) & ~torch.isin(wanted, taken)
+        self.kill(old)
+        self._observations.scatter_(0, places[kept], inherited[kept])
+        index.add(inherited[kept], places[kept])
+        self._count(inherited[kept], 1)
         self.points["replaced_by"][old] = new
         for counter in ("times_visible", "times_found"):
             self.points[counter].index_add_(0, new, self.points[counter][old])
@@ -270,12 +296,9 @@ class Map:
         seen = self.observations(torch.sort(keyframes).values)  # the newest keyframe comes last and wins
         if len(seen) == 0:
             return
-        newest = torch.full((len(self.points),), -1, device=keyframes.device)
-        newest = newest.scatter_reduce(
-            0, seen.point_index, torch.arange(len(seen), device=keyframes.device), "amax"
-        )
-        ids = torch.nonzero(newest >= 0)[:, 0]
-        row = newest[ids]
+        ids, which = torch.unique(seen.point_index, return_inverse=True)
+        rows = torch.arange(len(seen), device=keyframes.device)
+        row = torch.zeros_like(ids).scatter_reduce(0, which, rows, "amax", include_self=False)
         keyframe, keypoint = seen.keyframe_index[row], seen.keypoint_index[row]
         centres_w = se3_inverse(self.T_cw[keyframe])[:, :3, 3]
         rays_w = self.positions_w[ids] - centres_w
@@ -303,14 +326,3 @@ class Map:
 def key_of(sessions: Tensor, frames: Tensor) -> Tensor:
     """Names (n,) of the frames (n,) of sessions (n,)."""
     return (sessions << SESSION_BITS) + frames
-
-
-def without_repetitions(ids: Tensor, preferred: Tensor) -> Tensor:
-    """Rows (k, n) of ids in which every id but NO_POINT stands once; of several, a preferred place (k, n) stays."""
-    order = torch.sort(
-        ids * 2 - preferred.to(ids.dtype), dim=1, stable=True
-    )  # equal ids together, preferred first
-    in_order = ids.gather(1, order.indices)
-    repeated = torch.zeros_like(preferred)
-    repeated[:, 1:] = in_order[:, 1:] == in_order[:, :-1]
-    return ids.masked_fill(torch.zeros_like(preferred).scatter(1, order.indices, repeated), NO_POINT)

@@ -48,8 +48,16 @@ class Table:
         return torch.arange(start, end, device=next(iter(rows.values())).device)
 
     def keep(self, rows: Tensor) -> None:
-        """Keep some rows (n,), by index, in this order; the others are gone and their memory is given back."""
-        self._columns = {name: self[name][rows] for name in self._columns}
+        """Keep some rows (n,), by index, in this order; the others are gone.
+
+        Their memory is given back where most of it would stay empty; otherwise the next rows go there.
+        """
+        for name, column in self._columns.items():
+            kept = self[name][rows]
+            if 2 * len(rows) < len(column):
+                self._columns[name] = kept
+            else:
+                column[: len(rows)] = kept
         self._size = len(rows)
 
     def _check(self, rows: dict[str, Tensor]) -> None:

@@ -19,6 +19,8 @@ class Track:
     seen_last:       (n,) points that the last frame saw
     local_keyframes: (k,) the reference keyframe and those that share most points with it
     local_points:    (m,) what these see
+    error:           median squared error of the matches in units of their variance, over the last frames
+    explained:       share of the image with keypoints in which some agree with the map, over the last frames
     """
 
     T_cr: Tensor
@@ -28,6 +30,8 @@ class Track:
     seen_last: Tensor
     local_keyframes: Tensor
     local_points: Tensor
+    error: float = 0.0
+    explained: float = 1.0
 
     @classmethod
     def nowhere(cls, like: Tensor) -> Track:

@@ -1,0 +1,167 @@
+"""Which way of recognising places should one take, and what does it cost? See README.md."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from experiments.common import table, write_between
+from experiments.places import alternatives
+from experiments.places.geometric_check import inliers_of_pairs
+from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
+from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
+from torchslam.loops import Places, relative_scores
+from torchslam.loops.codes import rendered_words
+from torchslam.values import Features
+
+HEADER = ["", "lookalike: AP, recall at precision 1, recall@1"]
+HEADER += [f"{name}: AP, recall@1, @5" for name in MEASURED]
+SIZES = (500, 1000, 3000)
+QUERIES = 30
+COUNTS = (10, 12, 15, 20, 25, 30, 40, 60)
+BEST = 3
+WALK = 40  # images of one walk of lookalikes
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    collection = collect()
+    features = collection.features
+    rows = []
+    for name, way in ways(features):
+        rows.append([name, *quality(way(), collection)])
+        print(*rows[-1], sep="\t", flush=True)
+    scores = alternatives.places(features, 400)
+    relative = relative_to_previous(scores, collection)
+    rows.append(["taken, relative to the previous image", *quality(relative, collection)])
+    cut = len(collection.ranges["lookalike"])
+    check = checks(features[:cut], scores[:cut, :cut])
+    text = "\n".join([table(HEADER, rows), costs(features), check])
+    print(text)
+    write_between(Path(__file__).parent / "README.md", text)
+
+
+def relative_to_previous(scores: Tensor, collection: Collection) -> Tensor:
+    """Each row of scores (N, N) as a share of the score with the image before it; zero for first images."""
+    relative = torch.zeros_like(scores)
+    keys = torch.arange(len(scores))
+    for where in collection.ranges.values():
+        for row in where[1:]:
+            relative[row] = relative_scores(keys, scores[row], keys[row - 1 : row])
+    return relative
+
+
+def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:
+    """The candidates, by name."""
+    rendered = sample(rendered_descriptors(), DESCRIPTORS)
+    words = rendered_words(rendered.device)
+    # What an image of redkitchen is like, for words that know one image only.
+    one = alternatives.first_words(features, len(lookalike_truth()[0]))
+    return [
+        ("1024 words, tf-idf", lambda: alternatives.bag_of_words(features, words)),
+        ("4096 words, tf-idf", lambda: alternatives.bag_of_words(features, k_majority(rendered, 4096, 8))),
+        ("32 hash tables of 14 bits", lambda: alternatives.hash_tables(features, 14, 32)),
+        ("150 strongest matched", lambda: alternatives.direct(features, 150, 0.85, 64)),
+        ("taken: 1024 words and codes, 400 strongest", lambda: alternatives.places(features, 400)),
+        ("the same, 200 strongest", lambda: alternatives.places(features, 200)),
+        (
+            "the same, words of these very images",
+            lambda: alternatives.places(features, 400, alternatives.own_words(features, 1024)),
+        ),
+        ("the same, words of one image", lambda: alternatives.places(features, 400, one)),
+    ]
+
+
+def quality(scores: Tensor, collection: Collection) -> list[str]:
+    """The cells of a row, from scores (N, N) of all images with all."""
+    same, asked = lookalike_truth()
+    part = scores[: len(same), : len(same)]
+    precision, recall = average_precision(part[asked], same[asked])
+    hit = recall_at(part.masked_fill(~asked, -1.0), same, 1)
+    cells = [f"{precision:.2f}, {recall:.2f}, {hit:.2f}"]
+    for name in MEASURED:
+        where = collection.ranges[name]
+        rows = scores[where.start : where.stop].clone()
+        near, far, neighbours = sequence_truth(collection.T_cw[name])
+        true, counted = torch.zeros_like(rows, dtype=torch.bool), torch.ones_like(rows, dtype=torch.bool)
+        true[:, where.start : where.stop] = near
+        counted[:, where.start : where.stop] = near | far  # every image of another sequence is another place
+        rows[:, where.start : where.stop][neighbours] = -1.0
+        precision, _ = average_precision(rows[counted], true[counted])
+        cells.append(f"{precision:.2f}, {recall_at(rows, true, 1):.2f}, {recall_at(rows, true, 5):.2f}")
+    return cells
+
+
+def average_precision(scores: Tensor, true: Tensor) -> tuple[float, float]:
+    """Average precision of pairs (P,) in order of their scores, and the recall before the first false pair."""
+    ordered = true[torch.sort(scores, descending=True, stable=True).indices].double()
+    precision = ordered.cumsum(0) / torch.arange(1, len(ordered) + 1)
+    before = ordered.cumprod(0).sum()
+    return float((precision * ordered).sum() / ordered.sum()), float(before / ordered.sum())
+
+
+def recall_at(scores: Tensor, true: Tensor, count: int) -> float:
+    """How many of the images (rows) that have a true pair find one among their `count` best."""
+    rows = true.any(1)
+    best = scores[rows].topk(count, dim=1).indices
+    return float(true[rows].gather(1, best).any(1).double().mean())
+
+
+def costs(features: Features) -> str:
+    """A table of processor time of the way that was taken, by the number of keyframes: images over and over, noisy."""
+    generator, memory, rows = torch.Generator().manual_seed(0), Places(), []
+    adding = []
+    for key in range(max(SIZES)):
+        image = key % len(features.mask)
+        shape = features.descriptors[image].shape
+        noise = (1 << torch.randint(0, 8, shape, generator=generator)).to(torch.uint8)
+        noise = noise * (torch.rand(shape, generator=generator) < 0.3)
+        descriptors, mask = features.descriptors[image] ^ noise, features.mask[image]
+        adding.append(_milliseconds(lambda k=key, d=descriptors, m=mask: memory.add(k, d, m)))  # type: ignore[misc]
+        if len(memory) in SIZES:
+            asked = [features[image : image + 1] for image in range(1, 10 * QUERIES, 10)]
+            asking = [_milliseconds(lambda q=q: memory.query(q.descriptors[0], q.mask[0])) for q in asked]  # type: ignore[misc]
+            megabytes = sum(x.element_size() * x.nelement() for x in (memory._codes, memory._used)) / 1e6
+            cells = (sorted(adding)[len(adding) // 2], min(asking), sorted(asking)[QUERIES // 2])
+            rows.append([str(len(memory)), *(f"{cell:.1f}" for cell in cells), f"{megabytes:.0f}"])
+    return table(["keyframes", "add (ms)", "query, quickest (ms)", "query, median (ms)", "memory (MB)"], rows)
+
+
+def _milliseconds(call: Callable[[], object]) -> float:
+    start = time.process_time()
+    call()
+    return 1e3 * (time.process_time() - start)
+
+
+def checks(features: Features, scores: Tensor) -> str:
+    """A table of lookalike pairs by the number of inliers of their relative pose."""
+    inliers = inliers_of_pairs(features)
+    same, asked = lookalike_truth()
+    candidates = scores.masked_fill(~asked, -1.0).topk(BEST, dim=1).indices
+    best = asked & torch.zeros_like(asked).scatter(1, candidates, True)
+    # Each walk has 40 images. Pairs beyond those marked by two images more may still see the same stretch.
+    number = torch.arange(len(same))
+    away = ((number[:, None] - number + WALK // 2) % WALK - WALK // 2).abs()
+    elsewhere = away > 4
+    parts = (asked & same, asked & ~same, asked & ~same & elsewhere, best & same, best & ~same)
+    rows = [["all", *(str(int(part.sum())) for part in parts)]]
+    for count in COUNTS:
+        cells = (str(int((part & (inliers >= count)).sum())) for part in parts)
+        rows.append([f"{count} inliers", *cells])
+    header = [
+        "at least",
+        "true",
+        "false",
+        "false, further away",
+        "true, of the 3 best",
+        "false, of the 3 best",
+    ]
+    return table(header, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,155 @@
+"""Which keyframes the map can do without, and how many are left of a camera that stays in one place."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.world.simulated import CAMERA, path, tracked_at, view_of
+from torchslam.config import Config, KeyframesConfig, load_config
+from torchslam.geometry import se3_exp, se3_inverse
+from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
+from torchslam.mapping.mapper import Mapper
+from torchslam.stopwatch import Stopwatch
+from torchslam.values import View
+from torchslam.world import compaction
+from torchslam.world.map import Map
+from torchslam.world.track import Track
+from torchslam.world.world import World
+
+SETTINGS = KeyframesConfig()
+POINTS = 20
+
+
+def cloud() -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
+
+
+def view_at(index: int, T_cw: Tensor, scale: float = 1.0) -> View:
+    view = view_of(index, T_cw, cloud(), torch.Generator().manual_seed(index))
+    return View(**{**view.__dict__, "scales": torch.full((POINTS,), scale, dtype=torch.float64)})
+
+
+def world_of(T_cw: Tensor, scales: list[float] | None = None) -> World:
+    """Keyframes at T_cw (K, 4, 4) that all see all points, the last one followed."""
+    world = World.empty(0, CAMERA.params.double())
+    slam_map, everyone = world.map, torch.arange(POINTS)
+    for index, pose in enumerate(T_cw):
+        view = view_at(index, pose, scales[index] if scales else 1.0)
+        keyframe = slam_map.add_keyframe(view, pose)
+        if index == 0:
+            slam_map.add_points(cloud(), view.descriptors, 0)
+        slam_map.observe(keyframe, everyone, everyone)
+        seen = tracked_at(pose, everyone, everyone)
+        world.history.add(view, seen, pose @ se3_inverse(pose), keyframe)
+    last = len(T_cw) - 1
+    eye = torch.eye(4, dtype=torch.float64)
+    world.track = Track(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
+    return world
+
+
+def standing(count: int) -> Tensor:
+    return torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+
+
+def which(world: World, *candidates: int) -> list[int]:
+    return torch.nonzero(redundant(world, torch.tensor(candidates), SETTINGS))[:, 0].tolist()
+
+
+def test_a_keyframe_that_three_others_repeat_can_go_and_no_more_than_that() -> None:
+    assert which(world_of(standing(4)), 2) == [2]
+    assert which(world_of(standing(3)), 2) == []
+    assert which(world_of(standing(6)), 4, 3, 2, 1) == [2, 3, 4]
+
+
+def test_coarser_views_do_not_replace_finer_ones() -> None:
+    scales = [2.0, 1.0, 2.0, 2.0, 2.0]
+    assert which(world_of(standing(5), scales), 1) == []
+    assert which(world_of(standing(5), scales), 2) == [2]
+    assert which(world_of(standing(5), [1.2, 1.0, 1.2, 1.2, 1.2]), 1) == [1]  # a level of the pyramid
+    assert which(world_of(standing(5), [1.44, 1.0, 1.44, 1.44, 1.44]), 1) == []
+
+
+def forget(slam_map: Map, keyframe: int, count: int) -> None:
+    slam_map.forget(torch.full((count,), keyframe), torch.arange(count))
+
+
+@pytest.mark.parametrize(("missing", "covered"), [(2, True), (3, False)])
+def test_nine_of_ten_points_are_enough(missing: int, covered: bool) -> None:
+    world = world_of(standing(4))
+    forget(world.map, 3, missing)
+    assert is_covered(world.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
+
+
+@pytest.mark.parametrize(("degrees", "near"), [(11.0, True), (13.0, False)])
+def test_a_keyframe_that_looks_elsewhere_stays(degrees: float, near: bool) -> None:
+    T_cw = standing(4)
+    angle = torch.tensor(degrees).deg2rad().double()
+    T_cw[2] = se3_exp(torch.tensor([0, 0, 0, 0, 0, 1.0], dtype=torch.float64) * angle)
+    assert (which(world_of(T_cw), 2) == [2]) is near
+
+
+@pytest.mark.parametrize(("share", "near"), [(0.09, True), (0.12, False)])
+def test_a_keyframe_that_stands_elsewhere_stays(share: float, near: bool) -> None:
+    T_cw = standing(4)
+    T_cw[2, 0, 3] = share * float(cloud()[:, 2].median())
+    assert (which(world_of(T_cw), 2) == [2]) is near
+
+
+def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> None:
+    world = world_of(standing(30))
+    before = world.history.T_cw(world.map)
+    renumbering = cull_keyframes(world, SETTINGS)
+    assert renumbering is not None
+    stays = torch.nonzero(renumbering.keyframes >= 0)[:, 0]
+    assert stays[0] == 0
+    assert stays[-NEWEST:].tolist() == list(range(30 - NEWEST, 30))
+    assert world.map.num_keyframes == len(stays) == NEWEST + 1
+    torch.testing.assert_close(world.history.T_cw(world.map), before)
+    assert cull_keyframes(world, SETTINGS) is None  # nobody new to ask about
+
+
+def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compaction, "LEAST_DEAD", 5)
+    monkeypatch.setattr(compaction, "_PRICE", 1000)
+    world = world_of(standing(30))
+    descriptors = world.map.points["descriptors"][:1].repeat(40, 1)
+    world.map.kill(world.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
+    before, left = world.map.keyframes["frame_index"].clone(), world.map.positions_w[:21].clone()
+    went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
+    assert went is not None
+    assert went.points.tolist() == [*range(21)] + [-1] * 39
+    assert torch.equal(world.map.positions_w, left)
+    stays = went.keyframes >= 0
+    assert torch.equal(world.map.keyframes["frame_index"][went.keyframes[stays]], before[stays])
+    assert torch.equal(went.heirs[stays], went.keyframes[stays])
+    assert int(went.heirs.min()) >= 0
+    assert world.map.num_keyframes < 30
+    assert Mapper(CAMERA, Config(), Stopwatch()).tidy(world) is None
+
+
+def test_a_few_new_keyframes_are_not_worth_the_trouble() -> None:
+    assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
+    world = world_of(standing(20))
+    world.asked = 13
+    assert cull_keyframes(world, SETTINGS) is None
+
+
+def test_the_reference_of_the_track_stays() -> None:
+    world = world_of(standing(20))
+    world.track.reference = 5
+    renumbering = cull_keyframes(world, SETTINGS)
+    assert renumbering is not None
+    assert world.track.reference == renumbering.keyframes[5] >= 0
+
+
+def test_a_camera_on_its_way_keeps_its_keyframes() -> None:
+    T_cw = path(200)[::15]
+    assert cull_keyframes(world_of(T_cw), SETTINGS) is None
+
+
+def test_a_mapper_that_may_not_cull_keeps_all() -> None:
+    keeping = load_config(None, ["mapping.cull=false"])
+    assert Mapper(CAMERA, keeping, Stopwatch()).tidy(world_of(standing(30))) is None

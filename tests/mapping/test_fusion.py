@@ -1,0 +1,173 @@
+"""Points that are one become one, and no others."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from torchslam.config import Config, load_config
+from torchslam.geometry import se3_inverse, transform
+from torchslam.mapping.fusion import find_in, fuse, merge
+from torchslam.world.map import NO_POINT, Map
+from torchslam.world.world import World
+
+SCENE = Scene.of(200)
+ROWS = rows_of(SCENE)
+
+
+def world(count: int = 3) -> World:
+    return world_in(SCENE, sideways(count))
+
+
+def free(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
+    """Let a keyframe forget some points that all keyframes see; returns their rows and keypoints."""
+    table = slam_map.keyframes["point_ids"]
+    everywhere = slam_map.points["times_observed"] == slam_map.num_keyframes
+    at = torch.nonzero((table[keyframe] >= 0) & everywhere[table[keyframe].clamp(min=0)])[:count, 0]
+    points = table[keyframe, at].clone()
+    slam_map.forget(torch.full_like(at, keyframe), at)
+    return points, at
+
+
+def double(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
+    """Let a keyframe see some points as points of their own; returns the rows of the originals and of the doubles."""
+    points, at = free(slam_map, keyframe, count)
+    doubles = slam_map.add_points(
+        slam_map.positions_w[points], slam_map.points["descriptors"][points], keyframe
+    )
+    slam_map.observe(keyframe, at, doubles)
+    slam_map.refresh(torch.arange(slam_map.num_keyframes))
+    return points, doubles
+
+
+def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
+    here = world()
+    points, at = free(here.map, 2, 6)
+    before = here.map.points["times_observed"].clone()
+    found, there = find_in(here.map, 2, points, CAMERA, Config())
+    assert len(found) == len(there) == 0
+    assert torch.equal(here.map.keyframes["point_ids"][2, at], points)
+    assert torch.equal(here.map.points["times_observed"][points], before[points] + 1)
+
+
+def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([1]))
+    before = here.map.keyframes["point_ids"].clone()
+    assert len(find_in(here.map, 1, seen, CAMERA, Config())[0]) == 0
+    assert torch.equal(here.map.keyframes["point_ids"], before)
+
+
+def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
+    here = world()
+    points, doubles = double(here.map, 2, 6)
+    table = here.map.keyframes["point_ids"].clone()
+    found, there = find_in(here.map, 2, points, CAMERA, Config())
+    assert dict(zip(found.tolist(), there.tolist(), strict=True)) == dict(
+        zip(points.tolist(), doubles.tolist(), strict=True)
+    )
+    assert torch.equal(here.map.keyframes["point_ids"], table)
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(2.4, True), (2.5, False)])
+def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, agrees: bool) -> None:
+    here = world()
+    points, at = free(here.map, 2, 6)
+    T_cw = here.map.T_cw[2]
+    points_c = transform(T_cw, here.map.positions_w[points])
+    scales = here.map.keyframes["scales"][2, at]
+    points_c[:, 0] += offset * scales * points_c[:, 2] / 200.0
+    here.map.points["positions_w"][points] = transform(se3_inverse(T_cw), points_c)
+    find_in(here.map, 2, points, CAMERA, Config())
+    assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is agrees
+    assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
+    if not agrees:
+        wide = load_config(None, ["measurement.chi_square=7.0"])
+        find_in(here.map, 2, points, CAMERA, wide)
+        assert (here.map.keyframes["point_ids"][2, at] == points).all()
+
+
+def test_another_look_is_another_point() -> None:
+    here = world()
+    points, at = free(here.map, 2, 6)
+    here.map.points["descriptors"][points] ^= 255
+    find_in(here.map, 2, points, CAMERA, Config())
+    assert (here.map.keyframes["point_ids"][2, at] == NO_POINT).all()
+
+
+@pytest.mark.parametrize(("factor", "found"), [(1.4, True), (1.6, False), (0.72, True), (0.6, False)])
+def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) -> None:
+    here = world()
+    points, at = free(here.map, 2, 40)
+    middle = (here.map.keyframes["scales"][2, at] - 1.7).abs() < 0.15  # far from the ends of the scales
+    points, at = points[middle], at[middle]
+    assert len(at) > 3
+    here.map.points["reach"][points] *= factor
+    find_in(here.map, 2, points, CAMERA, Config())
+    assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is found
+    assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not found
+
+
+@pytest.mark.parametrize("asks", [0, 2])
+def test_doubles_are_found_from_either_side(asks: int) -> None:
+    """Keyframe 2 has points of its own that the other two see as others: whoever asks, they become one."""
+    here = world()
+    points, doubles = double(here.map, 2, 10)
+    others = torch.tensor([keyframe for keyframe in range(3) if keyframe != asks])
+    fuse(here.map, asks, others, CAMERA, Config())
+    assert torch.equal(here.map.resolve(doubles), points)
+    assert not here.map.points["alive"][doubles].any()
+    assert (here.map.points["times_observed"][points] == 3).all()
+
+
+def test_what_is_free_in_a_neighbour_or_here_is_filled_in() -> None:
+    for keyframe in (0, 1):
+        here = world()
+        points, at = free(here.map, 1, 10)
+        fuse(here.map, keyframe, torch.tensor([1 - keyframe]), CAMERA, Config())
+        assert torch.equal(here.map.keyframes["point_ids"][1, at], points)
+
+
+def observed(*times: int) -> Map:
+    """Points that so many keyframes see."""
+    scene = Scene.of(len(times))
+    slam_map = Map()
+    for index in range(max(times)):
+        slam_map.add_keyframe(scene.view(index, sideways(1)[0]), sideways(1)[0])
+    slam_map.add_points(scene.points_w, scene.descriptors, 0)
+    for point, count in enumerate(times):
+        for keyframe in range(count):
+            slam_map.observe(keyframe, torch.tensor([point]), torch.tensor([point]))
+    return slam_map
+
+
+def merged(times: tuple[int, ...], *pairs: tuple[int, int]) -> list[int]:
+    slam_map = observed(*times)
+    merge(slam_map, [(torch.tensor([one]), torch.tensor([other])) for one, other in pairs])
+    return slam_map.resolve(torch.arange(len(times))).tolist()
+
+
+def test_the_point_that_is_seen_most_stays() -> None:
+    assert merged((3, 2), (0, 1)) == [0, 0]
+    assert merged((2, 3), (0, 1)) == [1, 1]
+    assert merged((2, 2), (0, 1)) == [1, 1]  # of equals the one that was there
+    assert merged((2, 2), (1, 0)) == [0, 0]
+
+
+def test_chains_end_in_one_point() -> None:
+    assert merged((2, 3, 4), (0, 1), (1, 2)) == [2, 2, 2]
+    assert merged((2, 3, 4), (1, 2), (0, 1)) == [2, 2, 2]
+    assert merged((4, 2, 3), (1, 2), (1, 0), (2, 0)) == [0, 0, 0]
+    assert merged((3, 3, 3, 2), (0, 1), (1, 0)) == [1, 1, 2, 3]
+
+
+def test_nothing_to_merge_changes_nothing() -> None:
+    slam_map = observed(2, 3)
+    merge(slam_map, [])
+    merge(slam_map, [(torch.tensor([1]), torch.tensor([1]))])
+    assert slam_map.points["alive"].all()
+    assert math.isclose(float(slam_map.points["times_observed"].sum()), 5)

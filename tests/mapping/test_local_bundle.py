@@ -1,0 +1,181 @@
+"""What is free, what is fixed, how much a keypoint weighs, and which observations are forgotten."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from torchslam.config import BundleConfig, load_config
+from torchslam.geometry import se3_exp, transform
+from torchslam.mapping.local_bundle import HUBER, adjust, adjust_all, adjust_keyframes, drop_outliers, select
+from torchslam.world.map import NO_POINT, Map
+
+SCENE = Scene.of(200)
+ROWS = rows_of(SCENE)
+
+
+def row(T: Tensor) -> Map:
+    return world_in(SCENE, T).map
+
+
+def shake(slam_map: Map, keyframes: list[int], size: float = 0.003) -> None:
+    generator = torch.Generator().manual_seed(5)
+    for keyframe in keyframes:
+        twist = size * torch.randn(6, generator=generator, dtype=torch.float64)
+        slam_map.keyframes["T_cw"][keyframe] = se3_exp(twist) @ slam_map.T_cw[keyframe]
+
+
+def which_moved(slam_map: Map, before: Tensor) -> list[int]:
+    return torch.nonzero((slam_map.T_cw != before).flatten(1).any(1))[:, 0].tolist()
+
+
+def bundle(**changes: int) -> BundleConfig:
+    return load_config(None, [f"bundle.{name}={value}" for name, value in changes.items()]).bundle
+
+
+def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> None:
+    slam_map = row(sideways(6))
+    truth = slam_map.T_cw.clone()
+    shake(slam_map, [4, 5])
+    before = slam_map.T_cw.clone()
+    adjust(slam_map, 5, CAMERA, bundle(window=2, iterations=20))
+    assert which_moved(slam_map, before) == [4, 5]  # the one that shares most with it
+    torch.testing.assert_close(slam_map.T_cw, truth, atol=1e-5, rtol=0)
+
+
+def test_the_first_keyframe_never_moves() -> None:
+    slam_map = row(sideways(3))
+    shake(slam_map, [1, 2])
+    before = slam_map.T_cw.clone()
+    adjust(slam_map, 1, CAMERA, bundle(window=8))
+    assert which_moved(slam_map, before) == [1, 2]
+    adjust_all(slam_map, CAMERA, bundle())
+    assert torch.equal(slam_map.T_cw[0], before[0])
+
+
+def test_no_more_keyframes_hold_than_are_allowed() -> None:
+    """With one holding keyframe alone the scale is free; with two it is not."""
+    for limit, holds in ((1, False), (2, True)):
+        slam_map = row(sideways(4))
+        truth = slam_map.T_cw.clone()
+        slam_map.keyframes["T_cw"][2:, 0, 3] *= 1.02
+        adjust(slam_map, 3, CAMERA, bundle(window=2, max_fixed=limit, iterations=30))
+        off = float((slam_map.T_cw[2:] - truth[2:]).abs().max())
+        assert (off < 1e-6) is holds
+
+
+def weighted(coarse: float) -> float:
+    """By how many pixels points move of which one of three keyframes that stand has an error of 2 px.
+
+    A fourth one that may move has the same error; both have keypoints of another scale.
+    """
+    T_cw = sideways(4)
+    T_cw[:, 0, 3] = -torch.tensor([0.0, 0.3, 0.0, 0.3], dtype=torch.float64)
+    slam_map = row(T_cw)
+    slam_map.keyframes["keypoints"][2:, :, 1] += 2.0  # across the way, which no depth explains
+    slam_map.keyframes["scales"][:2], slam_map.keyframes["scales"][2:] = 1.0, coarse
+    seen = slam_map.points_seen_by(torch.arange(4))
+    before = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
+    adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30, covariances=False)
+    after = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
+    return float((after - before)[:, 1].median())
+
+
+def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
+    assert weighted(1.0) == pytest.approx(2 / 3, rel=0.02)
+    assert weighted(2.0) == pytest.approx(2 / 9, rel=0.02)
+    assert weighted(4.0) == pytest.approx(2 / 33, rel=0.02)
+
+
+def test_the_kernel_turns_where_an_error_is_hardly_noise() -> None:
+    assert pytest.approx(5.991**0.5) == HUBER
+
+
+@pytest.mark.parametrize(("offset", "stays"), [(2.4, True), (2.5, False)])
+def test_observations_are_dropped_in_units_of_their_scale(offset: float, stays: bool) -> None:
+    slam_map = row(sideways(4))
+    table = slam_map.keyframes["point_ids"]
+    at = torch.nonzero(table[2] >= 0)[:10, 0]
+    points = table[2, at].clone()
+    slam_map.keyframes["keypoints"][2, at, 1] += offset * slam_map.keyframes["scales"][2, at]
+    before = slam_map.points["times_observed"][points].clone()
+    drop_outliers(slam_map, slam_map.observations(), CAMERA)
+    assert bool((table[2, at] == points).all()) is stays
+    assert bool((table[2, at] == NO_POINT).all()) is not stays
+    alive = slam_map.points["alive"][points]
+    assert torch.equal(alive, before - int(not stays) >= 2)
+    assert slam_map.points["alive"].sum() > 100
+
+
+def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
+    slam_map = row(sideways(2))
+    table = slam_map.keyframes["point_ids"]
+    at = torch.nonzero(table[1] >= 0)[:3, 0]
+    points = table[1, at].clone()
+    slam_map.keyframes["keypoints"][1, at] += 30.0
+    count = slam_map.num_points
+    drop_outliers(slam_map, slam_map.observations(), CAMERA)
+    both = slam_map.points["times_observed"][points] == 0
+    assert both.all()
+    assert not slam_map.points["alive"][points].any()
+    assert slam_map.num_points == count - 3
+
+
+def test_a_bundle_leaves_no_observation_that_disagrees() -> None:
+    slam_map = row(sideways(4))
+    table = slam_map.keyframes["point_ids"]
+    at = torch.nonzero(table[3] >= 0)[:5, 0]
+    slam_map.keyframes["keypoints"][3, at] += 25.0
+    adjust(slam_map, 3, CAMERA, bundle(window=2))
+    assert (table[3, at] == NO_POINT).all()
+
+
+def test_adjusted_points_are_as_their_observers_have_them() -> None:
+    slam_map = row(sideways(4))
+    slam_map.points["reach"][:] = 0
+    adjust(slam_map, 3, CAMERA, bundle(window=2))
+    seen = slam_map.points_seen_by(torch.tensor([3]))
+    size = SCENE.sizes[torch.argsort(ROWS)[seen]] * 200.0
+    torch.testing.assert_close(slam_map.points["reach"][seen], size)
+
+
+def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
+    slam_map = row(sideways(5))
+    truth = slam_map.T_cw.clone()
+    shake(slam_map, [1, 2, 3, 4])
+    adjust_all(slam_map, CAMERA, bundle(final_iterations=30))
+    torch.testing.assert_close(slam_map.T_cw[:, :3, :3], truth[:, :3, :3], atol=1e-6, rtol=0)
+    scale = float(slam_map.T_cw[4, 0, 3] / truth[4, 0, 3])
+    torch.testing.assert_close(slam_map.T_cw[:, :3, 3], scale * truth[:, :3, 3], atol=1e-6, rtol=0)
+    assert (slam_map.keyframes["covariances"] == 0).all()
+
+
+def test_certainty_is_noted_where_it_is_asked_for() -> None:
+    for asked in (False, True):
+        slam_map = world_in(SCENE, sideways(4), noise=0.5).map
+        adjust(slam_map, 3, CAMERA, bundle(window=2), covariances=asked)
+        known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
+        assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if asked else [])
+        seen = slam_map.points_seen_by(torch.tensor([2, 3]))
+        seen = seen[slam_map.points["times_observed"][seen] >= 2]
+        trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
+        assert bool((trace > 0).all()) is asked
+
+
+def test_nothing_to_adjust_changes_nothing() -> None:
+    slam_map = row(sideways(2))
+    slam_map.kill(slam_map.living_points())
+    before = slam_map.T_cw.clone()
+    adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5, covariances=True)
+    assert torch.equal(slam_map.T_cw, before)
+
+
+def test_some_of_the_observations() -> None:
+    slam_map = row(sideways(2))
+    seen = slam_map.observations()
+    few = select(seen, seen.keyframe_index == 1)
+    assert (few.keyframe_index == 1).all()
+    assert len(few) == int((slam_map.keyframes["point_ids"][1] >= 0).sum())
+    assert torch.equal(few.pixels, slam_map.keyframes["keypoints"][1, few.keypoint_index])

@@ -1,0 +1,220 @@
+"""New points from two keyframes: who matches, which of them become points, and how certain they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from torchslam.config import MatchingConfig, load_config
+from torchslam.geometry import se3_inverse, transform, triangulation_covariance
+from torchslam.mapping.new_points import (
+    has_baseline,
+    has_consistent_scale,
+    match_along_epipolar_lines,
+    triangulate_against,
+)
+from torchslam.world.map import Map
+
+SCENE = Scene.of(300)
+ROWS = rows_of(SCENE)
+
+
+def half_known(T_cw: Tensor, noise: float = 0.0) -> Map:
+    """Keyframes at T_cw that know every other point of the scene."""
+    return world_in(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
+
+
+def triangulated(slam_map: Map, *overrides: str) -> Tensor:
+    """(n,) rows of the points that keyframes 1 and 0 make."""
+    before = len(slam_map.points)
+    triangulate_against(slam_map, 1, 0, CAMERA, load_config(None, overrides))
+    return torch.arange(before, len(slam_map.points))
+
+
+def shown(slam_map: Map, keyframe: int, points: Tensor) -> Tensor:
+    """(n,) which points of the scene a keyframe sees as points of the map."""
+    table = slam_map.keyframes["point_ids"][keyframe]
+    at = torch.stack([torch.nonzero(table == point)[0, 0] for point in points])
+    return SCENE.shows(int(slam_map.keyframes["frame_index"][keyframe]))[at]
+
+
+def test_what_both_see_and_neither_knows_becomes_a_point_where_it_is() -> None:
+    slam_map = half_known(sideways(2, step=0.4))
+    new = triangulated(slam_map)
+    one, two = shown(slam_map, 1, new), shown(slam_map, 0, new)
+    assert torch.equal(one, two)
+    assert (one % 2 == 1).all()
+    torch.testing.assert_close(slam_map.positions_w[new], SCENE.points_w[one], atol=1e-8, rtol=0)
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(sideways(2, step=0.4))]
+    both = views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)] & (torch.arange(300) % 2 == 1)
+    assert len(new) == int(both.sum()) > 80
+    assert torch.equal(slam_map.points["descriptors"][new], SCENE.descriptors[one])
+    assert (slam_map.points["born"][new] == 1).all()
+    assert (slam_map.points["times_observed"][new] == 2).all()
+    assert len(triangulated(slam_map)) == 0  # they are known now
+
+
+def test_new_points_know_how_certain_they_are() -> None:
+    slam_map = half_known(sideways(2, step=0.4))
+    new = triangulated(slam_map)
+    scales = []
+    for keyframe in (1, 0):
+        view = slam_map.view(keyframe)
+        scales.append(view.scales[SCENE.at(view.index)[shown(slam_map, keyframe, new)]])
+    wanted = triangulation_covariance(
+        slam_map.T_cw[1], slam_map.T_cw[0], slam_map.positions_w[new], *scales, CAMERA, CAMERA
+    )
+    torch.testing.assert_close(slam_map.points["covariances_w"][new], wanted)
+
+
+def test_points_with_little_parallax_are_not_made() -> None:
+    T_cw = sideways(2, step=0.1)
+    slam_map = half_known(T_cw)
+    new = triangulated(slam_map, "mapping.min_parallax_deg=1.5", "mapping.min_baseline=0.001")
+    every = half_known(T_cw)
+    all_of_them = triangulated(every, "mapping.min_parallax_deg=0", "mapping.min_baseline=0.001")
+
+    def angles(points_w: Tensor) -> Tensor:
+        rays = [torch.nn.functional.normalize(points_w - se3_inverse(T)[:3, 3], dim=-1) for T in T_cw]
+        return torch.rad2deg((rays[0] * rays[1]).sum(-1).acos())
+
+    wanted = int((angles(every.positions_w[all_of_them]) > 1.5).sum())
+    assert 0 < len(new) == wanted < len(all_of_them)
+
+
+def spoiled(slam_map: Map, keyframe: int, pixels: float, axis: int) -> None:
+    """Move all keypoints of a keyframe by pixels in units of their scales."""
+    off = pixels * slam_map.keyframes["scales"][keyframe]
+    slam_map.keyframes["keypoints"][keyframe, :, axis] += off
+
+
+@pytest.mark.parametrize(("offset", "good"), [(4.6, True), (5.2, False)])
+def test_points_must_be_seen_where_they_are(offset: float, good: bool) -> None:
+    """Across the epipolar line an error is shared by the two views: each may be off by 2.45 times its scale."""
+    slam_map = half_known(sideways(2, step=0.4))
+    spoiled(slam_map, 0, offset, 1)
+    new = triangulated(slam_map, "mapping.epipolar_px=100")
+    assert (len(new) > 40) is good
+    assert (len(new) == 0) is not good or good
+
+
+def test_the_gate_is_the_configured_one() -> None:
+    slam_map = half_known(sideways(2, step=0.4))
+    spoiled(slam_map, 0, 5.2, 1)
+    assert len(triangulated(slam_map, "mapping.epipolar_px=100", "measurement.chi_square=9")) > 40
+
+
+def test_points_of_another_size_are_not_made() -> None:
+    slam_map = half_known(sideways(2, step=0.4))
+    scales, all_of_them = (
+        slam_map.keyframes["scales"][1],
+        len(triangulated(half_known(sideways(2, step=0.4)))),
+    )
+    fine = scales < 1.3  # twice that is within the scales of the other view
+    scales[fine] *= 2
+    new = triangulated(slam_map)
+    assert 0 < len(new) < all_of_them
+    assert not fine[torch.nonzero(torch.isin(slam_map.keyframes["point_ids"][1], new))[:, 0]].any()
+
+
+def test_cameras_must_be_apart_by_a_share_of_the_depth() -> None:
+    slam_map = half_known(sideways(2, step=0.4))
+    seen = slam_map.points_seen_by(torch.tensor([0]))
+    share = 0.4 / float(slam_map.positions_w[seen, 2].median())
+    assert has_baseline(slam_map, 1, 0, 0.99 * share)
+    assert not has_baseline(slam_map, 1, 0, 1.01 * share)
+    assert len(triangulated(slam_map, f"mapping.min_baseline={1.01 * share}")) == 0
+    assert len(triangulated(slam_map, f"mapping.min_baseline={0.99 * share}")) > 0
+
+
+def test_the_depth_is_that_of_the_neighbour() -> None:
+    T_cw = torch.stack([pose(0, 0, 2.0), pose(0.5, 0, 0)])  # the first stands two metres back
+    slam_map = half_known(T_cw)
+    seen = slam_map.points_seen_by(torch.tensor([0]))
+    share = math.hypot(0.5, 2.0) / float(slam_map.positions_w[seen, 2].median() + 2.0)
+    assert has_baseline(slam_map, 1, 0, 0.99 * share)
+    assert not has_baseline(slam_map, 1, 0, 1.01 * share)
+
+
+ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
+
+
+def epipolar(offset: float, limit: float = 2.0, **changes: Tensor) -> tuple[Tensor, Tensor]:
+    """Matches of two views, the second with all its keypoints off the line by so many times their scale."""
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
+    moved = views[1].keypoints + offset * views[1].scales[:, None] * torch.tensor([0.0, 1.0])
+    views[1] = replace(views[1], keypoints=moved, **changes)
+    middle = (moved - torch.tensor([159.5, 119.5])).norm(dim=-1) < 60  # where a pixel is 1 / focal length
+    rows = [torch.nonzero(mask)[:, 0] for mask in (views[0].mask, views[1].mask & middle)]
+    T_21 = ALONG[1] @ se3_inverse(ALONG[0])
+    return match_along_epipolar_lines(*views, *rows, T_21, CAMERA, limit, MatchingConfig())
+
+
+def test_matches_lie_on_the_epipolar_line() -> None:
+    first, second = epipolar(0.0)
+    assert len(first) > 15
+    assert torch.equal(SCENE.shows(0)[first], SCENE.shows(1)[second])
+
+
+@pytest.mark.parametrize("limit", [1.0, 4.0])
+def test_a_match_may_be_off_the_line_in_units_of_its_scale(limit: float) -> None:
+    assert len(epipolar(0.98 * limit, limit)[0]) > 15
+    assert len(epipolar(1.12 * limit, limit)[0]) == 0
+
+
+@pytest.mark.parametrize(("bits", "found"), [(51, True), (52, False)])
+def test_descriptors_must_be_alike(bits: int, found: bool) -> None:
+    """Four fifths of what is allowed elsewhere: 0.8 times 64."""
+    other = SCENE.view(1, ALONG[1]).descriptors.clone()
+    other[:, : bits // 8] ^= 255
+    other[:, 31] ^= (1 << bits % 8) - 1
+    assert (len(epipolar(0.0, descriptors=other)[0]) > 15) is found
+
+
+def test_a_keypoint_has_one_partner() -> None:
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
+    twin = torch.nonzero(views[0].mask)[:2, 0]  # two keypoints of the same look in the first view
+    keypoints, descriptors = views[0].keypoints.clone(), views[0].descriptors.clone()
+    keypoints[twin[1]] = keypoints[twin[0]]
+    descriptors[twin[1]] = descriptors[twin[0]]
+    descriptors[twin[1], 0] ^= 1
+    views[0] = replace(views[0], keypoints=keypoints, descriptors=descriptors)
+    rows = [torch.nonzero(view.mask)[:, 0] for view in views]
+    T_21 = ALONG[1] @ se3_inverse(ALONG[0])
+    first, second = match_along_epipolar_lines(*views, *rows, T_21, CAMERA, 2.0, MatchingConfig())
+    assert twin[0] in first
+    assert twin[1] not in first
+    assert len(torch.unique(second)) == len(second)
+
+
+def test_nobody_matches_nobody() -> None:
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
+    rows, nobody = torch.arange(10), torch.arange(0)
+    for one, other in ((nobody, rows), (rows, nobody)):
+        found = match_along_epipolar_lines(*views, one, other, pose(1.0), CAMERA, 2.0, MatchingConfig())
+        assert [len(part) for part in found] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "consistent"), [(1.7, True), (1.9, False), (1 / 1.7, True), (1 / 1.9, False)]
+)
+def test_sizes_go_with_one_over_the_distance(factor: float, consistent: bool) -> None:
+    """At a third of the distance, three times the size, within a factor of 1.8."""
+    points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
+    ahead = pose(0, 0, -4.0)
+    one, size = torch.tensor([1.5]).double(), torch.tensor([4.5 * factor]).double()
+    assert bool(has_consistent_scale(points_w, pose(), ahead, one, size, (1.0, 20.0))[0]) is consistent
+    assert bool(has_consistent_scale(points_w, ahead, pose(), size, one, (0.1, 20.0))[0]) is consistent
+
+
+def test_sizes_beyond_those_of_the_detector_are_not_expected() -> None:
+    points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
+    one, two = torch.tensor([1.5]).double(), torch.tensor([2.0]).double()
+    assert has_consistent_scale(points_w, pose(), pose(0, 0, -4.0), one, two, (1.0, 2.0)).all()
+    assert not has_consistent_scale(points_w, pose(), pose(0, 0, -4.0), one, two, (1.0, 8.0)).any()
+    assert transform(pose(0, 0, -4.0), points_w)[0, 2] == 2.0

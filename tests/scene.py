@@ -1,0 +1,143 @@
+"""A scene of points that cameras look at, and worlds that hold exactly what is there: every answer is known.
+
+Rows are shuffled wherever they can be, so that a keypoint's number, a point's row and its place in the scene differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tests.world.simulated import tracked_at
+from torchslam.config import Config
+from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import View
+from torchslam.world.world import World
+
+CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
+UNTOUCHED = torch.eye(4, dtype=torch.float64)
+
+
+def pose(*tangent: float) -> Tensor:
+    """(4, 4) from translation and rotation; what is left out is zero."""
+    return se3_exp(torch.tensor([*tangent, *[0.0] * (6 - len(tangent))], dtype=torch.float64))
+
+
+def sideways(count: int, step: float = 0.15, start: float = 0.0) -> Tensor:
+    """(K, 4, 4) T_cw of cameras that look ahead, the one after the other a step to the right."""
+    T_cw = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    T_cw[:, 0, 3] = -(start + step * torch.arange(count, dtype=torch.float64))
+    return T_cw
+
+
+@dataclass(frozen=True)
+class Scene:
+    """points_w: (P, 3); sizes: (P,) map units; descriptors: (P, 32)."""
+
+    points_w: Tensor
+    sizes: Tensor
+    descriptors: Tensor
+
+    @classmethod
+    def of(cls, count: int = 200, seed: int = 0, depth: float = 4.0, width: float = 8.0) -> Scene:
+        """Points in a slab in front of the origin, of scales 1 to 3 px from there."""
+        generator = torch.Generator().manual_seed(seed)
+        draw = torch.rand(count, 4, generator=generator, dtype=torch.float64)
+        extent = draw.new_tensor([width, 0.9 * depth, 0.5 * depth])
+        points_w = (draw[:, :3] - 0.5) * extent + draw.new_tensor([0.0, 0.0, depth])
+        descriptors = torch.randint(0, 256, (count, 32), generator=generator, dtype=torch.uint8)
+        return cls(points_w, (1 + 2 * draw[:, 3]) * depth / 200.0, descriptors)
+
+    def __len__(self) -> int:
+        return len(self.points_w)
+
+    def shows(self, index: int) -> Tensor:
+        """(P,) which point each keypoint of a view shows."""
+        return torch.randperm(len(self), generator=torch.Generator().manual_seed(1000 + index))
+
+    def at(self, index: int) -> Tensor:
+        """(P,) at which keypoint of a view each point is."""
+        return torch.argsort(self.shows(index))
+
+    def view(self, index: int, T_cw: Tensor, *, noise: float = 0.0, session: int = 0) -> View:
+        """What a camera at T_cw (4, 4) sees: a keypoint for each point in the image, `noise` times its scale off."""
+        order = self.shows(index)
+        points_c = transform(T_cw, self.points_w[order])
+        pixels, valid = CAMERA.project(points_c)
+        mask = valid & CAMERA.in_image(pixels)
+        scales = self.sizes[order] * 200.0 / torch.linalg.vector_norm(points_c, dim=-1)
+        generator = torch.Generator().manual_seed(2000 + index)
+        error = noise * torch.randn(len(order), 2, generator=generator, dtype=torch.float64)
+        return View(
+            index=index,
+            timestamp=0.1 * index,
+            keypoints=torch.where(mask[:, None], pixels + scales[:, None] * error, 0.0),
+            scales=torch.where(mask, scales, 1.0),
+            angles=torch.zeros_like(scales),
+            descriptors=self.descriptors[order],
+            mask=mask,
+            session=session,
+        )
+
+
+def rows_of(scene: Scene, seed: int = 0) -> Tensor:
+    """(P,) the row in the map of each point of a scene."""
+    return torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed + 77))
+
+
+def world_in(
+    scene: Scene,
+    T_cw: Tensor,
+    *,
+    S_ws: Tensor = UNTOUCHED,
+    first: int = 0,
+    number: int = 0,
+    noise: float = 0.0,
+    seen: Tensor | None = None,
+) -> World:
+    """A world of keyframes at T_cw (K, 4, 4) of the scene, frames first, first + 1, ..., that holds the scene's points.
+
+    S_ws:  (4, 4) similarity from the scene to the world
+    seen:  (P,) bool, points that the map has; all without it. Row r of the map is point argsort(rows_of)[r].
+    The camera is followed from the last keyframe.
+    """
+    world = World.empty(number, CAMERA.params)
+    rows = rows_of(scene)
+    known = torch.ones(len(scene), dtype=torch.bool) if seen is None else seen
+    ids: Tensor | None = None
+    for offset, true in enumerate(T_cw):
+        view = scene.view(first + offset, true, noise=noise)
+        keyframe = world.map.add_keyframe(view, moved(true, S_ws))
+        if ids is None:
+            order = torch.argsort(rows)
+            ids = world.map.add_points(
+                transform(S_ws, scene.points_w[order]), scene.descriptors[order], keyframe
+            )
+        at = torch.nonzero(view.mask & known[scene.shows(first + offset)])[:, 0]
+        world.map.observe(keyframe, at, rows[scene.shows(first + offset)[at]])
+        tracked = tracked_at(world.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
+        world.history.add(view, tracked, UNTOUCHED, keyframe)
+    world.map.refresh(torch.arange(len(T_cw)))
+    lonely = torch.nonzero(world.map.points["times_observed"] == 0)[:, 0]
+    world.map.kill(lonely)
+    Tracker(CAMERA, Config()).follow(world, len(T_cw) - 1)
+    return world
+
+
+def moved(T_cw: Tensor, S_ws: Tensor) -> Tensor:
+    """(..., 4, 4) the pose of a camera in a world that a similarity S_ws (4, 4) makes of the scene."""
+    S_cw = T_cw @ sim3_inverse(S_ws)
+    scale = sim3_scale(S_cw)[..., None]
+    return rigid(S_cw[..., :3, :3] / scale[..., None], S_cw[..., :3, 3] / scale)
+
+
+def centre(T_cw: Tensor) -> Tensor:
+    """(..., 3) where a camera is."""
+    return se3_inverse(T_cw)[..., :3, 3]
+
+
+def with_scales(view: View, scales: Tensor) -> View:
+    return replace(view, scales=scales)

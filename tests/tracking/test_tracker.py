@@ -1,0 +1,474 @@
+"""The tracker's parts by known values, and the whole of it on a scene of which every answer is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
+from torchslam.config import load_config
+from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.tracking.correspondences import Projected, project_points
+from torchslam.tracking.tracker import (
+    CELLS,
+    ERROR_MEMORY,
+    PER_CELL,
+    SENIOR,
+    Tracker,
+    cells,
+    coverage,
+    spread,
+    trusted,
+    well_observed,
+)
+from torchslam.values import Tracked, View
+from torchslam.world.world import World
+
+SCENE = Scene.of(300)
+ROWS = rows_of(SCENE)
+STEP = torch.tensor([-0.05, 0.02, 0.03, 0.01, 0.04, -0.02], dtype=torch.float64)  # from frame to frame
+AWAY = pose(0, 0, 0, 0, 3.0)
+
+
+def tracker(*overrides: str) -> Tracker:
+    return Tracker(CAMERA, load_config(None, overrides))
+
+
+def world(count: int = 4, **options: float) -> World:
+    return world_in(SCENE, sideways(count), **options)  # type: ignore[arg-type]
+
+
+def followed(where: World, view: View, by: Tracker | None = None) -> Tracked:
+    tracked = (by or tracker()).track(where, view)
+    assert tracked is not None
+    return tracked
+
+
+# --- the track --------------------------------------------------------------------------------------------------
+
+
+def test_follow_goes_on_from_a_keyframe() -> None:
+    here = world(4)
+    here.track.velocity, here.track.error = pose(0.1), 0.7
+    tracker().follow(here, 2)
+    track = here.track
+    assert track.reference == 2
+    torch.testing.assert_close(track.T_cr, pose())
+    torch.testing.assert_close(here.T_cw, here.map.T_cw[2])
+    assert torch.equal(track.velocity, pose(0.1))
+    assert track.error == 0.7
+    assert int(track.local_keyframes[0]) == 2
+    assert sorted(track.local_keyframes.tolist()) == [0, 1, 2, 3]
+    seen = here.map.keyframes["point_ids"][2]
+    assert torch.equal(track.seen_last, seen[seen >= 0])
+    assert torch.equal(track.local_points, here.map.points_seen_by(torch.arange(4)))
+
+
+def test_the_local_map_is_bounded() -> None:
+    here, few = world(6), tracker("tracking.local_keyframes=2")
+    few.follow(here, 0)
+    assert here.track.local_keyframes.tolist() == [0, 1, 2]  # the nearest share most
+    assert torch.equal(here.track.local_points, here.map.points_seen_by(torch.arange(3)))
+
+
+def test_the_local_map_may_be_what_was_seen_lately() -> None:
+    here, recent = world(4), tracker("tracking.recent_frames=5")
+    last_seen = here.map.points["last_seen"]
+    last_seen[:] = 10
+    last_seen[:20] = 15
+    last_seen[20:30] = 11
+    here.map.kill(torch.tensor([3]))
+    recent.follow(here, 3)
+    wanted = [row for row in range(30) if here.map.points["alive"][row]]
+    assert here.track.local_points.tolist() == wanted
+    last_seen[0] = 16
+    recent.follow(here, 3)
+    assert here.track.local_points.tolist() == [row for row in wanted if row < 20]
+
+
+def test_a_prediction_repeats_the_last_motion() -> None:
+    here, follower = world(), tracker()
+    first = sideways(1, start=0.2)[0]
+    path = [first, se3_exp(STEP) @ first, se3_exp(STEP) @ se3_exp(STEP) @ first]
+    for index, T_cw in enumerate(path[:2]):
+        followed(here, SCENE.view(50 + index, T_cw), follower)
+    torch.testing.assert_close(here.track.velocity, se3_exp(STEP), atol=1e-7, rtol=0)
+    torch.testing.assert_close(follower.predict(here), path[2], atol=1e-7, rtol=0)
+    torch.testing.assert_close(here.T_cw, path[1], atol=1e-7, rtol=0)
+    torch.testing.assert_close(tracker("tracking.predict=false").predict(here), here.T_cw)
+    here.track.velocity = None
+    torch.testing.assert_close(follower.predict(here), here.T_cw)
+
+
+def test_a_frame_that_cannot_be_located_ends_the_motion() -> None:
+    here = world()
+    here.track.velocity = pose(0.1)
+    before = here.T_cw.clone()
+    assert tracker().track(here, SCENE.view(50, AWAY)) is None
+    assert here.track.velocity is None
+    assert torch.equal(here.T_cw, before)
+
+
+def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() -> None:
+    here, follower = world(5, noise=0.0), tracker()
+    follower.follow(here, 4)
+    T_cw = sideways(1, start=0.16)[0]
+    view = SCENE.view(50, T_cw)
+    tracked = followed(here, view, follower)
+    shared = here.map.observers(tracked.point_ids)
+    assert int(shared[here.track.reference]) == int(shared.max())
+    assert here.track.reference != 4
+    torch.testing.assert_close(here.T_cw, T_cw, atol=1e-7, rtol=0)
+    torch.testing.assert_close(
+        here.track.T_cr, T_cw @ se3_inverse(here.map.T_cw[here.track.reference]), atol=1e-7, rtol=0
+    )
+    assert torch.equal(here.track.seen_last, tracked.point_ids)
+    assert here.track.velocity is not None
+    last_seen = here.map.points["last_seen"]
+    assert (last_seen[tracked.point_ids] == 50).all()
+    others = torch.ones(len(last_seen), dtype=torch.bool).index_fill(0, tracked.point_ids, False)
+    assert (last_seen[others] == 0).all()
+
+
+def test_the_error_of_the_way_follows_slowly() -> None:
+    here, follower = world(), tracker()
+    here.track.error = 2.0
+    tracked = followed(here, SCENE.view(50, sideways(1, start=0.4)[0], noise=0.5), follower)
+    assert here.track.error == pytest.approx(2.0 + ERROR_MEMORY * (tracked.error - 2.0))
+    assert ERROR_MEMORY == 0.1
+
+
+def test_a_track_begins_anew_where_a_frame_was_found() -> None:
+    here, follower = world(5), tracker()
+    here.track.velocity, here.track.error = pose(0.1), 3.0
+    view = SCENE.view(50, sideways(1, start=0.02)[0])
+    tracked = followed(here.aside(), view, follower)
+    here.map.points["last_seen"][:] = 0
+    follower.start_at(here, view, tracked)
+    assert here.track.reference == 0
+    assert here.track.velocity is None
+    assert here.track.error == 0.0
+    assert torch.equal(here.track.seen_last, tracked.point_ids)
+    torch.testing.assert_close(here.T_cw, tracked.T_cw)
+    assert (here.map.points["last_seen"][tracked.point_ids] == 50).all()
+
+
+# --- one frame --------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_is_where_it_is_and_sees_what_it_sees() -> None:
+    here, T_cw = world(), se3_exp(3 * STEP)
+    view = SCENE.view(50, T_cw)
+    visible = here.map.points["times_visible"].clone()
+    tracked = followed(here, view)
+    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
+    assert torch.equal(tracked.point_ids, ROWS[SCENE.shows(50)[tracked.keypoints]])
+    assert tracked.matches == tracked.inliers > 150
+    assert tracked.error < 1e-12
+    assert tracked.coverage == 1.0
+    depth = transform(T_cw, here.map.positions_w[tracked.point_ids])[:, 2].median()
+    assert tracked.depth == pytest.approx(float(depth), abs=1e-6)
+    expected = here.map.points["times_visible"] - visible
+    assert set(expected.tolist()) == {0, 1}
+    assert (expected[tracked.point_ids] == 1).all()
+
+
+def test_the_error_is_in_units_of_the_noise() -> None:
+    medians = [followed(world(), SCENE.view(50 + n, se3_exp(n * STEP), noise=0.7)).error for n in range(6)]
+    # The median of a chi-square of two degrees of freedom is 1.386; six parameters of 400 residuals are fitted.
+    assert sum(medians) / len(medians) == pytest.approx(1.386 * 0.7**2, rel=0.15)
+
+
+def few(here: World, count: int) -> None:
+    """Leave the map so many of the points that all keyframes see."""
+    everyone = torch.nonzero(here.map.points["times_observed"] == here.map.num_keyframes)[:, 0]
+    rest = here.map.living_points()
+    here.map.kill(rest[~torch.isin(rest, everyone[:count])])
+    tracker().follow(here, here.map.num_keyframes - 1)
+
+
+@pytest.mark.parametrize(("setting", "count"), [("min_matches", 30), ("min_inliers", 30)])
+def test_fewer_points_than_are_needed_give_no_pose(setting: str, count: int) -> None:
+    here = world(2)
+    few(here, count)
+    view = SCENE.view(50, sideways(1, start=0.1)[0])
+    enough = followed(here.aside(), view, tracker(f"tracking.{setting}={count}"))
+    assert enough.inliers == count
+    assert tracker(f"tracking.{setting}={count + 1}").track(here.aside(), view) is None
+
+
+def test_enough_matches_must_agree_in_the_end() -> None:
+    here = world(2)
+    few(here, 40)
+    view = SCENE.view(50, sideways(1, start=0.1)[0])
+    wrong = SCENE.at(50)[torch.argsort(ROWS)[here.map.living_points()[:12]]]
+    off = view.keypoints.clone()
+    off[wrong, 1] += 4.5 * view.scales[wrong]  # near enough to match, too far to agree
+    spoiled = replace(view, keypoints=off)
+    tracked = followed(here.aside(), spoiled, tracker("tracking.min_inliers=28"))
+    assert (tracked.inliers, tracked.matches) == (28, 40)
+    assert tracker("tracking.min_inliers=29").track(here.aside(), spoiled) is None
+
+
+def located(here: World, view: View, T_cw: Tensor) -> Tracked | None:
+    """Track a view from a prediction."""
+    aside = here.aside()
+    aside.track.T_cr = T_cw @ se3_inverse(here.map.T_cw[here.track.reference])
+    aside.track.velocity = None
+    other = view.descriptors.clone()
+    other[:, 0] ^= 255  # eight bits of noise: no nearest neighbour is a billion times nearer than the second
+    return tracker("matching.ratio=1e-9").track(aside, replace(view, descriptors=other))
+
+
+@pytest.mark.parametrize(("pixels", "found"), [(10.0, True), (35.0, True), (110.0, False)])
+def test_matches_are_looked_for_near_the_prediction(pixels: float, found: bool) -> None:
+    """Scales are one to three pixels: the first window is 12 to 36 pixels wide, the second 36 to 108.
+
+    With a ratio test that nothing passes, matches without a place are out of the question.
+    """
+    here = world(3)
+    T_cw = sideways(1, start=0.2)[0]
+    turned = pose(0, 0, 0, 0, math.atan(pixels / 200.0)) @ T_cw
+    tracked = located(here, SCENE.view(50, T_cw), turned)
+    assert (tracked is not None) is found
+
+
+def test_without_a_place_to_look_descriptors_alone_decide() -> None:
+    here = world(3)
+    T_cw = sideways(1, start=0.2)[0]
+    here.track.T_cr = AWAY
+    here.track.velocity = None
+    tracked = followed(here, SCENE.view(50, T_cw))
+    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
+
+
+def test_points_that_died_are_not_looked_for() -> None:
+    here = world(3)
+    dead = here.track.seen_last[:20]
+    here.map.kill(dead)
+    tracked = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]))
+    assert not torch.isin(tracked.point_ids, dead).any()
+
+
+def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
+    here, follower = world_in(SCENE, sideways(12, step=0.6)), tracker("tracking.local_keyframes=1")
+    follower.follow(here, 11)
+    T_cw = sideways(1, start=0.05)[0]
+    view = SCENE.view(50, T_cw)
+    at = torch.nonzero(view.mask)[:, 0]
+    there = ROWS[SCENE.shows(50)[at]]
+    alive = here.map.points["alive"][there]
+    matches = iter([(there[alive][:30], at[alive][:30])])
+    tracked = follower.locate(here.map, view, matches, here.track.local_points)
+    assert tracked is not None
+    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
+    near = follower.around(here.map, there[alive][:30])
+    assert near.tolist() == [0, 1]
+    assert set(tracked.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
+    assert tracked.inliers > 60
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(2.44, True), (2.46, False)])
+@pytest.mark.parametrize("scale", [0.5, 3.0])
+def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
+    offset: float, agrees: bool, scale: float
+) -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    T_cw = here.map.T_cw[0]
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
+    scales = torch.full((len(seen),), scale, dtype=torch.float64)
+    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, scales).all()) is agrees
+    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, scales).any()) is agrees
+    wide = tracker("measurement.chi_square=24")
+    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, scales).all()
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
+def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
+    T_cw = roll @ here.map.T_cw[0]
+    points_c = transform(T_cw, here.map.positions_w[seen])
+    pixels, depth = CAMERA.project(points_c)[0], points_c[:, 2]
+    deviation = 3.0 * depth / 200.0  # three pixels
+    here.map.points["covariances_w"][seen] = torch.diag_embed(
+        torch.stack([deviation**2, 0 * depth, 0 * depth], -1)
+    )
+    gate = tracker("measurement.gate=mahalanobis")
+    scales = torch.full((len(seen),), 2.0, dtype=torch.float64)
+    for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
+        off = torch.zeros(2, dtype=torch.float64)
+        off[axis] = offset * sigma * math.sqrt(5.991)
+        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, scales)
+        assert agreeing.all() if agrees else not agreeing.any()
+
+
+def test_points_behind_the_camera_agree_with_nothing() -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    T_cw = pose(0, 0, 0, 0, math.pi)
+    middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
+    here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
+    for gate in ("chi_square", "mahalanobis"):
+        by = tracker(f"measurement.gate={gate}")
+        assert not by.agrees(here.map, T_cw, seen, middle, torch.ones(len(seen), dtype=torch.float64)).any()
+
+
+def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
+    """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
+    here = world()
+    T_cw = here.map.T_cw[0]
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    coarse = torch.arange(len(seen)) % 2 == 1
+    scales = torch.where(coarse, 4.0, 1.0).double()
+    shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, scales)
+    assert agrees.all()
+    fitted = CAMERA.project(transform(refined.T_cw[0], here.map.positions_w[seen]))[0]
+    assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
+    wanted = ((fitted - shifted) ** 2).sum(-1) / scales**2
+    torch.testing.assert_close(errors, wanted)
+
+
+def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
+    here = world()
+    T_cw = here.map.T_cw[0]
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    scales = torch.ones(len(seen), dtype=torch.float64)
+    wrong = torch.arange(len(seen)) < len(seen) // 4
+    for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
+        shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, scales)
+        assert torch.equal(agrees, ~wrong)
+        torch.testing.assert_close(refined.T_cw[0], T_cw, atol=exact, rtol=0)
+
+
+# --- the parts --------------------------------------------------------------------------------------------------
+
+
+def test_points_count_as_well_observed_when_three_local_keyframes_see_them() -> None:
+    here = world(4)
+    table = here.map.keyframes["point_ids"]
+
+    def seen(keyframe: int) -> set[int]:
+        return {row for row in table[keyframe].tolist() if row >= 0}
+
+    local = torch.arange(4)
+    wanted = [row for row in seen(3) if sum(row in seen(other) for other in range(4)) >= 3]
+    assert well_observed(here.map, 3, local) == len(wanted) < len(seen(3))
+    assert well_observed(here.map, 3, torch.tensor([3, 2])) == len(seen(3) & seen(2))
+    assert here.track.reference_size == len(wanted)
+
+
+def test_cells_number_the_image_row_by_row() -> None:
+    pixels = torch.tensor(
+        [[0.0, 0], [39.9, 39.9], [40.0, 0], [0, 40.0], [319.4, 239.4], [-0.5, -0.5], [320.0, 240.0]]
+    ).double()
+    assert cells(pixels, (320, 240)).tolist() == [0, 0, 1, 8, 47, 0, 47]
+    assert CELLS == (8, 6)
+
+
+def test_old_points_are_heard_alone_where_they_are_enough() -> None:
+    times = torch.tensor([SENIOR, SENIOR - 1, SENIOR + 5, 0, SENIOR])
+    assert trusted(times, 3).tolist() == [0, 2, 4]
+    assert trusted(times, 4).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_every_cell_has_a_voice() -> None:
+    crowd = torch.tensor([[10.0, 10.0]]).expand(12, 2)
+    pixels = torch.cat([crowd, torch.tensor([[300.0, 200.0], [100.0, 10.0]]), crowd]).double()
+    chosen = spread(pixels, (320, 240))
+    assert chosen.tolist() == [0, 1, 2, 3, 4, 12, 13]
+    assert PER_CELL == 5
+
+
+def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expected() -> None:
+    here = world()
+    ids = here.map.living_points()[:30]
+    here.map.points["times_found"][ids] = SENIOR
+    places = [(10.0, 10.0)] * 10 + [(100.0, 10.0)] * 5 + [(300.0, 200.0)] * 2 + [(10.0, 200.0)] * 1
+    pixels = torch.tensor(places).double()
+    expected = Projected(ids[:18], pixels, torch.ones(18), torch.zeros(18))
+
+    def share(*seen: int) -> float:
+        return coverage(here.map, expected, ids[list(seen)], (320, 240))
+
+    assert share(*range(18)) == 1.0
+    assert share(0, 1, 10, 15) == 1.0  # a fifth of each
+    assert share(0, 10, 15) == pytest.approx(2 / 3)  # a tenth of the first
+    assert share(0, 1) == pytest.approx(1 / 3)
+    assert share(17) == 0.0  # a single point is no expectation
+    here.map.points["times_found"][ids[:10]] = SENIOR - 1
+    assert share(15) == pytest.approx(1 / 2)  # young points are not expected
+    here.map.points["times_found"][ids] = 0
+    assert share() == 1.0
+
+
+# --- correspondences --------------------------------------------------------------------------------------------
+
+
+def projected(
+    here: World, T_cw: Tensor, angle: float = 60.0, scales: tuple[float, float] = (0.1, 50.0)
+) -> Projected:
+    return project_points(here.map, here.map.living_points(), T_cw, CAMERA, angle, scales)
+
+
+def test_the_expected_scale_falls_with_the_distance() -> None:
+    here = world(1)
+    here.map.points["alive"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
+    back = pose(0, 0, 4.0)
+    seen = projected(here, back)
+    size = SCENE.sizes[torch.argsort(ROWS)[seen.ids]]
+    distance = torch.linalg.vector_norm(transform(back, here.map.positions_w[seen.ids]), dim=-1)
+    torch.testing.assert_close(seen.scales, size * 200.0 / distance)
+    torch.testing.assert_close(
+        seen.pixels, CAMERA.project(transform(back, here.map.positions_w[seen.ids]))[0]
+    )
+    narrow = projected(here, back, scales=(0.9, 1.1))
+    torch.testing.assert_close(narrow.scales, seen.scales.clamp(0.9, 1.1))
+
+
+@pytest.mark.parametrize("limit", [20.0, 40.0])
+def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
+    here = world(1)
+    here.map.points["alive"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
+    middle = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
+    angle = math.radians(30.0)
+    turn = pose(0, 0, 0, 0, angle)
+    T_cw = turn.clone()
+    T_cw[:3, 3] = middle - turn[:3, :3] @ middle  # looks at the middle of the scene from 30 degrees aside
+    rays = here.map.positions_w - centre(T_cw)
+    between = (rays * here.map.positions_w).sum(-1) / (rays.norm(dim=-1) * here.map.positions_w.norm(dim=-1))
+    alike = torch.rad2deg(between.acos()) < limit
+    kept = projected(here, T_cw, limit).ids
+    assert alike[kept].all()
+    assert 0 < len(kept) < 300
+    pixels, valid = CAMERA.project(transform(T_cw, here.map.positions_w))
+    wanted = alike & valid & CAMERA.in_image(pixels) & here.map.points["alive"]
+    assert torch.equal(kept, torch.nonzero(wanted)[:, 0])
+
+
+def test_a_track_of_a_moved_world_is_the_same_track() -> None:
+    """Nothing depends on where the origin of the world is, nor on its unit."""
+    S = torch.eye(4, dtype=torch.float64)
+    S[:3] = se3_exp(torch.tensor([1.0, -2.0, 3.0, 0.3, 1.0, -0.5], dtype=torch.float64))[:3]
+    S[:3, :3] *= 2.5
+    T_cw = se3_exp(3 * STEP)
+    here, there = world(), world(S_ws=S)  # type: ignore[arg-type]
+    one = followed(here, SCENE.view(50, T_cw, noise=0.5))
+    two = followed(there, SCENE.view(50, T_cw, noise=0.5))
+    torch.testing.assert_close(two.T_cw, moved(one.T_cw, S), atol=1e-6, rtol=0)
+    assert two.depth == pytest.approx(2.5 * one.depth, rel=1e-6)
+    assert (two.inliers, two.matches) == (one.inliers, one.matches)
+    assert two.error == pytest.approx(one.error, rel=1e-4)
+    units = torch.tensor([2.5] * 3 + [1.0] * 3, dtype=torch.float64)
+    torch.testing.assert_close(two.covariance, units[:, None] * one.covariance * units, rtol=1e-3, atol=1e-12)
