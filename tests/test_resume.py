@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,9 +27,11 @@ from torchslam.cli import main
 from torchslam.commands import arguments
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
+from torchslam.loops.recognition import Recall
 from torchslam.output.frames_file import read_frames
 from torchslam.run import Progressed, run_sequence
 from torchslam.world.map_file import read_tensors, read_worlds, write_tensors, write_worlds
+from torchslam.world.track import Track
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
@@ -61,6 +63,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
     slam.stillness.evidence[3, 4] = 1  # too little to matter
+    slam.recalls.append(Recall(20, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -87,6 +90,12 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert slam.world is not None
     assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
     assert resumed.state is State.TRACKING
+    assert resumed.recalls == [Recall(20, 3, 0, 0)]
+    for column in fields(Track):
+        before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
+        assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
+            column.name
+        )
     assert torch.nonzero(resumed.stillness.evidence).tolist() == [[3, 4]]
 
 
@@ -126,11 +135,11 @@ def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: P
 DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
     (lambda run, tensors: run.pop("next"), "'next'"),
     (lambda run, tensors: run.update(world=5), "not enough values"),
-    (lambda run, tensors: run.update(reference=1000), "names rows beyond"),
+    (lambda run, tensors: run["track"].update(reference=1000), "names rows beyond"),
     (lambda run, tensors: run.update(last_frame=[3]), "not enough values"),
     (lambda run, tensors: run["reasons"].pop(), "out of range"),
     (lambda run, tensors: tensors.pop("run.T_cw"), r"run\.T_cw"),
-    (lambda run, tensors: tensors.pop("run.track.seen_last"), "where the camera was is missing"),
+    (lambda run, tensors: tensors.pop("run.track.seen_last"), "seen_last"),
     (lambda run, tensors: tensors.update({"run.evidence": torch.zeros(3)}), "evidence|size"),
 ]
 
