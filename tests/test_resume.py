@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,9 +27,11 @@ from torchslam.cli import main
 from torchslam.commands import arguments
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
+from torchslam.loops.recognition import Recall
 from torchslam.output.frames_file import read_frames
 from torchslam.run import Progressed, run_sequence
 from torchslam.world.map_file import read_tensors, read_worlds, write_tensors, write_worlds
+from torchslam.world.track import Track
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
@@ -57,6 +62,8 @@ def half(config: Config = CONFIG) -> tuple[SLAM, Progressed]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
+    slam.stillness.evidence[3, 4] = 1  # too little to matter
+    slam.recalls.append(Recall(20, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -83,6 +90,13 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert slam.world is not None
     assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
     assert resumed.state is State.TRACKING
+    assert resumed.recalls == [Recall(20, 3, 0, 0)]
+    for column in fields(Track):
+        before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
+        assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
+            column.name
+        )
+    assert torch.nonzero(resumed.stillness.evidence).tolist() == [[3, 4]]
 
 
 def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:
@@ -121,11 +135,11 @@ def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: P
 DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
     (lambda run, tensors: run.pop("next"), "'next'"),
     (lambda run, tensors: run.update(world=5), "not enough values"),
-    (lambda run, tensors: run.update(reference=1000), "names rows beyond"),
+    (lambda run, tensors: run["track"].update(reference=1000), "names rows beyond"),
     (lambda run, tensors: run.update(last_frame=[3]), "not enough values"),
     (lambda run, tensors: run["reasons"].pop(), "out of range"),
     (lambda run, tensors: tensors.pop("run.T_cw"), r"run\.T_cw"),
-    (lambda run, tensors: tensors.pop("run.track.seen_last"), "where the camera was is missing"),
+    (lambda run, tensors: tensors.pop("run.track.seen_last"), "seen_last"),
     (lambda run, tensors: tensors.update({"run.evidence": torch.zeros(3)}), "evidence|size"),
 ]
 
@@ -282,6 +296,47 @@ def test_a_signal_ends_the_final_adjustment(
     assert figures["interrupted"]
     assert figures["frames"] == figures["posed"] == FRAMES
     assert figures["ate_m"] < 0.01
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_second_signal_ends_at_once(
+    tmp_path: Path, cut: type[Cut], number: int, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(number)
+
+    def twice() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
+        time.sleep(1)  # where the signal is taken note of, at the latest
+
+    cut.do = staticmethod(twice)
+    with pytest.raises(SystemExit) as ended:
+        command(tmp_path, "--checkpoint", "2")
+    assert ended.value.code == status
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.safetensors"]
+    assert signal.getsignal(number) is before
+
+
+def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchslam.commands import folder
+
+    taken: list[int] = []
+    slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, is_settled=True)
+    state.worlds = [SimpleNamespace(map=slam_map)]
+    monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
+    checkpoints = folder.Checkpoints(tmp_path, 10, state, Progressed(), WALK)  # type: ignore[arg-type]
+    for count in range(1, 1001):
+        slam_map.num_keyframes = count
+        state.is_settled = count not in (30, 31)
+        checkpoints.offer()
+    assert taken[:4] == [10, 20, 32, 42]
+    gaps = [after - before for before, after in itertools.pairwise(taken)]
+    assert all(
+        gap == max(10, math.ceil(0.05 * after)) for gap, after in zip(gaps[2:], taken[3:], strict=True)
+    )
+    state.mapping = False
+    checkpoints.offer(at_once=True)
+    assert taken[-1] < 1000
 
 
 def test_a_saved_map_is_gone_on_in_and_localised_in(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import replace
+from dataclasses import astuple, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.front_end import Extractor
+from torchslam.loops.recognition import Recall
 from torchslam.run import Progressed
 from torchslam.slam import SLAM
 from torchslam.values import State, StepResult
@@ -28,7 +29,7 @@ from torchslam.world.map_file import pack, read_tensors, unpack, write_tensors
 from torchslam.world.track import Track
 
 STATES = tuple(State)
-TRACK = ("T_cr", "velocity", "seen_last", "local_keyframes", "local_points")
+TRACK = "run.track."
 UNKNOWN = "not a whole checkpoint"
 
 
@@ -38,9 +39,8 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
     if world is None or not slam.is_settled:
         raise ValueError("a checkpoint needs a world that is followed and nothing that is held back")
     tensors, about = pack(slam.worlds, slam.camera, slam.session + 1, slam.worlds.begun)
-    track = {
-        f"run.track.{name}": value for name in TRACK if (value := getattr(world.track, name)) is not None
-    }
+    whole = {column.name: getattr(world.track, column.name) for column in fields(Track)}
+    track = {TRACK + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
     about["run"] = {
         "sequence": fingerprint(sequence),
@@ -51,8 +51,9 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "stages": stages,
         "last_frame": slam.last_frame,
         "world": world.number,
-        "reference": world.track.reference,
-        "reference_size": world.track.reference_size,
+        "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
+        "asked": [each.asked for each in slam.worlds],
+        "recalls": [astuple(recall) for recall in slam.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.stillness.evidence}, about)
 
@@ -100,13 +101,10 @@ def fingerprint(of: Sequence | Config) -> str:
 def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> None:
     """Put the system to where it was."""
     (world,) = (world for world in slam.worlds if world.number == run["world"])
-    columns = {name: tensors.get(f"run.track.{name}") for name in TRACK}
-    moved: dict[str, Any] = {
-        name: None if value is None else value.to(device) for name, value in columns.items()
+    columns: dict[str, Any] = {
+        name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
     }
-    if any(moved[name] is None for name in TRACK if name != "velocity"):
-        raise ValueError("where the camera was is missing")
-    track = Track(reference=run["reference"], reference_size=run["reference_size"], **moved)
+    track = Track(**run["track"], **columns)
     for rows, count in (
         (track.seen_last, len(world.map.points)),
         (track.local_points, len(world.map.points)),
@@ -116,6 +114,9 @@ def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: 
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
             raise ValueError(f"where the camera was names rows beyond {count}")
     index, timestamp = run["last_frame"]
+    for each, asked in zip(slam.worlds, run["asked"], strict=True):
+        each.asked = int(asked)
+    slam.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.stillness.evidence.copy_(tensors["run.evidence"])
     slam.resume(world, track, (int(index), float(timestamp)))
 
@@ -139,7 +140,7 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
         for result in results
     ]
     times = [[result.stage_ms.get(stage, nan) for stage in stages] for result in results]
-    columns = {
+    columns: dict[str, Any] = {
         "run.counts": torch.tensor(counts, dtype=torch.int64).reshape(-1, 6),
         "run.timestamps": torch.tensor([result.timestamp for result in results], dtype=torch.float64),
         "run.T_cw": _stack(poses, 4),

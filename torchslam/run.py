@@ -22,6 +22,7 @@ from torchslam.values import State, StepResult, Trajectory
 from torchslam.world.history import History, RunGraph
 from torchslam.world.map import Map
 from torchslam.world.world import World
+from torchslam.world.worlds import main_of
 
 if TYPE_CHECKING:
     from torchslam.slam import SLAM
@@ -53,7 +54,7 @@ class Run:
     @property
     def main(self) -> World | None:
         """The world in which most frames of the run are posed; None where there is no map."""
-        return max(self.worlds, key=lambda world: world.history.count(self.session), default=None)
+        return main_of(self.worlds, self.session)
 
     @property
     def map(self) -> Map:

@@ -1,4 +1,7 @@
-"""What Ctrl-C and SIGTERM do to a run: it comes to an end, with everything written that there is by then."""
+"""What Ctrl-C and SIGTERM do to a run: it comes to an end, with everything written that there is by then.
+
+The second one ends it at once, whatever it is at, and nothing more is written: the map may be halfway through a change.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +57,9 @@ class Stopping:
 
     def _wish(self, number: int, frame: FrameType | None) -> None:
         self._signal, self._is_wanted = number, True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for each in SIGNALS:
+            signal.signal(each, self._end)
         tqdm.write(f"torchslam: stopping {self._phase}; again to stop at once", file=sys.stderr)
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        raise SystemExit(STATUS[signal.Signals(number)])

@@ -48,8 +48,8 @@ class Worlds:
         self._worlds = [other for other in self._worlds if other is not world]
 
     def main(self, session: int | None = None) -> World | None:
-        """The world in which most frames, of one session or of all, are posed, of equals the first; None without."""
-        return max(self._worlds, key=lambda world: world.history.count(session), default=None)
+        """As `main_of`."""
+        return main_of(self._worlds, session)
 
     def find(self, key: int) -> tuple[World, int] | None:
         """The world and the row of the keyframe of that name; None where no world has it."""
@@ -58,3 +58,8 @@ class Worlds:
             if row >= 0:
                 return world, row
         return None
+
+
+def main_of(worlds: Iterable[World], session: int | None = None) -> World | None:
+    """The world in which most frames of a session are posed, then most of all; of equals the first; None without."""
+    return max(worlds, key=lambda world: (world.history.count(session), len(world.history)), default=None)
