@@ -249,11 +249,11 @@ class SLAM:
         if self.probation:
             self.state = State.UNCERTAIN
             return self._result(view, doubt or self.probation.reason, world, tracked)
-        held = self.probation.release()
+        came_back, held = self.probation.came_back, self.probation.release()
         for earlier in held:
             self.tracker.vouch(world.map, earlier[1])
             world.history.add(*earlier)
-        if self.probation.came_back:
+        if came_back:
             first, located, _, _ = held[0]
             self._track_back(world, first, located)
         self.state = State.TRACKING

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.test_clip import BentEyes
+from tests.learning.test_clip import BentEyes
 from torch import Tensor, nn
 
 from experiments.learn_features.clip_noise import Changed

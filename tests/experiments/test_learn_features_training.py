@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.test_clip import BentEyes
+from tests.learning.test_clip import BentEyes
 from torch import Tensor, nn
 
 from experiments.learn_features.front_end import NUM_INPUTS, SubPixel

@@ -123,10 +123,10 @@ def may_have_drifted(
 ) -> bool:
     """Whether so long a way can have drifted by what a loop says: places that only look alike lie further apart.
 
-    The way is that of the keyframes in the order of time, between the two.
+    The way is that of the keyframes between the two, in the order in which they were seen.
     """
     slam_map = world.map
-    order = torch.argsort(slam_map.keyframes["timestamp"], stable=True)
+    order = torch.argsort(slam_map.keys)
     rank = torch.argsort(order)
     start, end = sorted((int(rank[place]), int(rank[keyframe])))
     centres_w = se3_inverse(slam_map.T_cw[order[start : end + 1]])[:, :3, 3]

@@ -51,5 +51,5 @@ class Probation:
     def release(self) -> list[Held]:
         """What was held back and is believed now; nothing is held any more."""
         held, self._held = self._held, []
-        self._needed = 0
+        self._needed, self.came_back = 0, False
         return held
