@@ -53,7 +53,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "world": world.number,
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
-        "recalls": [astuple(recall) for recall in slam.recalls],
+        "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.stillness.evidence}, about)
 
@@ -116,7 +116,7 @@ def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: 
     index, timestamp = run["last_frame"]
     for each, asked in zip(slam.worlds, run["asked"], strict=True):
         each.asked = int(asked)
-    slam.recalls += [Recall(*recall) for recall in run["recalls"]]
+    slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.stillness.evidence.copy_(tensors["run.evidence"])
     slam.resume(world, track, (int(index), float(timestamp)))
 

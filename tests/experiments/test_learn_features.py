@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.learning.test_clip import BentEyes
 from torch import Tensor, nn
 
 from experiments.learn_features.clip_noise import Changed
@@ -19,6 +18,7 @@ from experiments.learn_features.picture import draw
 from experiments.learn_features.report import Result, bootstrap, medians, ratios
 from experiments.learn_features.room import NOISES_PX, room
 from experiments.learn_features.run import Part, spread
+from tests.learning.test_clip import BentEyes
 from tests.walks import Walk, arc
 from torchslam import ORB, Features
 from torchslam.geometry import rigid, so3_exp

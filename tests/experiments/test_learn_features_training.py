@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.learning.test_clip import BentEyes
 from torch import Tensor, nn
 
 from experiments.learn_features.front_end import NUM_INPUTS, SubPixel
 from experiments.learn_features.tracks import MIN_VIEWS, VIEWS_S, Tracks, residuals
 from experiments.learn_features.training import Settings, draw, moved, pose_errors, train
+from tests.learning.test_clip import BentEyes
 from tests.walks import Walk, arc
 from torchslam import Features
 

@@ -195,11 +195,15 @@ class Tracker:
     ) -> tuple[RefinedPose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
-        By least squares on what is not far from agreeing with T_cw, then on what agrees with that.
+        By least squares on what is not far from agreeing with T_cw, old points alone if there are enough of them, then
+        on all that agrees with that.
         """
         points_w = slam_map.positions_w[ids]
         errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
         mask = fits(errors, scales, FAR * self.measurement.chi_square)
+        old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
+        if int(old.sum()) >= self.settings.min_matches:
+            mask = old
         weights = scales**-2 * voices(pixels, self.camera.size)
         passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
         for kernel, iterations in passes:
