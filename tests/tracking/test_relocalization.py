@@ -77,6 +77,11 @@ def test_those_beside_one_that_failed_in_another_world_are_tried() -> None:
     assert found(ANYWHERE, [(wrong, 3), (right, 3)]) is right
 
 
+def test_beside_a_candidate_are_as_many_as_the_local_map_has() -> None:
+    right, _ = worlds()
+    assert relocalizer("tracking.local_keyframes=2")._near(right.map, 5).tolist() == [5, 4, 3]
+
+
 def test_a_pose_that_is_doubted_is_no_pose() -> None:
     right, _ = worlds()
     assert found(ANYWHERE, [(right, 0)], "judge.max_position_std=1e-6") is None

@@ -91,6 +91,17 @@ def test_cells_around_a_keypoint_that_stays_are_covered_too() -> None:
     assert by.covers(corner).all()
 
 
+def test_the_edge_of_the_image_is_covered_as_its_middle_is() -> None:
+    corners = torch.tensor([[0.0, 0.0], [319.4, 0.0], [0.0, 239.4], [319.4, 239.4]] * 2).double()
+    by = stillness()
+    by.add(corners)
+    by.add(corners)
+    assert by.covers(corners).all()
+    inside = torch.tensor([[7.9, 7.9], [312.1, 7.9], [7.9, 232.1], [312.1, 232.1]]).double()
+    assert by.covers(inside).all()
+    assert not by.covers(inside + 9 * (torch.tensor([159.5, 119.5]) - inside).sign()).any()
+
+
 def test_a_scene_alone_makes_nothing_known() -> None:
     by = stillness()
     assert observed(by, turning(5), logo=False) == [0] * 5
