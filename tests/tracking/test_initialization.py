@@ -116,10 +116,13 @@ def test_a_scene_behind_a_picture_that_stands_still_starts_a_map() -> None:
     assert "the camera stands still" in reason or "not clear" in reason
 
 
-@pytest.mark.parametrize("share", [0.4, 0.45])
+ROLLED = pose(-0.6, 0.3, 0.1, 0.02, -0.02, 0.05)  # what stays in place is on no epipolar line
+
+
+@pytest.mark.parametrize("share", [0.15, 0.4])
 def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
     """Most of the image moves with the scene, but some of it stays."""
-    views = [SCENE.view(0, pose()), SCENE.view(1, SIDE)]
+    views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
     some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
     initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
     initializer.step(views[0])
@@ -127,7 +130,7 @@ def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
     assert start is not None, reason
     moving = SCENE.shows(1)[start.keypoints_2] >= round(share * len(SCENE))
     assert moving.double().mean() > 0.98
-    wanted = SIDE[:3, 3] / SIDE[:3, 3].norm()
+    wanted = ROLLED[:3, 3] / ROLLED[:3, 3].norm()
     torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=1e-3, rtol=0)
 
 
