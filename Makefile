@@ -1,20 +1,24 @@
 # The two commands a newcomer needs are `make demo` and `make test`; both make their own environment first.
 #   VENV=path      use (or create) another virtual environment than .venv
 #   PYTHON=python  the interpreter that creates it
+#   SAMPLE=200 SEED=0  how many changes `make mutation` tries, and which; SAMPLE=0 tries all: hours
 #   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
 
 PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
+SAMPLE ?= 200
+SEED ?= 0
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --constraint constraints.txt
 
 # Stamps: an environment is made again only when what it is made from has changed.
 INSTALLED := $(VENV)/.torchslam-installed
 INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
+INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 
-.PHONY: help demo test lint types format benchmarks clean distclean
+.PHONY: help demo test mutation lint types format benchmarks clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -25,6 +29,9 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+mutation: $(INSTALLED_MUTATION)  ## small changes to the system layer: how many of them do its tests notice?
+	$(BIN)/python -m tests.mutation --sample $(SAMPLE) --seed $(SEED)
 
 lint: $(INSTALLED_DEV) types  ## ruff and mypy
 	$(BIN)/ruff check .
@@ -44,7 +51,7 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 	$(BIN)/python -m experiments.benchmarks.pose_graph
 
 clean:  ## remove results and caches, keep the environment
-	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf results build dist mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean  ## remove the environment too
@@ -66,6 +73,11 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 $(INSTALLED_DEV): $(INSTALLED)
 	@echo 'installing the tools for tests and lint into $(VENV): a minute, once'
 	@$(PIP) --group test --group lint
+	@touch $@
+
+$(INSTALLED_MUTATION): $(INSTALLED_DEV)
+	@echo 'installing the tool for mutation testing into $(VENV): a minute, once'
+	@$(PIP) --group mutation
 	@touch $@
 
 $(INSTALLED_BENCHMARKS): $(INSTALLED)

@@ -35,6 +35,13 @@ def arc(frames: int, length: float = 3.0) -> Tensor:
     return rigid(so3_exp(torch.stack([0.05 * torch.sin(4 * s), -0.4 * s, zero], -1)), centres)
 
 
+def there_and_elsewhere(first: int = 16, later: int = 42) -> Tensor:
+    """(F, 4, 4) T_wc of a camera that walks to the right, is suddenly far off, and walks back to where it began."""
+    x = torch.cat([torch.linspace(0, 1.0, first), torch.linspace(3.6, 0.5, later)]).double()
+    turns = torch.stack([torch.zeros_like(x), 0.05 * torch.sin(3 * x), torch.zeros_like(x)], -1)
+    return rigid(so3_exp(turns), torch.stack([x, 0.1 * torch.sin(4 * x), 0.1 * torch.cos(5 * x)], -1))
+
+
 def still(frames: int) -> Tensor:
     return torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
 

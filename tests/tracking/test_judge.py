@@ -15,6 +15,7 @@ from torchslam.config import JudgeConfig
 from torchslam.geometry import se3_exp
 from torchslam.tracking.judge import deviations, jump, why_doubt
 from torchslam.values import Tracked
+from torchslam.world.track import Track
 
 SETTINGS = JudgeConfig()
 HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
@@ -24,8 +25,11 @@ def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> Trac
     return tracked_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
 
 
-def doubt(tracked: Tracked, expected: Tensor | None = None, error: float = 0.9) -> str:
-    return why_doubt(tracked, expected, error, SETTINGS)
+def doubt(
+    tracked: Tracked, expected: Tensor | None = None, error: float = 0.9, explained: float = 1.0
+) -> str:
+    track = replace(Track.nowhere(HERE), error=error, explained=explained)
+    return why_doubt(tracked, expected, track, SETTINGS)
 
 
 def test_a_certain_pose_is_believed() -> None:
@@ -49,6 +53,15 @@ def test_errors_over_many_frames_must_be_noise() -> None:
 def test_enough_of_the_image_must_show_what_is_expected() -> None:
     assert doubt(seen(coverage=SETTINGS.min_coverage)) == ""
     assert doubt(seen(coverage=SETTINGS.min_coverage - 0.01)).startswith("only 19% of the image")
+
+
+def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
+    least = SETTINGS.min_explained
+    assert doubt(seen(), explained=least) == ""
+    assert doubt(seen(explained=0.0)) == ""  # one frame alone proves nothing
+    assert doubt(seen(), explained=least - 0.01).startswith(
+        f"the map explains only {least - 0.01:.0%} of the image"
+    )
 
 
 def covariance(position: float = 0.0, rotation: float = 0.0) -> Tensor:

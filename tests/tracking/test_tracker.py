@@ -15,14 +15,17 @@ from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
 from torchslam.tracking.tracker import (
     CELLS,
-    ERROR_MEMORY,
+    CROWD,
+    MEMORY,
     PER_CELL,
     SENIOR,
     Tracker,
     cells,
     coverage,
+    explained,
     spread,
     trusted,
+    voices,
     well_observed,
 )
 from torchslam.values import Tracked, View
@@ -53,14 +56,14 @@ def followed(where: World, view: View, by: Tracker | None = None) -> Tracked:
 
 def test_follow_goes_on_from_a_keyframe() -> None:
     here = world(4)
-    here.track.velocity, here.track.error = pose(0.1), 0.7
+    here.track.velocity, here.track.error, here.track.explained = pose(0.1), 0.7, 0.4
     tracker().follow(here, 2)
     track = here.track
     assert track.reference == 2
     torch.testing.assert_close(track.T_cr, pose())
     torch.testing.assert_close(here.T_cw, here.map.T_cw[2])
     assert torch.equal(track.velocity, pose(0.1))
-    assert track.error == 0.7
+    assert (track.error, track.explained) == (0.7, 0.4)
     assert int(track.local_keyframes[0]) == 2
     assert sorted(track.local_keyframes.tolist()) == [0, 1, 2, 3]
     seen = here.map.keyframes["point_ids"][2]
@@ -134,24 +137,25 @@ def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() ->
     assert (last_seen[others] == 0).all()
 
 
-def test_the_error_of_the_way_follows_slowly() -> None:
+def test_the_track_remembers_the_last_ten_frames_or_so() -> None:
     here, follower = world(), tracker()
-    here.track.error = 2.0
+    here.track.error, here.track.explained = 2.0, 0.5
     tracked = followed(here, SCENE.view(50, sideways(1, start=0.4)[0], noise=0.5), follower)
-    assert here.track.error == pytest.approx(2.0 + ERROR_MEMORY * (tracked.error - 2.0))
-    assert ERROR_MEMORY == 0.1
+    assert here.track.error == pytest.approx(2.0 + MEMORY * (tracked.error - 2.0))
+    assert here.track.explained == pytest.approx(0.5 + MEMORY * (tracked.explained - 0.5))
+    assert MEMORY == 0.1
 
 
 def test_a_track_begins_anew_where_a_frame_was_found() -> None:
     here, follower = world(5), tracker()
-    here.track.velocity, here.track.error = pose(0.1), 3.0
+    here.track.velocity, here.track.error, here.track.explained = pose(0.1), 3.0, 0.1
     view = SCENE.view(50, sideways(1, start=0.02)[0])
     tracked = followed(here.aside(), view, follower)
     here.map.points["last_seen"][:] = 0
     follower.start_at(here, view, tracked)
     assert here.track.reference == 0
     assert here.track.velocity is None
-    assert here.track.error == 0.0
+    assert (here.track.error, here.track.explained) == (0.0, 1.0)
     assert torch.equal(here.track.seen_last, tracked.point_ids)
     torch.testing.assert_close(here.T_cw, tracked.T_cw)
     assert (here.map.points["last_seen"][tracked.point_ids] == 50).all()
@@ -389,6 +393,45 @@ def test_every_cell_has_a_voice() -> None:
     chosen = spread(pixels, (320, 240))
     assert chosen.tolist() == [0, 1, 2, 3, 4, 12, 13]
     assert PER_CELL == 5
+
+
+def test_a_crowd_has_no_more_to_say_than_a_few() -> None:
+    crowd = torch.tensor([[10.0, 10.0]]).expand(2 * CROWD, 2)
+    few = torch.tensor([[100.0, 10.0]]).expand(CROWD, 2)
+    weights = voices(torch.cat([crowd, few, few[:1] + 100]).double(), (320, 240))
+    assert weights.tolist() == [0.5] * 2 * CROWD + [1.0] * (CROWD + 1)
+
+
+def test_what_is_explained_is_the_share_of_the_cells_with_keypoints_that_are_used() -> None:
+    places = (
+        [(10.0, 10.0)] * 3
+        + [(100.0, 10.0)] * 2
+        + [(300.0, 200.0)] * 2
+        + [(10.0, 200.0)]
+        + [(200.0, 100.0)] * 2
+    )
+    view = SCENE.view(0, pose())
+    mask = torch.arange(len(places)) < 8  # the last two are no keypoints
+    some = replace(view, keypoints=torch.tensor(places).double(), mask=mask)
+    for used, share in (([0, 3, 5], 1.0), ([1, 2], 1 / 3), ([4, 6, 7], 2 / 3), ([7], 0.0)):
+        assert explained(some, torch.tensor(used), (320, 240)) == pytest.approx(share)
+    nothing = replace(some, mask=torch.zeros_like(mask))
+    assert explained(nothing, torch.tensor([0]), (320, 240)) == 1.0
+
+
+def test_a_tracker_that_does_not_count_leaves_the_map_as_it_is() -> None:
+    here, follower = world(), tracker()
+    follower.counts = False
+    before = {name: column.clone() for name, column in here.map.points.columns().items()}
+    tracked = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]), follower)
+    follower.vouch(here.map, tracked)
+    follower.start_at(here, SCENE.view(51, sideways(1, start=0.2)[0]), tracked)
+    assert all(torch.equal(column, before[name]) for name, column in here.map.points.columns().items())
+    follower.counts = True
+    follower.vouch(here.map, tracked)
+    found = here.map.points["times_found"] - before["times_found"]
+    assert torch.equal(torch.nonzero(found)[:, 0], tracked.point_ids.sort().values)
+    assert int(found.max()) == 1
 
 
 def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expected() -> None:

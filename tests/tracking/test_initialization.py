@@ -1,0 +1,284 @@
+"""Which pairs of views start a map, and why the others do not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, centre, pose
+from torchslam.config import InitializationConfig, load_config
+from torchslam.geometry import Triangulation, transform
+from torchslam.tracking.initialization import Initializer, is_good, refine_pair, why_not
+from torchslam.values import Start, View
+
+SCENE = Scene.of(400)
+SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
+
+
+def tried(
+    T_cw: Tensor, *overrides: str, scene: Scene = SCENE, noise: float = 0.0
+) -> tuple[Start | None, str]:
+    """The last answer for views at T_cw (F, 4, 4)."""
+    return tried_views([scene.view(index, T, noise=noise) for index, T in enumerate(T_cw)], *overrides)
+
+
+def tried_views(views: list[View], *overrides: str) -> tuple[Start | None, str]:
+    initializer = Initializer(CAMERA, load_config(None, overrides))
+    for view in views:
+        answer = initializer.step(view)
+    return answer
+
+
+def pair(T_cw: Tensor) -> Tensor:
+    return torch.stack([pose(), T_cw])
+
+
+def test_a_start_has_the_motion_and_the_points_in_units_of_its_baseline() -> None:
+    start, reason = tried(pair(SIDE))
+    assert start is not None, reason
+    assert reason == ""
+    baseline = float(SIDE[:3, 3].norm())
+    wanted = SIDE.clone()
+    wanted[:3, 3] /= baseline
+    torch.testing.assert_close(start.T_cw, wanted, atol=1e-6, rtol=0)
+    shown = SCENE.shows(0)[start.keypoints_1]
+    assert torch.equal(shown, SCENE.shows(1)[start.keypoints_2])
+    torch.testing.assert_close(start.points_w, SCENE.points_w[shown] / baseline, atol=1e-3, rtol=1e-4)
+    assert (start.reference.index, start.view.index) == (0, 1)
+    assert len(shown) > 150
+
+
+def test_the_first_view_is_the_reference_until_it_is_too_old() -> None:
+    initializer = Initializer(CAMERA, load_config(None, ["initialization.max_reference_age=3"]))
+    for index, reason in (
+        (0, "took"),
+        (1, "the camera stands"),
+        (2, "the camera stands"),
+        (3, "took"),
+        (4, "the"),
+    ):
+        assert initializer.step(SCENE.view(index, pose()))[1].startswith(reason)
+    assert initializer.reference.index == 3
+    assert [view.index for view in initializer.views] == [3, 4]
+
+
+def test_too_few_matches_make_a_new_reference() -> None:
+    views = [SCENE.view(index, T) for index, T in enumerate(pair(SIDE))]
+    both = len(torch.nonzero(views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)]))
+    assert tried(pair(SIDE), f"initialization.min_matches={both}")[0] is not None
+    initializer = Initializer(CAMERA, load_config(None, [f"initialization.min_matches={both + 1}"]))
+    initializer.step(views[0])
+    start, reason = initializer.step(views[1])
+    assert start is None
+    assert reason == f"too few matches with the reference frame: {both}, {both + 1} are needed"
+    assert initializer.views == [views[1]]
+
+
+def test_a_camera_that_stands_is_told_from_one_that_moves() -> None:
+    """The points are four away, on the average: a pixel is about 0.02 of a step to the side."""
+    assert "stands still: the image moved by 0.0 px" in tried(pair(pose()))[1]
+    views = [SCENE.view(index, pose()) for index in range(2)]
+    for pixels, still in ((1.9, True), (2.1, False)):
+        moved = replace(views[1], keypoints=views[1].keypoints + torch.tensor([0.6, 0.8]) * pixels)
+        assert ("stands still" in tried_views([views[0], moved])[1]) is still
+
+
+def static(view: View, share: float, order: Tensor, at_rest: View, rest_order: Tensor) -> View:
+    """The view in which a share of the points is seen where another view has them."""
+    count = round(share * len(order))
+    chosen = torch.arange(count)
+    keypoints, mask, scales = view.keypoints.clone(), view.mask.clone(), view.scales.clone()
+    place, there = torch.argsort(order)[chosen], torch.argsort(rest_order)[chosen]
+    keypoints[place], mask[place], scales[place] = (
+        at_rest.keypoints[there],
+        at_rest.mask[there],
+        at_rest.scales[there],
+    )
+    return replace(view, keypoints=keypoints, mask=mask, scales=scales)
+
+
+def test_a_scene_behind_a_picture_that_stands_still_starts_a_map() -> None:
+    views = [SCENE.view(0, pose()), SCENE.view(1, SIDE)]
+    half = static(views[1], 0.6, SCENE.shows(1), views[0], SCENE.shows(0))
+    start, reason = tried_views(
+        [views[0], half], "initialization.min_matches=60", "initialization.min_points=30"
+    )
+    assert start is not None, reason
+    wanted = SIDE[:3, 3] / SIDE[:3, 3].norm()
+    torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=1e-4, rtol=0)
+    count = int((half.keypoints[SCENE.at(1)] != views[0].keypoints[SCENE.at(0)]).any(-1).sum())
+    start, reason = tried_views([views[0], half], f"initialization.min_matches={count}")
+    assert start is None
+    assert "the camera stands still" in reason or "not clear" in reason
+
+
+ROLLED = pose(-0.6, 0.3, 0.1, 0.02, -0.02, 0.05)  # what stays in place is on no epipolar line
+
+
+@pytest.mark.parametrize("share", [0.15, 0.4])
+def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
+    """Most of the image moves with the scene, but some of it stays."""
+    views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
+    some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
+    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer.step(views[0])
+    start, reason = initializer.step(some)
+    assert start is not None, reason
+    moving = SCENE.shows(1)[start.keypoints_2] >= round(share * len(SCENE))
+    assert moving.double().mean() > 0.98
+    wanted = ROLLED[:3, 3] / ROLLED[:3, 3].norm()
+    torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=1e-3, rtol=0)
+
+
+def test_a_thing_that_moves_before_a_camera_that_stands_is_no_scene() -> None:
+    """A flat thing: one homography explains its motion."""
+    views = [SCENE.view(0, pose()), SCENE.view(1, pose())]
+    moving = torch.argsort(SCENE.shows(1))[150:]
+    keypoints = views[1].keypoints.clone()
+    keypoints[moving] += torch.tensor([30.0, 5.0], dtype=torch.float64)
+    start, reason = tried_views(
+        [views[0], replace(views[1], keypoints=keypoints)], "initialization.min_matches=50"
+    )
+    assert start is None
+    assert re_any(reason, "something may move before a camera that stands still", "not clear what moves")
+
+
+def test_a_camera_that_turns_has_no_depth() -> None:
+    assert "only turns" in tried(pair(pose(0, 0, 0, 0.02, 0.1, 0.05)), noise=0.2)[1]
+
+
+WALL = Scene(SCENE.points_w * torch.tensor([1.0, 1.0, 0.0]).double() + torch.tensor([0.0, 0, 4.0]).double(),
+             SCENE.sizes, SCENE.descriptors)  # fmt: skip
+TURNED = pose(-1.2, 0.1, 0.5, 0.0, -0.25, 0.0)
+
+
+def test_a_plane_is_believed_after_a_while() -> None:
+    poses = torch.stack([pose(), *[TURNED] * 4])
+    for patience, believed in ((4, True), (5, False)):
+        start, reason = tried(
+            poses,
+            f"initialization.planar_patience={patience}",
+            "initialization.min_points=30",
+            scene=WALL,
+            noise=0.2,
+        )
+        if believed:
+            assert "looks planar" not in reason
+        else:
+            assert start is None
+            assert "looks planar" in reason
+
+
+def test_a_step_too_small_leaves_depths_uncertain() -> None:
+    # sigma / (f a): one to three pixels of scale; at 200 px and a tenth a parallax of 0.05 to 0.15 is needed
+    start, reason = tried(pair(pose(-0.1)), noise=0.1)
+    assert start is None
+    assert re_any(reason, "parallax", "uncertain", "planar", "turns", "ambiguous")
+    assert tried(pair(pose(-0.6)), noise=0.1)[0] is not None
+
+
+def re_any(text: str, *parts: str) -> bool:
+    return any(part in text for part in parts)
+
+
+def seen(angles: list[float], errors: float = 0.0, mask: bool = True) -> Triangulation:
+    angle = torch.tensor(angles, dtype=torch.float64)
+    zero = torch.zeros_like(angle)
+    return Triangulation(
+        torch.zeros(len(angles), 3, dtype=torch.float64),
+        angle,
+        zero,
+        zero,
+        zero,
+        zero + errors,
+        zero == 0 if mask else zero > 0,
+    )
+
+
+def test_a_point_is_good_when_its_depth_is_known_to_a_tenth() -> None:
+    settings = InitializationConfig()
+    ones = torch.ones(2, dtype=torch.float64)
+    assert is_good(seen([0.0501, 0.0499]), ones, CAMERA, settings).tolist() == [
+        True,
+        False,
+    ]  # 1 / (200 * 0.05)
+    assert is_good(seen([0.1002, 0.0998]), 2 * ones, CAMERA, settings).tolist() == [True, False]
+    assert is_good(seen([0.0, 1.0], mask=False), ones, CAMERA, settings).tolist() == [False, False]
+    for errors, good in ((2.99, True), (3.01, False)):
+        assert is_good(seen([1.0, 1.0], errors), ones, CAMERA, settings).tolist() == [good, good]
+    other = replace(seen([1.0]), errors_1=torch.tensor([6.02]).double())
+    assert not is_good(other, 2 * ones[:1], CAMERA, settings)
+    assert is_good(seen([1.0], 5.98), 2 * ones[:1], CAMERA, settings)
+
+
+def test_by_parallax_a_point_is_good_from_an_angle_on() -> None:
+    settings = replace(InitializationConfig(), criterion="parallax")
+    angles = [math.radians(3.01), math.radians(2.99)]
+    assert is_good(seen(angles), torch.ones(2).double(), CAMERA, settings).tolist() == [True, False]
+
+
+def reason_for(count: int, total: int, matches: int, share: float = 0.15, **changes: object) -> str:
+    good = torch.arange(total) < count
+    settings = replace(InitializationConfig(), **changes)  # type: ignore[arg-type]
+    return why_not(good, seen([math.radians(4.9)] * total), matches, settings, share)
+
+
+def test_why_points_are_no_start() -> None:
+    assert reason_for(60, 100, 100) == ""
+    assert reason_for(59, 100, 100) == "too little parallax: 59 points have enough, 60 are needed"
+    assert reason_for(60, 100, 400) == ""
+    assert reason_for(60, 100, 401).startswith("depths too uncertain: 60 of 401 known well, 15%")
+    assert reason_for(60, 100, 100, share=0.61).startswith("depths too uncertain")
+    assert (
+        reason_for(60, 100, 400, criterion="parallax")
+        == "too little parallax: 4.9 degrees in the mean, 5.0 are needed"
+    )
+    assert reason_for(60, 100, 1000, criterion="parallax", min_mean_parallax_deg=4.8) == ""
+
+
+def test_most_points_must_lie_in_front() -> None:
+    for behind, fine in ((20, True), (21, False)):
+        some = seen([0.1] * 100)
+        some = replace(some, mask=torch.arange(100) >= behind)
+        reason = why_not(torch.ones(100, dtype=torch.bool), some, 100, InitializationConfig(), 0.15)
+        assert (reason == "") is fine
+        assert fine or reason == "matches behind a camera: only 79% lie in front of both"
+
+
+def refined(scales: Tensor, off: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Refinement from the truth, in units of twice the baseline, with pixels of the second view off by (n, 2)."""
+    points_w = SCENE.points_w[:200]
+    pixels = [CAMERA.project(transform(T, points_w))[0] for T in (pose(), SIDE)]
+    return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, scales, CAMERA)
+
+
+def test_a_pair_that_is_right_stays_as_it_is() -> None:
+    T_cw, points_w, agrees = refined(torch.ones(200).double(), torch.zeros(200, 2).double())
+    torch.testing.assert_close(T_cw, SIDE, atol=1e-8, rtol=0)
+    torch.testing.assert_close(points_w, SCENE.points_w[:200], atol=1e-6, rtol=0)
+    assert agrees.all()
+
+
+def test_the_baseline_keeps_its_length_and_noise_weighs_by_its_variance() -> None:
+    generator = torch.Generator().manual_seed(2)
+    scales = torch.where(torch.arange(200) % 2 == 0, 1.0, 6.0).double()
+    noise = torch.randn(200, 2, generator=generator, dtype=torch.float64)
+    T_cw, _, agrees = refined(scales, 0.5 * scales[:, None] * noise)
+    assert float(T_cw[:3, 3].norm()) == pytest.approx(float(SIDE[:3, 3].norm()))
+    blunt, _, _ = refined(torch.ones(200).double(), 0.5 * scales[:, None] * noise)
+    off, much = ((centre(T) - centre(SIDE)).norm() for T in (T_cw, blunt))
+    assert off < 0.7 * much
+    assert agrees.double().mean() > 0.9
+
+
+def test_what_disagrees_with_both_views_is_told() -> None:
+    off = torch.zeros(200, 2, dtype=torch.float64)
+    off[:10, 1] = 12.0  # across the epipolar lines: shared by the two views, six each
+    ones = torch.ones(200, dtype=torch.float64)
+    assert not refined(ones, off)[2][:10].any()
+    assert refined(ones, off)[2][10:].double().mean() > 0.95
+    assert refined(torch.where(off[:, 1] > 0, 6.0, 1.0).double(), off)[2][:10].all()

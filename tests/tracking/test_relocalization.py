@@ -1,0 +1,120 @@
+"""A camera that is lost finds its place again, or says that it does not know."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from torchslam.config import load_config
+from torchslam.tracking.correspondences import (
+    descriptor_distances,
+    match_keyframe,
+    match_points,
+    max_distance,
+)
+from torchslam.tracking.relocalization import Relocalizer
+from torchslam.tracking.tracker import Tracker
+from torchslam.world.world import World
+
+SCENE = Scene.of(300)
+ROWS = rows_of(SCENE)
+FAR = Scene(SCENE.points_w, SCENE.sizes, SCENE.descriptors.flip(0) ^ 255)  # of another look
+ANYWHERE = pose(-0.3, 0.1, 0.2, 0.05, 0.1, -0.1)
+
+
+def relocalizer(*overrides: str) -> Relocalizer:
+    config = load_config(None, overrides)
+    return Relocalizer(Tracker(CAMERA, config), config)
+
+
+def worlds() -> tuple[World, World]:
+    return world_in(SCENE, sideways(6)), world_in(FAR, sideways(6), number=1)
+
+
+def found(
+    T_cw: Tensor, candidates: list[tuple[World, int]], *overrides: str, noise: float = 0.3
+) -> World | None:
+    located = relocalizer(*overrides).locate(SCENE.view(50, T_cw, noise=noise), candidates)
+    if located is None:
+        return None
+    world, tracked = located
+    torch.testing.assert_close(tracked.T_cw, T_cw, atol=0.02, rtol=0)
+    assert tracked.inliers > 100
+    return world
+
+
+def test_a_frame_is_found_where_it_is_without_knowing_anything() -> None:
+    right, _ = worlds()
+    right.track.local_points = right.track.local_points[:0]
+    assert found(ANYWHERE, [(right, 0)]) is right
+    assert found(sideways(1, start=0.6)[0], [(right, 0)]) is right
+
+
+def test_the_first_candidate_that_gives_a_pose_decides() -> None:
+    right, wrong = worlds()
+    assert found(ANYWHERE, [(wrong, 0), (right, 2)]) is right
+    twin = world_in(SCENE, sideways(6), number=2)
+    assert found(ANYWHERE, [(twin, 1), (right, 1)]) is twin
+    assert found(ANYWHERE, []) is None
+
+
+def test_only_so_many_are_tried() -> None:
+    right, wrong = worlds()
+    others = [world_in(FAR, sideways(2), number=number) for number in range(3, 6)]
+    candidates = [(other, 0) for other in others]
+    assert found(ANYWHERE, [*candidates, (right, 0)]) is None
+    assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
+    assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.tries=4") is right
+    # those beside one that failed are not tried, nor do they count
+    assert (
+        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.tries=2") is right
+    )
+
+
+def test_those_beside_one_that_failed_in_another_world_are_tried() -> None:
+    right, wrong = worlds()
+    assert found(ANYWHERE, [(wrong, 3), (right, 3)]) is right
+
+
+def test_beside_a_candidate_are_as_many_as_the_local_map_has() -> None:
+    right, _ = worlds()
+    assert relocalizer("tracking.local_keyframes=2")._near(right.map, 5).tolist() == [5, 4, 3]
+
+
+def test_a_pose_that_is_doubted_is_no_pose() -> None:
+    right, _ = worlds()
+    assert found(ANYWHERE, [(right, 0)], "judge.max_position_std=1e-6") is None
+    assert found(ANYWHERE, [(right, 0)], "judge.max_error=1e-3") is None
+    assert found(ANYWHERE, [(right, 0)], "judge.max_jump=1e-9") is right  # nothing was expected
+
+
+def test_a_keyframe_matches_by_its_own_descriptors() -> None:
+    right, _ = worlds()
+    right.map.points["descriptors"][:] = 0  # of other observations
+    view = SCENE.view(50, ANYWHERE)
+    points, keypoints = match_keyframe(right.map, 2, view, relocalizer().matching)
+    assert len(points) > 150
+    assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
+    assert set(points.tolist()) <= set(right.map.points_seen_by(torch.tensor([2])).tolist())
+
+
+def test_points_match_by_descriptor_wherever_they_are() -> None:
+    right, _ = worlds()
+    view = SCENE.view(50, ANYWHERE)
+    ids = right.map.living_points().flip(0)
+    points, keypoints = match_points(right.map, ids, view, relocalizer().matching)
+    assert len(points) > 150
+    assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
+    assert len(match_points(right.map, ids[:0], view, relocalizer().matching)[0]) == 0
+
+
+def test_distances_of_bits_and_of_floats() -> None:
+    bits = torch.zeros(2, 32, dtype=torch.uint8)
+    bits[1, 3] = 7
+    assert descriptor_distances(bits, bits).tolist() == [[0, 3], [3, 0]]
+    floats = torch.tensor([[1.0, 0], [0.6, 0.8]])
+    torch.testing.assert_close(descriptor_distances(floats, floats), torch.tensor([[0.0, 0.4], [0.4, 0.0]]))
+    settings = load_config(None, ["matching.max_distance=50", "matching.max_cosine_distance=0.3"]).matching
+    assert max_distance(bits, settings) == 50
+    assert max_distance(floats, settings) == 0.3
