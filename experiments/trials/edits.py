@@ -126,7 +126,7 @@ def lens_dirt(size: tuple[int, int]) -> Edit:
     """Soft grey spots that stay where they are, in images of (width, height)."""
     width, height = size
     rng = np.random.default_rng(SPOT_SEED)
-    cover = np.zeros((height, width), np.float32)
+    cover: np.ndarray = np.zeros((height, width), np.float32)
     for _ in range(SPOTS):
         place = int(rng.integers(width)), int(rng.integers(height))
         cv2.circle(cover, place, int(rng.integers(5, 40)), float(rng.uniform(0.3, 0.9)), cv2.FILLED)
@@ -139,14 +139,18 @@ def turned(camera: Camera, angle: float) -> Edit:
 
     What was out of the image is black.
     """
-    width, height = camera.size
-    x, y = _grid(width, height)
-    pixels = torch.from_numpy(np.stack((x, y), -1)).reshape(-1, 2).to(camera.params)
-    R = so3_exp(pixels.new_tensor((0.0, angle, 0.0)))
-    sources, seen = camera.project(camera.unproject(pixels) @ R)
-    sources = torch.where(seen[:, None], sources, -1e3).reshape(height, width, 2)
-    x, y = (part.contiguous().numpy() for part in sources.to(torch.float32).unbind(-1))
-    return lambda grey, _: cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+    def edit(grey: np.ndarray, _: int) -> np.ndarray:
+        height, width = grey.shape
+        pixels = torch.from_numpy(np.stack(_grid(width, height), -1)).reshape(-1, 2).to(camera.params)
+        R = so3_exp(pixels.new_tensor((0.0, angle, 0.0)))
+        sources, seen = camera.project(camera.unproject(pixels) @ R)
+        outside = -float(width)
+        sources = torch.where(seen[:, None], sources, outside).reshape(height, width, 2)
+        x, y = (part.contiguous().numpy() for part in sources.to(torch.float32).unbind(-1))
+        return cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+    return edit
 
 
 def _grid(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

@@ -36,7 +36,7 @@ def robust_similarity(source: Tensor, target: Tensor, seed: int = 0) -> tuple[Te
     if n < MIN_JUDGED:
         return umeyama(source, target)
     generator = torch.Generator().manual_seed(seed)
-    order = torch.rand(SAMPLES, n, generator=generator).argsort(-1)[:, : min(n, SAMPLE_SIZE)]
+    order = torch.rand(SAMPLES, n, generator=generator).argsort(-1)[:, : min(max(3, n // 2), SAMPLE_SIZE)]
     s, R, t = umeyama(source[order], target[order])
     residuals = (s[:, None, None] * source @ R.mT + t[:, None] - target).norm(dim=-1)
     errors = residuals[residuals.median(-1).values.argmin()]
