@@ -1,0 +1,230 @@
+"""A trial, run, and what came of it."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+import warnings
+from collections.abc import Sequence as Rows
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from experiments.trials.edited import Edited
+from experiments.trials.judging import extent, wrong
+from experiments.trials.trials import Trial
+from torchslam.config import Config, load_config
+from torchslam.evaluation import MIN_POSES, evaluate
+from torchslam.front_end import Extractor
+from torchslam.geometry import Camera, se3_inverse, so3_log
+from torchslam.loops.recognition import Recall
+from torchslam.run import Run
+from torchslam.slam import SLAM
+from torchslam.values import Frame, State, StepResult
+
+LETTERS = {State.INITIALIZING: "i", State.TRACKING: "T", State.UNCERTAIN: "U", State.LOST: "L"}
+TOLD = 8  # stretches of states, and recalls, of which the table tells
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run over an edited sequence came to.
+
+    posed:    frames with a pose in the main world that can have one, `possible` of which there are
+    strays:   frames with a pose in the main world that cannot have one
+    worlds:   frames of each world, the main one first
+    ate:      in units of the truth; None where too little is posed
+    extent:   of the true path
+    misled:   frames called tracking whose pose in the main world is wrong, as it was given or in the end
+    states:   one per frame; recalls: places recognised; apart: by the truth, how far away the furthest of them is:
+              metres and degrees; None without truth
+    seconds:  of the processor, for the whole run with reading of images and the last adjustment
+    ms:       of the processor, for `SLAM.step`, median
+    failure:  why there is no map
+    """
+
+    posed: int
+    possible: int
+    strays: int
+    worlds: list[int]
+    ate: float | None
+    extent: float
+    misled: list[int]
+    states: list[State]
+    recalls: list[Recall]
+    apart: tuple[float, float] | None
+    seconds: float
+    ms: float
+    failure: str
+
+
+class Timed(SLAM):
+    """Remembers for every frame how much of the processor it took, which other work on the machine does not change."""
+
+    def __init__(
+        self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
+    ) -> None:
+        super().__init__(camera, config, extractor)
+        self.ms: list[float] = []
+
+    def step(self, frame: Frame) -> StepResult:
+        before = time.process_time()
+        result = super().step(frame)
+        self.ms.append(1e3 * (time.process_time() - before))
+        return result
+
+
+def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
+    """Run a trial; `more` settings come after its own. Raises SequenceError where its frames are not at hand."""
+    config = load_config(None, [*trial.settings, *more])
+    sequence = trial.sequence()
+    slam = Timed(sequence.camera, config) if trial.map_of is None else _in_map(trial.map_of(), config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        start = time.process_time()
+        run = slam.run(sequence)
+        seconds = time.process_time() - start
+    return _outcome(slam, run, sequence, seconds), run
+
+
+def _in_map(sequence: Edited, config: Config) -> Timed:
+    """A system that only localises, in the saved map of another run."""
+    slam = SLAM(sequence.camera, config)
+    slam.run(sequence)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.safetensors"
+        slam.save(path)
+        loaded = Timed.load(path, config, mapping=False)
+        assert isinstance(loaded, Timed)
+        return loaded
+
+
+def _outcome(slam: Timed, run: Run, sequence: Edited, seconds: float) -> Outcome:
+    final = final_poses(run)
+    truth = sequence.groundtruth
+    assert truth is not None
+    ate = None
+    if sum(sequence.pose(index) is not None for index in final) >= MIN_POSES:
+        ate = evaluate(run.trajectory, truth).ate_m
+    posed = sum(bool(sequence.belongs[index]) for index in final)
+    return Outcome(
+        posed=posed,
+        possible=int(sequence.belongs.sum()),
+        strays=len(final) - posed,
+        worlds=sorted((world.history.count(run.session) for world in run.worlds), reverse=True),
+        ate=ate,
+        extent=extent(truth.positions_w),
+        misled=misled(run, sequence),
+        states=[result.state for result in run.results],
+        recalls=slam.memory.recalls,
+        apart=furthest(slam.memory.recalls, sequence),
+        seconds=seconds,
+        ms=median(slam.ms),
+        failure=run.failure,
+    )
+
+
+def final_poses(run: Run) -> dict[int, Tensor]:
+    """T_cw (4, 4) of the frames of the main world, by their numbers, as the run left them."""
+    if run.main is None or len(run.main.history) == 0:
+        return {}
+    frames = run.main.history.frames
+    T_cw = run.main.history.T_cw(run.main.map)
+    rows = torch.nonzero(frames["session"] == run.session)[:, 0]
+    return {int(frames["frame_index"][row]): T_cw[row] for row in rows.tolist()}
+
+
+def online_poses(run: Run) -> dict[int, Tensor]:
+    """T_cw (4, 4) of the frames of the main world, by their numbers, as they were given."""
+    if run.main is None:
+        return {}
+    number = run.main.number
+    return {
+        result.index: result.T_cw
+        for result in run.results
+        if result.T_cw is not None and result.world == number
+    }
+
+
+def misled(run: Run, sequence: Edited) -> list[int]:
+    """The frames that were called tracking and whose pose in the main world, given or final, is wrong."""
+    bad = wrong_frames(final_poses(run), sequence) | wrong_frames(online_poses(run), sequence)
+    return [result.index for result in run.results if result.state is State.TRACKING and result.index in bad]
+
+
+def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
+    """Those of the frames whose poses T_cw, in one world, are wrong: any pose is where none can be."""
+    strays = {index for index in poses if not sequence.belongs[index]}
+    pairs = {
+        index: (poses[index], pose) for index in sorted(poses) if (pose := sequence.pose(index)) is not None
+    }
+    if not pairs or sequence.groundtruth is None:
+        return strays
+    given, true = (
+        se3_inverse(torch.stack(side).to(torch.float64)) for side in zip(*pairs.values(), strict=True)
+    )
+    bad = wrong(given, true, extent(sequence.groundtruth.positions_w))
+    return strays | {index for index, is_bad in zip(pairs, bad.tolist(), strict=True) if is_bad}
+
+
+def furthest(recalls: list[Recall], sequence: Edited) -> tuple[float, float] | None:
+    """The largest distance, in metres, and the largest angle, in degrees, between a frame and the place it recalled."""
+    metres, degrees = [], []
+    for recall in recalls:
+        here, there = sequence.pose(recall.frame), sequence.pose(recall.place)
+        if here is None or there is None:
+            continue
+        motion = se3_inverse(here) @ there
+        metres.append(float((se3_inverse(here) - se3_inverse(there))[:3, 3].norm()))
+        degrees.append(math.degrees(float(so3_log(motion[:3, :3]).norm())))
+    return (max(metres), max(degrees)) if metres else None
+
+
+HEADER = ["trial", "posed", "worlds", "ATE", "wrong & tracking", "states", "recalls", "s, ms a frame"]
+
+
+def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
+    """The row of the table."""
+    return [
+        name,
+        f"{outcome.posed} of {outcome.possible}" + f", and {outcome.strays} strays" * bool(outcome.strays),
+        " + ".join(map(str, outcome.worlds)) or "none",
+        _ate(outcome, unit),
+        _misled(outcome),
+        states_in_short(outcome.states),
+        _recalls(outcome),
+        f"{outcome.seconds:.0f}, {outcome.ms:.0f}",
+    ]
+
+
+def states_in_short(states: list[State]) -> str:
+    """How often each state came in a row, initialising, tracking, uncertain and lost by their letters."""
+    stretches = [f"{LETTERS[state]}{len(list(group))}" for state, group in groupby(states)]
+    return " ".join(stretches[:TOLD]) + " …" * (len(stretches) > TOLD)
+
+
+def _ate(outcome: Outcome, unit: str) -> str:
+    if outcome.ate is None:
+        return outcome.failure or "too few poses"
+    return f"{outcome.ate:.4f} {unit}" if unit else f"{outcome.ate / outcome.extent:.2%} of the extent"
+
+
+def _misled(outcome: Outcome) -> str:
+    share = len(outcome.misled) / len(outcome.states)
+    return f"{len(outcome.misled)} ({share:.1%})" if outcome.misled else "0"
+
+
+def _recalls(outcome: Outcome) -> str:
+    told = [
+        f"{recall.frame}→{recall.place}" + " in another world" * (recall.world != recall.other)
+        for recall in outcome.recalls
+    ]
+    text = ", ".join(told[:TOLD]) + f" and {len(told) - TOLD} more" * (len(told) > TOLD)
+    if outcome.apart is not None:
+        text += f"; within {outcome.apart[0]:.2g} m, {outcome.apart[1]:.0f}°"
+    return text or "none"
