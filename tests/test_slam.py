@@ -130,6 +130,23 @@ def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
     assert int(run.history.frames["frame_index"].max()) < 25
 
 
+@pytest.mark.parametrize(("least", "believed"), [(0.4, True), (0.6, False)])
+def test_a_start_must_explain_the_frames_since_its_reference(
+    least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reference frame is explained, the one that starts the map is not."""
+    explain = SLAM._explain
+    monkeypatch.setattr(
+        SLAM, "_explain", lambda slam, world, view: explain(slam, world, view) and view.index == 0
+    )
+    walk = Walk(arc(40)[[0, 3]])
+    run = run_walk(
+        walk, "simulated.depth_near=7", "simulated.depth_far=25", f"initialization.min_explained={least}"
+    )
+    assert (len(run.worlds) == 1) is believed
+    assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
+
+
 def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:
     """A camera that stands at first: there is nothing to begin with before it moves."""
     walk = Walk(torch.cat([still(6), arc(60)[1:20]]))

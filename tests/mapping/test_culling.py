@@ -130,6 +130,14 @@ def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -
     assert Mapper(CAMERA, Config(), Stopwatch()).tidy(world) is None
 
 
+def test_keyframes_go_where_the_rows_of_points_stay() -> None:
+    world = world_of(standing(30))
+    went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
+    assert went is not None
+    assert went.points.tolist() == list(range(POINTS))
+    assert world.map.num_keyframes == NEWEST + 1
+
+
 def test_a_few_new_keyframes_are_not_worth_the_trouble() -> None:
     assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
     world = world_of(standing(20))

@@ -275,6 +275,16 @@ def test_the_baseline_keeps_its_length_and_noise_weighs_by_its_variance() -> Non
     assert agrees.double().mean() > 0.9
 
 
+def test_coarse_keypoints_move_the_pose_by_what_their_variance_says() -> None:
+    """Half of the keypoints are six times as coarse and 3 px too low: 3 / 37 px are left of that."""
+    coarse = torch.arange(200) % 2 == 1
+    off = torch.zeros(200, 2, dtype=torch.float64)
+    off[coarse, 1] = 3.0
+    T_cw, _, _ = refined(torch.where(coarse, 6.0, 1.0).double(), off)
+    sunk = [CAMERA.project(transform(T, SCENE.points_w[:200]))[0][:, 1] for T in (SIDE, T_cw)]
+    assert float((sunk[1] - sunk[0]).median()) == pytest.approx(3 / 37, rel=0.4)
+
+
 def test_what_disagrees_with_both_views_is_told() -> None:
     off = torch.zeros(200, 2, dtype=torch.float64)
     off[:10, 1] = 12.0  # across the epipolar lines: shared by the two views, six each
