@@ -13,21 +13,19 @@ from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, w
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
-from torchslam.tracking.tracker import (
+from torchslam.tracking.spread import (
     CELLS,
     CROWD,
-    MEMORY,
     PER_CELL,
     SENIOR,
-    Tracker,
     cells,
     coverage,
     explained,
     spread,
     trusted,
     voices,
-    well_observed,
 )
+from torchslam.tracking.tracker import MEMORY, Tracker, well_observed
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
 

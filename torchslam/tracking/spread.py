@@ -1,0 +1,80 @@
+"""Who has a voice in a pose: points of age, and all parts of the image alike.
+
+A thing with much texture that moves before a scene with little has most of the matches. It has not most of the image,
+and its points do not grow old.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchslam.tracking.correspondences import Projected
+from torchslam.values import View
+from torchslam.world.map import Map
+
+CELLS = (8, 6)  # the image as a grid, for what should be spread over it
+PER_CELL = 5  # matches of a cell that RANSAC hears
+CROWD = 8  # matches of a cell that count in full
+SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
+
+
+def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) int64 number of the cell of the image that pixels (n, 2) lie in."""
+    extent = pixels.new_tensor([size[0], size[1]])
+    grid = pixels.new_tensor(CELLS)
+    column, row = torch.minimum((pixels / extent * grid).clamp(min=0), grid - 1).long().unbind(-1)
+    return row * CELLS[0] + column
+
+
+def trusted(times_found: Tensor, least: int) -> Tensor:
+    """(m,) rows of matches (n,) with points that many frames have found; all where they are fewer than `least`.
+
+    What moves by itself agrees with the scene for a while at most: its points do not grow old.
+    """
+    old = torch.nonzero(times_found >= SENIOR)[:, 0]
+    return old if len(old) >= least else torch.arange(len(times_found), device=times_found.device)
+
+
+def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(m,) rows of pixels (n, 2), a few of each cell of the image: each cell has a voice.
+
+    Where one thing with much texture moves before a scene with little, most matches are its.
+    """
+    cell = cells(pixels, size)
+    order = torch.argsort(cell, stable=True)
+    ordered = cell[order]
+    counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
+    rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
+    return torch.sort(order[rank < PER_CELL]).values
+
+
+def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """(n,) what each of the pixels (n, 2) counts, so that a crowded cell of the image does not outvote the others."""
+    cell = cells(pixels, size)
+    crowd = torch.bincount(cell, minlength=CELLS[0] * CELLS[1])[cell]
+    return (CROWD / crowd).clamp(max=1.0)
+
+
+def explained(view: View, keypoints: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells with several keypoints in which at least one of keypoints (m,) lies."""
+    count = CELLS[0] * CELLS[1]
+    there = torch.bincount(cells(view.keypoints[view.mask], size), minlength=count) >= 2
+    used = torch.bincount(cells(view.keypoints[keypoints], size), minlength=count) > 0
+    return float(used[there].double().mean()) if bool(there.any()) else 1.0
+
+
+def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
+    """The share of the image's cells in which several old points were expected that has at least a fifth of them.
+
+    expected: points that should be in the image; seen: (m,) those of them that are where they should be
+    """
+    old = slam_map.points["times_found"][expected.ids] >= SENIOR
+    cell = cells(expected.pixels[old], size)
+    count = CELLS[0] * CELLS[1]
+    wanted = torch.bincount(cell, minlength=count)
+    found = torch.bincount(cell[torch.isin(expected.ids[old], seen)], minlength=count)
+    asked = wanted >= 2
+    if not bool(asked.any()):
+        return 1.0
+    return float((5 * found >= wanted)[asked].double().mean())
