@@ -132,11 +132,9 @@ def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
     assert drifts(pose(0, 3.99), max_drift=0.4)
 
 
-def test_the_way_is_that_in_time() -> None:
+def test_the_way_is_that_in_which_the_frames_came() -> None:
     world = way()
-    world.map.keyframes["timestamp"][:] = torch.tensor(
-        [0.0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10], dtype=torch.float64
-    )
+    world.map.keyframes["frame_index"][:] = torch.tensor([0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10])
     # to and fro: 2, 2, 2, 2, then 7 back, 2, 2, 2, 2 and 1: 24 metres
     assert drifts(pose(0, 4.79), world)
     assert not drifts(pose(0, 4.81), world)
