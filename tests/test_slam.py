@@ -17,6 +17,7 @@ from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.mapping.founding import Founder
 from torchslam.slam import FOUND_AGAIN
 from torchslam.tracking.tracker import Tracker
 
@@ -135,9 +136,9 @@ def test_a_start_must_explain_the_frames_since_its_reference(
     least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reference frame is explained, the one that starts the map is not."""
-    explain = SLAM._explain
+    explains = Founder._explains
     monkeypatch.setattr(
-        SLAM, "_explain", lambda slam, world, view: explain(slam, world, view) and view.index == 0
+        Founder, "_explains", lambda founder, world, view: explains(founder, world, view) and view.index == 0
     )
     walk = Walk(arc(40)[[0, 3]])
     run = run_walk(
