@@ -327,7 +327,7 @@ class SLAM:
             return reason
         for keyframe in range(world.map.num_keyframes):
             self.memory.add(world.map, keyframe)
-        known = set(world.history.frames["frame_index"].tolist())
+        known = set(world.history.frames["frame_index"].tolist()) if len(world.history) else set()
         posed = [view for view in views if view.index in known]
         self.waiting.remove(posed)
         self.world, self.youth, self.state = world, Youth(world, posed), State.TRACKING
