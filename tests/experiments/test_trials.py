@@ -157,6 +157,8 @@ def test_only_tracking_frames_of_the_main_world_mislead(
     other = [replace(result, world=1 if result.index == 10 else result.world) for result in results]
     assert 10 in online_poses(run)
     assert 10 not in online_poses(replace(run, results=other))
+    doubtful = [replace(result, state=State.UNCERTAIN) for result in results]
+    assert online_poses(replace(run, results=doubtful)) == {}
 
 
 def test_final_poses_are_those_of_the_session(run: Run, trajectory: Trajectory) -> None:
