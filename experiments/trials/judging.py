@@ -66,7 +66,21 @@ def wrong(T_wc: Tensor, truth_wc: Tensor, path_extent: float) -> Tensor:
         return torch.zeros(len(T_wc), dtype=torch.bool)
     positions, truth = T_wc[:, :3, 3], truth_wc[:, :3, 3]
     rows = moves(truth, STANDS * path_extent)
-    s, R, t = robust_similarity(positions[rows], truth[rows])
+    s, R, t = _fit_to_right(positions[rows], truth[rows], FAR * path_extent)
     errors = (s * positions @ R.mT + t - truth).norm(dim=-1)
     turned = so3_log(truth_wc[:, :3, :3].mT @ R @ T_wc[:, :3, :3]).norm(dim=-1) * (180 / math.pi)
     return (errors > FAR * path_extent) | (turned > turned.median() + TURNED_DEG)
+
+
+def _fit_to_right(source: Tensor, target: Tensor, far: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The similarity that fits all that it brings nearer than `far`, begun with that of the majority.
+
+    That of the majority alone may take the side of one half of a path that drifts, by chance the one or the other.
+    """
+    s, R, t = robust_similarity(source, target)
+    for _ in range(REFITS):
+        near = (s * source @ R.mT + t - target).norm(dim=-1) <= far
+        if 2 * int(near.sum()) < len(near):
+            break
+        s, R, t = umeyama(source, target, near)
+    return s, R, t

@@ -140,14 +140,17 @@ def final_poses(run: Run) -> dict[int, Tensor]:
 
 
 def online_poses(run: Run) -> dict[int, Tensor]:
-    """T_cw (4, 4) of the frames of the main world, by their numbers, as they were given."""
+    """T_cw (4, 4) of the frames that were tracking in the main world, by their numbers, as they were given.
+
+    Uncertain poses are no claim: many of them would tell the judge what is right.
+    """
     if run.main is None:
         return {}
     number = run.main.number
     return {
         result.index: result.T_cw
         for result in run.results
-        if result.T_cw is not None and result.world == number
+        if result.T_cw is not None and result.world == number and result.state is State.TRACKING
     }
 
 

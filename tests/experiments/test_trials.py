@@ -110,6 +110,18 @@ def test_a_camera_that_stands_for_long_is_judged_by_how_it_moves() -> None:
     assert moves(truth[:, :3, 3], 1e-3 * path).tolist() == [0, *range(3 * N + 1, 4 * N)]
 
 
+def test_a_drift_is_shared_out_among_the_whole_path() -> None:
+    """The second half has another scale: fitted to one half alone, the other one's end is off by half the extent."""
+    truth = arc(2 * N)
+    path = extent(truth[:, :3, 3])
+    given = truth.clone()
+    given[N:, :3, 3] += 0.35 * (truth[N:, :3, 3] - truth[N, :3, 3])
+    assert not wrong(similar(given), truth, path).any()
+    s, R, t = robust_similarity(given[:, :3, 3], truth[:, :3, 3])
+    alone = (s * given[:, :3, 3] @ R.mT + t - truth[:, :3, 3]).norm(dim=-1)
+    assert float(alone.max()) > FAR * path
+
+
 def test_three_poses_cannot_be_wrong() -> None:
     truth = arc(3)
     assert not wrong(shifted(truth, slice(0, 1), 9.0), truth, 0.1).any()
@@ -145,6 +157,8 @@ def test_only_tracking_frames_of_the_main_world_mislead(
     other = [replace(result, world=1 if result.index == 10 else result.world) for result in results]
     assert 10 in online_poses(run)
     assert 10 not in online_poses(replace(run, results=other))
+    doubtful = [replace(result, state=State.UNCERTAIN) for result in results]
+    assert online_poses(replace(run, results=doubtful)) == {}
 
 
 def test_final_poses_are_those_of_the_session(run: Run, trajectory: Trajectory) -> None:
