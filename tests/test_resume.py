@@ -63,7 +63,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
     slam.stillness.evidence[3, 4] = 1  # too little to matter
-    slam.recalls.append(Recall(20, 3, 0, 0))
+    slam.memory.recalls.append(Recall(20, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -90,7 +90,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert slam.world is not None
     assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
     assert resumed.state is State.TRACKING
-    assert resumed.recalls == [Recall(20, 3, 0, 0)]
+    assert resumed.memory.recalls == [Recall(20, 3, 0, 0)]
     for column in fields(Track):
         before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
         assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (

@@ -80,7 +80,7 @@ def test_a_third_session_knows_the_keyframes_of_both(first: tuple[SLAM, Run, Pat
     slam.run(WALK.part(FIRST - 10))
     slam.save(tmp_path / "grown")
     third = SLAM.load(tmp_path / "grown", config_of(), eyes(), mapping=False)
-    assert len(third.places) == slam.map.num_keyframes
+    assert len(third.memory.places) == slam.map.num_keyframes
     assert third.step(WALK[45]).reason == "found again"
 
 
