@@ -234,6 +234,7 @@ class SLAM:
                 self.settle()
             self.world, keyframe = self.memory.take_up(found)
             self.tracker.follow(self.world, keyframe)
+            self.stillness.forget_last()  # its pose was one of the map before
         return self.world
 
     def _tidy(self, world: World) -> None:

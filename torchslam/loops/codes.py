@@ -22,9 +22,8 @@ BITS = 256  # of a descriptor
 CODE_BITS = 64  # of a code: one machine word
 _CODE_NOISE = 9.0  # bits: the likeness of codes falls by exp(-(distance / _CODE_NOISE)^2)
 _CODE_LIMIT = 19  # bits: codes further apart mean different things
-_WORDS_FILE = (
-    Path(__file__).parent / "words.safetensors"
-)  # by experiments/places/train.py, from rendered images
+# by experiments/places/train.py, from rendered images
+_WORDS_FILE = Path(__file__).parent / "words.safetensors"
 _SEED = 0  # of the choice of bits and of the projections of floats; part of what a saved state means
 
 

@@ -23,11 +23,9 @@ SHARE, OTHERS = 0.9, 3  # of a keyframe's points that so many others must see
 COARSER = 1.25  # seen one level of the pyramid (a factor of 1.2) coarser is seen as well
 NEWEST = 8  # keyframes that are never asked: their points are still on trial, and the track starts from them
 AROUND = 20  # keyframes that are asked around each new one
-_LEAST_BATCH, _BATCH_SHARE = (
-    8,
-    16,
-)  # asked every so many keyframes, or every sixteenth of the map, so that the copies
-# of the map's rows that a removal makes cost a fixed amount for each keyframe
+# Asked every so many keyframes, or every sixteenth of the map: the copies of rows that a removal makes then
+# cost a fixed amount for each keyframe.
+_LEAST_BATCH, _BATCH_SHARE = 8, 16
 
 
 def cull_keyframes(world: World, settings: KeyframesConfig) -> Renumbering | None:
@@ -95,7 +93,4 @@ def drop_covered(world: World, covers: Callable[[Tensor], Tensor]) -> None:
     """
     slam_map = world.map
     seen = slam_map.observations(torch.sort(world.track.local_keyframes).values)
-    wrong = covers(seen.pixels)
-    slam_map.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
-    touched = torch.unique(seen.point_index[wrong])
-    slam_map.kill(touched[slam_map.points["times_observed"][touched] < 2])
+    slam_map.drop(seen, covers(seen.pixels))

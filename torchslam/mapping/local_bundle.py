@@ -95,9 +95,7 @@ def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
     wrong = ~fits(squared_reprojection_errors(points_c[:, 0], seen.pixels, camera), seen.scales)
-    slam_map.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
-    touched = torch.unique(seen.point_index[wrong])
-    slam_map.kill(touched[slam_map.points["times_observed"][touched] < 2])
+    slam_map.drop(seen, wrong)
 
 
 def select(seen: Observations, rows: Tensor) -> Observations:

@@ -37,9 +37,8 @@ class Initializer:
         self.camera = camera
         self.config = config
         self.views: list[View] = []  # the reference and what came after it
-        self.still = camera.params.new_zeros(
-            0, 2
-        )  # pixels that the last view showed not to move with the scene
+        # pixels (n, 2) that the last view showed not to move with the scene
+        self.still = camera.params.new_zeros(0, 2)
         self.planar_views = 0  # in which a plane explained the matches
 
     @property

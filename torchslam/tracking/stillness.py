@@ -54,7 +54,7 @@ class Stillness:
         return self.evidence[row, column] >= self.settings.min_evidence
 
     def observe(self, view: View, T_cw: Tensor, depth: float) -> int:
-        """Compare a posed frame with an earlier one; returns how many keypoints became known to stay.
+        """Compare a posed frame with an earlier one; returns how many cells became known to stay.
 
         view: with all its keypoints; T_cw: (4, 4); depth: median depth of the scene
         """

@@ -95,9 +95,7 @@ def _leave_points(slam_map: Map, goes: Tensor, heirs: Tensor) -> None:
     """Drop what keyframes see that go (K,) bool; their points are left to the others."""
     gone = torch.nonzero(goes)[:, 0]
     seen = slam_map.observations(gone)
-    slam_map.forget(seen.keyframe_index, seen.keypoint_index)
-    touched = torch.unique(seen.point_index)
-    slam_map.kill(touched[slam_map.points["times_observed"][touched] < 2])
+    slam_map.drop(seen, torch.ones_like(seen.point_index, dtype=torch.bool))
     orphans = torch.nonzero(goes[slam_map.points["born"]])[:, 0]
     observers, _ = slam_map.scales_of(orphans)
     first = torch.where(observers >= 0, observers, len(goes)).amin(1)
