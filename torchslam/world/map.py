@@ -254,7 +254,7 @@ class Map:
         self.points["times_observed"][point_ids] = 0
 
     def drop(self, seen: Observations, wrong: Tensor) -> None:
-        """Forget the observations (O,) that are `wrong` (O,), and kill points that fewer than two keyframes still see."""
+        """Forget the observations that are `wrong` (O,), and kill points that fewer than two keyframes still see."""
         self.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
         touched = torch.unique(seen.point_index[wrong])
         self.kill(touched[self.points["times_observed"][touched] < 2])
