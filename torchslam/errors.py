@@ -17,6 +17,10 @@ class CalibrationError(SequenceError):
     """A camera calibration is missing or wrong: NaN, negative focal length, too few numbers."""
 
 
+class MissingCalibrationError(CalibrationError):
+    """A sequence says nothing about its camera, and none was given."""
+
+
 class FrameError(TorchslamError):
     """One image of a sequence cannot be read or has another size. A run skips the frame and counts it."""
 

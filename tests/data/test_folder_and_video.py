@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.errors import CalibrationError, FrameError, SequenceError
+from torchslam.errors import CalibrationError, FrameError, MissingCalibrationError, SequenceError
 
 CAMERA = "60,60,32,24"
 
@@ -37,6 +37,28 @@ def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
     (tmp_path / "mine.txt").write_text("62 62 32 24")
     assert float(open_sequence(tmp_path, tmp_path / "mine.txt").camera.fx) == 62.0
     assert float(open_sequence(tmp_path, str(tmp_path / "mine.txt")).camera.fx) == 62.0
+
+
+def test_unknown_camera_is_a_first_guess(tmp_path: Path, write_picture: Callable) -> None:
+    for index in range(3):
+        write_picture(tmp_path / f"{index}.png")
+    with pytest.raises(MissingCalibrationError):
+        open_sequence(tmp_path)
+    (tmp_path / "calibration.txt").write_text("60 60 32 24")
+    guessed = open_sequence(tmp_path, "auto", limit=2)
+    width, height = guessed.size
+    assert not guessed.calibrated
+    assert guessed.describe()["camera"] == "unknown"
+    assert guessed.camera.params.tolist() == [0.85 * width, 0.85 * width, (width - 1) / 2, (height - 1) / 2]
+    known = guessed.with_camera(open_sequence(tmp_path).camera)
+    assert known.calibrated
+    assert float(known.camera.fx) == 60.0
+    assert float(guessed.camera.fx) != 60.0
+    assert len(known) == 2
+    assert open_sequence(tmp_path).calibrated
+    room = open_sequence("synthetic:room", "auto", limit=2)
+    assert not room.calibrated
+    assert float(room.camera.fx) == 0.85 * room.size[0]
 
 
 def test_folder_without_images(tmp_path: Path) -> None:

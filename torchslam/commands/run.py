@@ -15,12 +15,14 @@ import torch
 
 from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
+from torchslam.commands.camera import find_camera, judged
 from torchslam.commands.folder import Checkpoints, prepare
 from torchslam.commands.progress import ProgressBar
 from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
-from torchslam.errors import ConfigError, ResultsError, TrajectoryError
+from torchslam.data.calibration import AUTO
+from torchslam.errors import ConfigError, MissingCalibrationError, ResultsError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
@@ -31,6 +33,7 @@ from torchslam.values import StepResult, Trajectory
 
 DONE = 0
 NO_MAP = 3
+RADIAL = 2  # coefficients of the distortion that may be found
 CHECKPOINT_EVERY = 20  # keyframes
 
 
@@ -41,6 +44,7 @@ class Plan:
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
+    refine:     improve the given camera by the images first; distortion: its distortion, too
     """
 
     output: Path
@@ -50,6 +54,8 @@ class Plan:
     map: Path | None = None
     mapping: bool = True
     checkpoint: int = CHECKPOINT_EVERY
+    refine: bool = False
+    distortion: bool = False
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,11 +84,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="save the state every N keyframes at the most, for --resume; 0: never (default: %(default)s)",
     )
+    parser.add_argument(
+        "--refine-camera", action="store_true", help="improve the focal length by the images before the run"
+    )
+    parser.add_argument(
+        "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
+    )
     arguments.add_device(parser)
     arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
+    if options.map is not None and (options.refine_camera or options.refine_distortion):
+        raise ConfigError("--refine-camera: a --map has the camera that it was made with")
     if options.localize and options.map is None:
         raise ConfigError("--localize needs a --map to find poses in")
     saved = options.map
@@ -98,13 +112,30 @@ def execute(options: argparse.Namespace) -> int:
         map=saved,
         mapping=not options.localize,
         checkpoint=options.checkpoint,
+        refine=options.refine_camera or options.refine_distortion,
+        distortion=options.refine_distortion,
     )
-    return run(arguments.sequence(options), arguments.config(options), plan)
+    return run(_sequence(options), arguments.config(options), plan)
+
+
+def _sequence(options: argparse.Namespace) -> Sequence:
+    """The sequence; without a calibration, as with `--camera auto`."""
+    try:
+        return arguments.sequence(options)
+    except MissingCalibrationError:
+        options.camera = AUTO
+        print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)
+        return arguments.sequence(options)
 
 
 def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
+    found = ""
+    if plan.map is None and (plan.refine or not sequence.calibrated):
+        radial = RADIAL if plan.distortion or not sequence.calibrated else 0
+        goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
+        sequence, found = find_camera(sequence, config, plan.output, plan.device, radial, goes_on)
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     with Stopping() as stopping:
@@ -117,7 +148,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan.output)
+        figures = _write(finished, sequence, plan.output, found)
     print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
@@ -142,10 +173,9 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
         return SLAM(sequence.camera.to(plan.device), config), Progressed()
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
     known, mine = slam.camera, sequence.camera.to(torch.float64)
-    if (
-        known.model != mine.model
-        or known.size != mine.size
-        or not torch.equal(known.params.cpu(), mine.params)
+    if known.size != mine.size or (
+        sequence.calibrated  # else the map's is the camera
+        and (known.model != mine.model or not torch.equal(known.params.cpu(), mine.params))
     ):
         raise ResultsError(
             f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
@@ -159,13 +189,14 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
 
 
-def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]:
-    """Evaluate, write, draw; returns the figures."""
+def _write(finished: Run, sequence: Sequence, output: Path, camera: str) -> dict[str, object]:
+    """Evaluate, write, draw; returns the figures. camera: what there is to say of it before the run."""
     figures = metrics(
         finished,
         _evaluate(finished, finished.trajectory, sequence),
         _evaluate(finished, finished.online, sequence),
     )
+    figures["camera"] = "; but over all frames ".join(filter(None, (camera, judged(finished))))
     write_results(finished, sequence, figures, output)
     draw(read_results(output), output)
     return figures

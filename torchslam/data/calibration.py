@@ -12,6 +12,10 @@ from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
+AUTO = "auto"
+"""What is given as a camera where nothing is known about it."""
+
+USUAL_FOCAL = 0.85  # widths of the image: of most phones and webcams it is 0.7 to 1
 EXPECTED = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
 
@@ -52,6 +56,19 @@ class Calibration:
     def camera(self, size: tuple[int, int]) -> Camera:
         """The camera for images of `size` (width, height)."""
         return Camera(self.model, torch.tensor(self.params, dtype=torch.float64), size)
+
+
+class UnknownCamera(Calibration):
+    """Nothing is known: the usual focal length for the size, the centre as principal point, no distortion."""
+
+    def __init__(self) -> None:
+        super().__init__("pinhole", (), AUTO)
+
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """A first guess for images of `size` (width, height)."""
+        width, height = size
+        focal = USUAL_FOCAL * width
+        return Camera.pinhole(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), size=size)
 
 
 def parse_camera(text: str, source: str = "--camera") -> Calibration:

@@ -12,7 +12,7 @@ from torchslam.data.calibration import Calibration, read_calibration
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import numbered_lines
 from torchslam.data.trajectory_file import read_trajectory
-from torchslam.errors import CalibrationError, SequenceError
+from torchslam.errors import MissingCalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
 CALIBRATION_FILES = ("calibration.txt", "calib.txt")
@@ -31,7 +31,7 @@ def open_eth3d_tum(path: Path, camera: Camera | Calibration | None = None) -> Im
     entries = read_image_list(path / "rgb.txt")
     camera = camera if camera is not None else find_calibration(path)
     if camera is None:
-        raise CalibrationError(
+        raise MissingCalibrationError(
             f"{path}: no {' or '.join(CALIBRATION_FILES)} (TUM RGB-D archives carry none); "
             "give the camera with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or as a calibration file"
         )

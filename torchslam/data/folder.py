@@ -9,7 +9,7 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.eth3d_tum import find_calibration
 from torchslam.data.image_file import SUFFIXES
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
-from torchslam.errors import CalibrationError, SequenceError
+from torchslam.errors import MissingCalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
 DEFAULT_RATE = 30.0
@@ -34,7 +34,7 @@ def open_folder(
         raise SequenceError(f"{path}: no images ({', '.join(sorted(SUFFIXES))})")
     camera = camera if camera is not None else find_calibration(path)
     if camera is None:
-        raise CalibrationError(
+        raise MissingCalibrationError(
             f"{path}: a plain image folder says nothing about its camera; "
             "give it with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or put a calibration.txt into the folder"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from torchslam.data.calibration import Calibration, parse_camera, read_calibration
+from torchslam.data.calibration import AUTO, Calibration, UnknownCamera, parse_camera, read_calibration
 from torchslam.data.eth3d_tum import is_eth3d_tum, open_eth3d_tum
 from torchslam.data.euroc import is_euroc, open_euroc
 from torchslam.data.folder import open_folder
@@ -29,7 +29,8 @@ def open_sequence(
 
     path:   an ETH3D, TUM, KITTI or EuRoC folder, a plain folder of images, a video file, or `synthetic:room`
     camera: a Camera, `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or a calibration file; overrides the calibration found
-            at `path`, needed where there is none: plain folders, videos, TUM folders
+            at `path`, needed where there is none: plain folders, videos, TUM folders. "auto" for a first guess,
+            for `torchslam.calibration.calibrate` to start at
     fps:    frames per second, for plain folders (default 30) and videos (default their own)
     limit, stride: at most `limit` frames, every `stride`-th one
 
@@ -40,6 +41,7 @@ def open_sequence(
     if isinstance(camera, str | Path):
         camera = _calibration(camera)
     sequence = _open(path, camera, fps)
+    sequence.calibrated = not isinstance(camera, UnknownCamera)
     if limit is None and stride == 1:
         return sequence
     return sequence.part(stop=None if limit is None else limit * stride, stride=stride)
@@ -47,6 +49,9 @@ def open_sequence(
 
 def _open(path: str | Path, camera: Camera | Calibration | None, fps: float | None) -> Sequence:
     if str(path).startswith("synthetic:"):
+        if isinstance(camera, UnknownCamera):
+            rendered = open_synthetic(str(path))
+            return rendered.with_camera(camera.camera(rendered.size))
         if camera is not None:
             raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
         return open_synthetic(str(path))
@@ -67,5 +72,7 @@ def _open(path: str | Path, camera: Camera | Calibration | None, fps: float | No
 
 
 def _calibration(camera: str | Path) -> Calibration:
-    """A camera given as text: the name of a file, or the numbers themselves."""
+    """A camera given as text: "auto", the name of a file, or the numbers themselves."""
+    if camera == AUTO:
+        return UnknownCamera()
     return read_calibration(camera) if Path(camera).is_file() else parse_camera(str(camera))

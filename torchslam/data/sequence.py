@@ -24,6 +24,7 @@ class Sequence(ABC):
     name:        what the sequence is called
     kind:        what it was read from, in words
     camera:      intrinsics, with the size of the images
+    calibrated:  whether it is known; if not, the camera is a first guess
     timestamps:  (N,) float64 seconds, strictly increasing
     groundtruth: the true trajectory at its own rate, or None
     """
@@ -34,6 +35,7 @@ class Sequence(ABC):
         self.name = name
         self.kind = kind
         self.camera = camera
+        self.calibrated = True
         self.timestamps = timestamps
         self.groundtruth = groundtruth
         self._T_cw: Tensor | None = None
@@ -87,6 +89,12 @@ class Sequence(ABC):
             raise SequenceError(f"{self.name}: no frames left of {len(self)}")
         return _Part(self, indices)
 
+    def with_camera(self, camera: Camera) -> Sequence:
+        """The same frames, taken with another camera, which is known."""
+        same = self.part()
+        same.camera, same.calibrated = camera, True
+        return same
+
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) in pixels."""
@@ -114,7 +122,7 @@ class Sequence(ABC):
             "frames": str(len(self)),
             "size": f"{self.size[0]}x{self.size[1]}",
             "rate": f"{self.frame_rate:.2f} Hz over {duration:.2f} s",
-            "camera": f"{self.camera.model} {numbers}",
+            "camera": f"{self.camera.model} {numbers}" if self.calibrated else "unknown",
             "ground truth": truth,
         }
 
@@ -126,6 +134,7 @@ class _Part(Sequence):
         super().__init__(
             whole.name, whole.kind, whole.camera, whole.timestamps[list(indices)], whole.groundtruth
         )
+        self.calibrated = whole.calibrated
         self._whole = whole
         self._indices = indices
 

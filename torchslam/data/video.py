@@ -13,7 +13,7 @@ from torchslam.data.calibration import Calibration, fit_camera
 from torchslam.data.folder import DEFAULT_RATE
 from torchslam.data.image_file import grey_to_tensor
 from torchslam.data.sequence import Sequence
-from torchslam.errors import CalibrationError, FrameError, SequenceError
+from torchslam.errors import FrameError, MissingCalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
 SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
@@ -25,7 +25,7 @@ class VideoSequence(Sequence):
     def __init__(self, path: Path, camera: Camera | Calibration | None, rate: float | None = None) -> None:
         """Raises SequenceError for a file that holds no video, CalibrationError without a fitting camera."""
         if camera is None:
-            raise CalibrationError(
+            raise MissingCalibrationError(
                 f"{path}: a video says nothing about its camera; "
                 "give it with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or as a calibration file"
             )

@@ -110,6 +110,7 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
         "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
     }
     rows |= _beside(figures)
+    rows |= {"camera": figures["camera"]} if figures.get("camera") else {}
     rows |= {
         "speed": f"{figures['fps']:.1f} frames/s; {figures['ms_median']:.0f} ms a frame (median), "
         f"{figures['ms_p95']:.0f} ms (95th percentile)",

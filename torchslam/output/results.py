@@ -28,6 +28,7 @@ OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the world of that number
 ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
+CALIBRATION = "calibration.txt"  # where the camera was found by the images
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"

@@ -93,7 +93,7 @@ def bundle_adjust(
     problem: BundleProblem,
     kernel: Kernel = "huber",
     scale: Tensor | float = 1.0,
-    free_camera: bool = False,
+    free_camera: bool | Tensor = False,
     backward: Backward = "implicit",
     iterations: int = 20,
     tolerance: float = 1e-8,
@@ -101,6 +101,8 @@ def bundle_adjust(
 ) -> BundleSolution:
     """Minimise robust reprojection errors over poses, points and, if `free_camera`, the camera's parameters.
 
+    free_camera: True: all K of them; a tensor (K, n): along its n columns alone, and covariances are of the steps
+              along these
     scale:    of the kernel, in units of the whitened residual: a number or a scalar tensor
     backward: how gradients reach pixels, weights, camera.params (unless free), scale, fixed poses and fixed points, see
               `implicit.Backward`. The gradient ends at the start values of what moves.

@@ -12,6 +12,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
 from torchslam.solvers.assembly import assemble
 from torchslam.solvers.residuals import (
+    Expansion,
     Linearization,
     Observations,
     exact_expansion,
@@ -123,9 +124,17 @@ class Bundle:
     """A bundle adjustment for `levenberg.minimize` (a batch of one), and what follows from its minimum."""
 
     def __init__(
-        self, layout: Layout, inputs: Inputs, camera: Camera, kernel: Kernel, free_camera: bool
+        self, layout: Layout, inputs: Inputs, camera: Camera, kernel: Kernel, free_camera: bool | Tensor
     ) -> None:
-        self.layout, self.free_camera = layout, free_camera
+        """free_camera: whether all parameters (K,) move, or the directions (K, n) in which they do."""
+        self.layout, self.free_camera = layout, free_camera is not False
+        self.directions = free_camera if isinstance(free_camera, Tensor) else None
+        self.columns: Tensor | None = (
+            None  # (3 + K, 3 + n) from the point and the directions to the parameters
+        )
+        if self.directions is not None:
+            eye = torch.eye(3, dtype=self.directions.dtype, device=self.directions.device)
+            self.columns = torch.block_diag(eye, self.directions)
         self.observations = Observations(
             inputs.pixels.index_select(0, layout.observations),
             inputs.weights.index_select(0, layout.observations),
@@ -150,11 +159,19 @@ class Bundle:
         decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
         moved = retract(estimate.T_cw.index_select(0, frames), -step.frames)
-        params = estimate.params - step.camera if self.free_camera else estimate.params
+        params = estimate.params - self._along(step.camera) if self.free_camera else estimate.params
         return (
             Estimate(estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params),
             decrease[None],
         )
+
+    def _along(self, step: Tensor) -> Tensor:
+        """(K,) how a step (n,) changes the camera's parameters."""
+        return step if self.directions is None else self.directions @ step
+
+    def _across(self, gradient: Tensor) -> Tensor:
+        """(n,) of a gradient in the camera's parameters (K,)."""
+        return gradient if self.directions is None else gradient @ self.directions
 
     def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
         return new if bool(accept) else old
@@ -214,7 +231,8 @@ class Bundle:
         points_w = estimate.points_w.index_select(0, self.layout.point_index)
         R_cw = T_cw[:, :3, :3]
         points_c = (R_cw @ points_w[..., None]).squeeze(-1) + T_cw[:, :3, 3]
-        return linearize(self._observations(estimate), points_c, self.free_camera), points_c, R_cw
+        lin = linearize(self._observations(estimate), points_c, self.free_camera)
+        return lin if self.columns is None else lin._replace(J=lin.J @ self.columns), points_c, R_cw
 
     def _observations(self, estimate: Estimate) -> Observations:
         if not self.free_camera:
@@ -225,6 +243,9 @@ class Bundle:
     def _exact_equations(self, estimate: Estimate) -> NormalEquations:
         _, points_c, R_cw = self._linearize(estimate)
         expansion = exact_expansion(self._observations(estimate), points_c, self.free_camera)
+        if self.columns is not None:
+            gradient, hessian = expansion
+            expansion = Expansion(gradient @ self.columns, self.columns.mT @ hessian @ self.columns)
         layout = self.layout
         return assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
 
@@ -234,15 +255,18 @@ class Bundle:
         return Tangent(
             pull_back(estimate.T_cw[frames], gradient.T_cw[frames]),
             gradient.points_w,
-            gradient.params if self.free_camera else gradient.params[:0],
+            self._across(gradient.params) if self.free_camera else gradient.params[:0],
         )
 
     def at_minimum(self, minimum: Estimate) -> Estimate:
         """The minimum where things move, the inputs, with their graph, where they are fixed."""
         frames = torch.zeros(len(minimum.T_cw), dtype=torch.bool, device=minimum.T_cw.device)
         frames[self.layout.free_frames] = True
+        params = minimum.params if self.free_camera else self.start.params
+        if self.directions is not None:  # what does not move of the parameters reaches them unchanged
+            params = params + (self.start.params - self.start.params.detach())
         return Estimate(
             torch.where(frames[:, None, None], minimum.T_cw, self.start.T_cw),
             torch.where(self.layout.free_points[:, None], minimum.points_w, self.start.points_w),
-            minimum.params if self.free_camera else self.start.params,
+            params,
         )

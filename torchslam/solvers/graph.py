@@ -143,7 +143,7 @@ def solve(
     graph: ObservationGraph,
     kernel: Kernel = "huber",
     scale: Tensor | float = 2.45,
-    free_camera: bool = False,
+    free_camera: bool | Tensor = False,
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-10,
@@ -157,7 +157,7 @@ def solve(
     worlds, and for `free_camera` with several worlds, of which each would find a camera of its own.
     """
     worlds = graph.worlds
-    if free_camera and len(worlds) > 1:
+    if free_camera is not False and len(worlds) > 1:
         raise ValueError("a free camera needs a graph of one world")
     solved = graph.points_w.new_zeros(len(graph.points_w), dtype=torch.int64)
     T_cw, points_w = graph.T_cw.detach(), graph.points_w.detach()

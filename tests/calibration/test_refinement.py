@@ -1,0 +1,109 @@
+"""The camera of a graph: known cameras, errors that tell the truth, motions that leave it open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchslam.calibration import refine
+from torchslam.calibration.keyframes import frames_of
+from torchslam.geometry import Camera
+from torchslam.solvers.graph import ObservationGraph
+
+Make = Callable[..., ObservationGraph]
+
+
+def straight(camera: Camera, factor: float = 1.0) -> Camera:
+    """`factor` times the focal length, no distortion."""
+    return Camera.pinhole(factor * camera.fx, factor * camera.fy, camera.cx, camera.cy, camera.size)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_exact_pixels_give_the_camera(simulated: Make, truth: Camera, factor: float) -> None:
+    """Focal length and both coefficients from none, the ratio of fx to fy and the rest as they are."""
+    params = torch.cat([factor * truth.params[:2], truth.params[2:4], torch.zeros(2), truth.params[6:]])
+    start = truth.with_params(params.double())
+    refined = refine(replace(simulated(), camera=start), start, radial=2)
+    assert refined.num_radial == 2
+    torch.testing.assert_close(refined.camera.params, truth.params, rtol=1e-3, atol=1e-5)
+    assert refined.cost < 1e-3 * refined.cost_before
+
+
+def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make, truth: Camera) -> None:
+    pinhole = straight(truth)
+    refined = refine(replace(simulated(pinhole, noise=0.5), camera=straight(truth, 0.9)), pinhole, radial=2)
+    assert refined.num_radial == 0
+    assert refined.camera.model == "pinhole"
+    assert float(refined.camera.focal) == pytest.approx(float(truth.focal), rel=5e-3)
+    torch.testing.assert_close(refined.camera.params[2:], pinhole.params[2:])
+    params = torch.tensor([400.0, 404.0, 320.0, 240.0, -0.3, 0.4, 0, 0, 0], dtype=torch.float64)
+    bent = simulated(truth.with_params(params), noise=0.1)
+    assert refine(bent, pinhole, radial=2).num_radial == 2
+    assert refine(bent, pinhole, radial=1).num_radial == 1
+
+
+def test_distortion_stays_as_given_where_it_is_not_free(simulated: Make, truth: Camera) -> None:
+    refined = refine(simulated(noise=0.3))
+    torch.testing.assert_close(refined.camera.params[2:], truth.params[2:])
+    assert refined.std == pytest.approx(refined.given_rest)
+
+
+@pytest.mark.parametrize("frames", [8, 24])
+def test_formal_errors_are_those_of_many_trials(simulated: Make, truth: Camera, frames: int) -> None:
+    """Where the noise is what the error assumes it is about right, and in a short way on the safe side."""
+    off, stds = [], []
+    for seed in range(12):
+        refined = refine(simulated(straight(truth), noise=0.5, frames=frames, seed=seed))
+        off.append(math.log(float(refined.camera.focal / truth.focal)))
+        stds.append(refined.given_rest)
+    rms = math.sqrt(sum(x * x for x in off) / len(off))
+    assert 0.2 < rms / (sum(stds) / len(stds)) < 1.5
+
+
+def test_what_is_held_fixed_counts(simulated: Make, truth: Camera) -> None:
+    """A principal point that is one standard error off moves the focal length by no more than it says."""
+    graph = simulated(straight(truth), noise=0.2, frames=24)
+    refined = refine(graph, straight(truth), radial=2)
+    assert refined.std > refined.given_rest
+    moved = straight(truth).params + torch.tensor([0, 0, 6.4, 6.4], dtype=torch.float64)
+    other = refine(replace(graph, camera=straight(truth).with_params(moved)), straight(truth), radial=0)
+    assert abs(math.log(float(other.camera.focal / refined.camera.focal))) < 3 * refined.std
+
+
+def test_parts_of_the_way_that_disagree_make_it_less_certain(simulated: Make, truth: Camera) -> None:
+    graph = simulated(straight(truth), noise=0.2, frames=24)
+    centre = straight(truth).params[2:4]
+    later = (graph.frame_index >= 12)[:, None]
+    zoomed = torch.where(later, centre + 1.05 * (graph.pixels - centre), graph.pixels)
+    assert refine(replace(graph, pixels=zoomed)).given_rest > 4 * refine(graph).given_rest
+
+
+def test_a_straight_way_without_turns_leaves_it_open(simulated: Make, truth: Camera) -> None:
+    twists = torch.zeros(16, 6, dtype=torch.float64)
+    twists[:, 2] = torch.linspace(0, 1.5, 16)
+    graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
+    refined = refine(replace(graph, camera=straight(truth, 0.9)), straight(truth), radial=2)
+    assert not refined.is_determined
+    turning = refine(simulated(straight(truth), noise=0.5, frames=16), straight(truth), radial=2)
+    assert turning.is_determined
+
+
+def test_few_keyframes_have_frames_between_them_counted(simulated: Make, truth: Camera) -> None:
+    graph = simulated(straight(truth), frames=40)
+    few = replace(graph, is_keyframe=torch.arange(40) % 13 == 0)
+    frames = frames_of(few)
+    assert set(range(0, 40, 13)) <= set(frames.tolist())
+    assert 20 <= len(frames) <= 24
+    assert frames.tolist() == sorted(frames.tolist())
+    many = replace(graph, is_keyframe=torch.arange(40) < 30)
+    assert frames_of(many).tolist() == list(range(30))
+
+
+def test_the_largest_world_is_asked(simulated: Make, truth: Camera) -> None:
+    graph = simulated(straight(truth), frames=40)
+    worlds = replace(graph, world=(torch.arange(40) >= 10).long())
+    assert frames_of(worlds).tolist() == list(range(10, 40))

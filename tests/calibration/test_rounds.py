@@ -1,0 +1,104 @@
+"""Runs and refinements in turns, on simulated features of a known camera; and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.walks import Walk, arc, turn
+from torchslam.calibration import Calibrated, Refinement, Round, calibrate
+from torchslam.calibration.words import contradiction, in_words
+from torchslam.config import Config, load_config
+from torchslam.data.sequence import Sequence
+from torchslam.front_end import Extractor, simulated_extractor
+from torchslam.geometry import Camera
+from torchslam.run import true_poses
+
+CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
+
+
+def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config, Extractor]:
+    """A walk with `CAMERA`, of which the sequence does not know."""
+    settings = ["features.num_keypoints=200", "simulated.points_per_view=90", "simulated.noise_px=0.3"]
+    config = load_config(None, ["features.kind=simulated", *settings])
+    path = Walk(poses).with_camera(CAMERA)
+    extractor = simulated_extractor(config, CAMERA, true_poses(path))
+    unknown = path.with_camera(
+        CAMERA.with_params(CAMERA.params * torch.tensor([share * 1.6] * 2 + [1.0] * 2))
+    )
+    unknown.calibrated = False
+    return unknown, config, extractor
+
+
+def test_the_focal_length_is_found_from_nothing() -> None:
+    unknown, config, extractor = walk(arc(22, 2.2))
+    told: list[Round] = []
+    found = calibrate(unknown, config, extractor=extractor, told=told.append)
+    assert found.is_determined
+    assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
+    assert found.rounds == told
+    assert [round(float(each.camera.focal) / 320, 3) for each in told[:2]] == [0.85, 0.6]
+    assert found.refined is not None
+    assert abs(float(found.camera.focal) - 200.0) < 3 * found.refined.std * 200.0
+    assert in_words(found).startswith("focal length ")
+    assert len(unknown) == 22  # and the sequence is as it was
+    assert not unknown.calibrated
+
+
+def test_a_given_camera_is_refined_without_guessing() -> None:
+    unknown, config, extractor = walk(arc(22, 2.2), share=0.55)
+    given = unknown.with_camera(unknown.camera)
+    found = calibrate(given, config, radial=0, guess=False, extractor=extractor)
+    assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
+    assert len(found.rounds) < 4
+
+
+def test_a_camera_that_only_turns_stays_unknown() -> None:
+    unknown, config, extractor = walk(turn(14))
+    found = calibrate(unknown, config, extractor=extractor)
+    assert not found.is_determined
+    assert found.camera is unknown.camera or float(found.camera.focal) == float(unknown.camera.focal)
+    assert "a guess, which may be wrong by a factor of two" in in_words(found)
+
+
+def refinement(focal: float, std: float, drop: float = 0.0) -> Refinement:
+    camera = CAMERA.with_params(CAMERA.params * torch.tensor([focal / 200] * 2 + [1.0] * 2))
+    return Refinement(camera, 0, std, std, (), 1.0 - drop, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("focal", "std", "drop", "said"),
+    [
+        (200.5, 1e-5, 0.0, False),  # certain, but nobody minds
+        (210.0, 0.01, 0.0, True),
+        (205.0, 0.01, 0.01, False),  # within the error
+        (240.0, 0.1, 0.05, True),  # uncertain, but the residuals are clearly smaller
+        (240.0, 0.1, 0.01, False),
+        (204.0, 0.1, 0.05, False),
+    ],
+)
+def test_a_contradicted_camera_is_named(focal: float, std: float, drop: float, said: bool) -> None:
+    words = contradiction(CAMERA, refinement(focal, std, drop))
+    error = focal * std
+    expected = f"with a focal length of {focal:.0f} ± {error:.0f} px than with 200"
+    assert words.endswith(expected) if said else not words
+
+
+def test_words_for_what_is_not_determined() -> None:
+    vague = refinement(200.0, 0.12)
+    found = Calibrated(vague.camera, vague, [])
+    assert not found.is_determined
+    assert "may be wrong by 24 %" in in_words(found)
+    assert "a factor of two" in in_words(replace(found, refined=refinement(200.0, 0.7)))
+    far = refinement(2000.0, 0.01)  # beyond the bounds
+    assert not far.is_determined
+    bent = CAMERA.params.new_tensor([200.0, 200.0, 160.0, 120.0, -0.2, 0.05, 0, 0, 0])
+    sure = replace(
+        refinement(200.0, 0.02),
+        camera=Camera("radial_tangential", bent, CAMERA.size),
+        num_radial=1,
+        k_std=(0.01,),
+    )
+    assert in_words(Calibrated(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"

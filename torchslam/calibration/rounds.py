@@ -1,0 +1,158 @@
+"""Runs and refinements in turns: a run with the camera as known, the camera from the run's graph, and again.
+
+A wrong camera makes a run choose its matches and outliers wrongly, so its graph alone does not lead all the way. The
+rounds use the first frames of a sequence, and more of them while these do not determine the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from torchslam.calibration.refinement import Refinement, refine
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence
+from torchslam.front_end import Extractor, image_extractor
+from torchslam.geometry import Camera
+from torchslam.run import Run
+from torchslam.slam import SLAM
+from torchslam.values import Features, Frame
+
+# Focal lengths in widths of the image that are tried beside the first one; the first map decides.
+GUESSES = 0.6, 1.2, 1.7
+FIRST_FRAMES, MOST_FRAMES = 80, 800
+FEW_KEYFRAMES = 3  # a map of fewer does not decide
+SETTLED = 5e-3  # change of the focal length that the discrete choices of a run make by themselves
+PRECISE = 0.03  # relative error with which more frames are not worth their time
+MOST_ROUNDS = 10
+SURE, NEAR = 0.05, 0.15  # relative error, and change of the focal length, with which no other guess is tried
+
+
+@dataclass(frozen=True)
+class Round:
+    """A run over the first frames and what its graph says; refined is None where there was no map."""
+
+    camera: Camera
+    frames: int
+    run: Run
+    refined: Refinement | None
+
+    @property
+    def cost(self) -> float:
+        """Per observation with the refined camera, higher where frames have no pose; infinite without a map."""
+        if self.refined is None:
+            return math.inf
+        return self.refined.cost * (self.frames / len(self.run.trajectory)) ** 2
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the images confirm the focal length of the run."""
+        if self.refined is None or not self.refined.is_determined:
+            return False
+        off = math.log(float(self.refined.camera.focal) / float(self.camera.focal))
+        return self.refined.std < SURE and abs(off) < NEAR
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What the rounds came to.
+
+    camera:  the best that is known
+    refined: what the last run says of it; None where there is no map with that camera
+    rounds:  all of them, the guesses first
+    """
+
+    camera: Camera
+    refined: Refinement | None
+    rounds: list[Round]
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the images say what the focal length is."""
+        return self.refined is not None and self.refined.is_determined
+
+
+class Remembered:
+    """An extractor that reads every image once: features do not depend on the camera."""
+
+    def __init__(self, extractor: Extractor) -> None:
+        self.extractor = extractor
+        self.features: dict[int, Features] = {}
+
+    def __call__(self, frame: Frame) -> Features:
+        if frame.index not in self.features:
+            self.features[frame.index] = self.extractor(frame)
+        return self.features[frame.index]
+
+
+def calibrate(
+    sequence: Sequence,
+    config: Config,
+    radial: int = 2,
+    guess: bool = True,
+    device: torch.device | str = "cpu",
+    extractor: Extractor | None = None,
+    told: Callable[[Round], None] | None = None,
+) -> Calibrated:
+    """Find the camera of a sequence, started at the one it has.
+
+    radial: how many coefficients of the distortion may be fitted, where the residuals ask for them
+    guess:  the sequence's camera is a guess: other focal lengths are tried, and no distortion of it is kept
+    extractor: the configured one if None
+    told:   of every round
+
+    Raises KeyboardInterrupt where that ends a run.
+    """
+    extractor = Remembered(extractor or image_extractor(config, device))
+    rounds: list[Round] = []
+    start = sequence.camera.to(torch.float64).to(device)
+
+    def one(camera: Camera, frames: int) -> Round:
+        run = SLAM(camera, config, extractor).run(sequence.part(stop=frames))
+        if run.interrupted:
+            raise KeyboardInterrupt
+        refined = None if run.failure else refine(run.graph, start, radial)
+        rounds.append(Round(camera, frames, run, refined))
+        if told is not None:
+            told(rounds[-1])
+        return rounds[-1]
+
+    most = min(len(sequence), MOST_FRAMES)
+    frames = min(FIRST_FRAMES, most)
+    last = one(start, frames)
+    while guess and frames < most and last.run.map.num_keyframes < FEW_KEYFRAMES:
+        frames = min(2 * frames, most)
+        last = one(start, frames)
+    tried = [last]
+    for share in GUESSES if guess else ():
+        if tried[-1].is_sure:
+            break
+        tried.append(one(_scaled(start, share * start.width / float(start.focal)), frames))
+    last = tried[-1] if tried[-1].is_sure else min(tried, key=lambda each: each.cost)
+    for _ in range(MOST_ROUNDS):
+        if last.refined is None:  # also where a rotation that a wrong camera took for a motion shows as one
+            break
+        camera = last.refined.camera
+        if _alike(camera, last.camera) and last.refined.num_radial == _bends(last.camera, start):
+            if last.refined.std < PRECISE or frames == most:
+                break
+            frames = min(2 * frames, most)
+        last = one(camera, frames)
+    return Calibrated(start if last.refined is None else last.refined.camera, last.refined, rounds)
+
+
+def _scaled(camera: Camera, factor: float) -> Camera:
+    return camera.with_params(torch.cat([factor * camera.params[:2], camera.params[2:]]))
+
+
+def _alike(one: Camera, other: Camera) -> bool:
+    return abs(math.log(float(one.focal) / float(other.focal))) < SETTLED
+
+
+def _bends(camera: Camera, start: Camera) -> int:
+    """How many coefficients of the distortion differ from those of the start."""
+    own, given = (torch.cat([c.params, c.params.new_zeros(2)])[4:6] for c in (camera, start))
+    return int((own != given).sum())

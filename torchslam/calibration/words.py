@@ -1,0 +1,54 @@
+"""What a calibration came to, in words, and whether a run contradicts the camera that it was given."""
+
+from __future__ import annotations
+
+import math
+
+from torchslam.calibration.refinement import Refinement
+from torchslam.calibration.rounds import Calibrated
+from torchslam.geometry import Camera
+
+# When the images contradict a given focal length: by so many standard errors and this share, or by a larger share
+# with a cost that is lower by a share of its own.
+CERTAIN, NOTABLE = 3.0, 0.01
+LARGE, LOWER = 0.03, 0.02
+OPEN = "pure rotation, a straight way and a plane leave it open"
+
+
+def in_words(calibrated: Calibrated) -> str:
+    """The camera that was found and its standard errors, or that it is not determined and how wrong it may be."""
+    camera, refined = calibrated.camera, calibrated.refined
+    if refined is None:
+        return (
+            f"unknown: no map could be made; the focal length of {float(camera.focal):.0f} px is a guess, which may be "
+            "wrong by a factor of two"
+        )
+    if not refined.is_determined:
+        wrong = f"{200 * refined.std:.0f} %" if refined.std < 0.5 else "a factor of two"
+        return (
+            f"not determined by the motion ({OPEN}): the focal length of {float(camera.focal):.0f} px may be wrong "
+            f"by {wrong}"
+        )
+    terms = zip(camera.params[4:6].tolist(), refined.k_std, ("k1", "k2"), strict=False)
+    bends = [f"{name} {k:.3f} ± {std:.3f}" for k, std, name in terms]
+    return ", ".join([f"focal length {_focal(refined, refined.std)}", *(bends or ["no other distortion"])])
+
+
+def contradiction(given: Camera, refined: Refinement) -> str:
+    """That the images agree better with another focal length than the given one, empty where they do not.
+
+    refined: with the focal length alone free
+    """
+    off = abs(math.log(float(refined.camera.focal) / float(given.focal)))
+    lower = 1 - refined.cost / refined.cost_before if refined.cost_before > 0 else 0.0
+    certain = off > max(NOTABLE, CERTAIN * refined.given_rest)
+    if not certain and not (off > LARGE and lower > LOWER):
+        return ""
+    found = _focal(refined, refined.given_rest)
+    return f"the images agree better with a focal length of {found} than with {float(given.focal):.0f}"
+
+
+def _focal(refined: Refinement, std: float) -> str:
+    focal = float(refined.camera.focal)
+    error = focal * std
+    return f"{focal:.0f} ± {error:.0f} px" if error >= 1 else f"{focal:.1f} ± {error:.1f} px"

@@ -1,0 +1,60 @@
+"""The camera of a run: as given, or found by the images before the run begins."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+
+import torch
+
+from torchslam.calibration import Round, calibrate, refine
+from torchslam.calibration.words import contradiction, in_words
+from torchslam.config import Config
+from torchslam.data import Sequence
+from torchslam.data.calibration import read_calibration
+from torchslam.errors import ConfigError
+from torchslam.output.calibration_file import check_replaceable, write_calibration
+from torchslam.output.results import CALIBRATION
+from torchslam.run import Run
+
+
+def find_camera(
+    sequence: Sequence, config: Config, output: Path, device: torch.device, radial: int, resume: bool
+) -> tuple[Sequence, str]:
+    """The sequence with the camera that its images ask for, and what there is to say of it; the file is written.
+
+    radial: how many coefficients of the distortion are free
+    resume: take the camera of the run that this one goes on with
+    """
+    if config.features.kind == "simulated":
+        raise ConfigError("simulated features are made with the camera: there is none to be found")
+    path = output / CALIBRATION
+    check_replaceable(path)
+    if resume and path.exists():
+        found = read_calibration(path).camera(sequence.size)
+        return sequence.with_camera(found), f"as {path} says"
+    with warnings.catch_warnings():  # the run itself will say which frames cannot be read
+        warnings.simplefilter("ignore", UserWarning)
+        calibrated = calibrate(sequence, config, radial, not sequence.calibrated, device, told=_tell)
+    said = in_words(calibrated)
+    frames = calibrated.rounds[-1].frames
+    remarks = [said, f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames"]
+    if calibrated.refined is not None:
+        remarks.append(f"relative standard error of the focal length: {calibrated.refined.std:.2g}")
+    write_calibration(path, calibrated.camera, remarks)
+    print(f"torchslam: camera: {said}", file=sys.stderr)
+    return sequence.with_camera(calibrated.camera), said
+
+
+def judged(finished: Run) -> str:
+    """What the run has against its focal length; empty where it agrees with it, or there is no map."""
+    return "" if finished.failure else contradiction(finished.camera, refine(finished.graph))
+
+
+def _tell(done: Round) -> None:
+    focal, refined = float(done.camera.focal), done.refined
+    asks = (
+        "no map" if refined is None else f"{float(refined.camera.focal):.0f} px, {refined.std:.1%} uncertain"
+    )
+    print(f"torchslam: camera: {done.frames} frames with {focal:.0f} px ask for {asks}", file=sys.stderr)
