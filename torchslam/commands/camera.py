@@ -48,8 +48,10 @@ def find_camera(
 
 
 def judged(finished: Run) -> str:
-    """What the run has against its focal length; empty where it agrees with it, or there is no map."""
-    return "" if finished.failure else contradiction(finished.camera, refine(finished.graph))
+    """What a first session has against its focal length; empty where it agrees with it, or was not finished."""
+    if finished.failure or finished.interrupted or finished.session:
+        return ""
+    return contradiction(finished.camera, refine(finished.graph))
 
 
 def _tell(done: Round) -> None:

@@ -24,9 +24,10 @@ from torchslam.data import Sequence
 from torchslam.data.calibration import AUTO
 from torchslam.errors import ConfigError, MissingCalibrationError, ResultsError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
+from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
-from torchslam.output.results import CHECKPOINT, CONFIG, MAP, read_results, write_results
+from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
@@ -131,11 +132,7 @@ def _sequence(options: argparse.Namespace) -> Sequence:
 def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
-    found = ""
-    if plan.map is None and (plan.refine or not sequence.calibrated):
-        radial = RADIAL if plan.distortion or not sequence.calibrated else 0
-        goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
-        sequence, found = find_camera(sequence, config, plan.output, plan.device, radial, goes_on)
+    sequence, found = _with_camera(sequence, config, plan)
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     with Stopping() as stopping:
@@ -158,6 +155,17 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
         print(f"torchslam: {finished.failure}", file=sys.stderr)
         return NO_MAP
     return DONE
+
+
+def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:
+    """The sequence with the camera of the run, and what there is to say of it where the images found it."""
+    if plan.map is not None or not (plan.refine or not sequence.calibrated):
+        if not plan.resume and is_found(plan.output / CALIBRATION):
+            (plan.output / CALIBRATION).unlink()
+        return sequence, ""
+    radial = RADIAL if plan.distortion or not sequence.calibrated else 0
+    goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
+    return find_camera(sequence, config, plan.output, plan.device, radial, goes_on)
 
 
 def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progressed]:

@@ -16,9 +16,14 @@ NAMES = {
 }
 
 
+def is_found(path: Path) -> bool:
+    """Whether there is a file that `write_calibration` wrote."""
+    return path.exists() and path.read_text(encoding="utf-8", errors="replace").startswith(HEADER)
+
+
 def check_replaceable(path: Path) -> None:
     """Raises ResultsError where a file is in the way that `write_calibration` did not write."""
-    if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(HEADER):
+    if path.exists() and not is_found(path):
         raise ResultsError(f"{path}: a calibration that is not of an earlier run: it is not replaced")
 
 
