@@ -64,14 +64,23 @@ def test_formal_errors_are_those_of_many_trials(simulated: Make, truth: Camera, 
     assert 0.2 < rms / (sum(stds) / len(stds)) < 1.5
 
 
-def test_what_is_held_fixed_counts(simulated: Make, truth: Camera) -> None:
-    """A principal point that is one standard error off moves the focal length by no more than it says."""
-    graph = simulated(straight(truth), noise=0.2, frames=24)
-    refined = refine(graph, straight(truth), radial=2)
-    assert refined.std > refined.given_rest
-    moved = straight(truth).params + torch.tensor([0, 0, 6.4, 6.4], dtype=torch.float64)
-    other = refine(replace(graph, camera=straight(truth).with_params(moved)), straight(truth), radial=0)
-    assert abs(math.log(float(other.camera.focal / refined.camera.focal))) < 3 * refined.std
+def test_a_guessed_centre_moves_as_far_as_the_images_are_sure(simulated: Make, truth: Camera) -> None:
+    """To the true one where the pixels are good, hardly at all where they say nothing, and the error knows."""
+    off = straight(truth).params + torch.tensor([0, 0, 6.0, -5.0], dtype=torch.float64)
+    guess = Camera.pinhole(*off.tolist(), size=truth.size)
+    stds = []
+    for noise, near in ((0.02, 0.6), (4.0, 8.0)):
+        graph = replace(simulated(straight(truth), noise=noise, frames=24), camera=guess)
+        refined = refine(graph, guess, radial=2, centre=True)
+        away = (refined.camera.params[2:4] - truth.params[2:4]).abs()
+        assert (away < near).all()
+        assert (refined.camera.params[2:4] - off[2:4]).norm() < 9
+        assert abs(math.log(float(refined.camera.focal / truth.focal))) < 3 * refined.std
+        assert refined.std >= refined.given_rest
+        stds.append(refined.std)
+    assert stds[0] < 0.2 * stds[1]
+    held = refine(graph, guess, radial=2)
+    torch.testing.assert_close(held.camera.params[2:4], off[2:4])
 
 
 def test_parts_of_the_way_that_disagree_make_it_less_certain(simulated: Make, truth: Camera) -> None:
@@ -86,7 +95,7 @@ def test_a_straight_way_without_turns_leaves_it_open(simulated: Make, truth: Cam
     twists = torch.zeros(16, 6, dtype=torch.float64)
     twists[:, 2] = torch.linspace(0, 1.5, 16)
     graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
-    refined = refine(replace(graph, camera=straight(truth, 0.9)), straight(truth), radial=2)
+    refined = refine(replace(graph, camera=straight(truth, 0.9)), straight(truth), radial=2, centre=True)
     assert not refined.is_determined
     turning = refine(simulated(straight(truth), noise=0.5, frames=16), straight(truth), radial=2)
     assert turning.is_determined

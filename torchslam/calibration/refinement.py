@@ -4,7 +4,7 @@ The least cost of a graph, over its poses and points, is a function of the camer
 bundle adjustment in which focal length and distortion move, too, poses and points eliminated by the Schur complement.
 
 The formal standard error counts every pixel as an error of its own. Real ones err together, so it is scaled by how much
-parts of the way disagree (the ratio of Birge, 1932), and what the fit holds fixed adds what it would change: the
+parts of the way disagree (the ratio of Birge, 1932), and what the fit holds fixed adds what it would change: a guessed
 principal point, and a bend of the lens that is left out.
 """
 
@@ -24,6 +24,7 @@ from torchslam.calibration.keyframes import (
     K1,
     K2,
     adjust,
+    directions,
     part_of,
     problem_of,
     simplest,
@@ -71,13 +72,16 @@ class Refinement:
         return self.std < UNDETERMINED and low < float(self.camera.focal) / self.camera.width < high
 
 
-def refine(graph: ObservationGraph, straight: Camera | None = None, radial: int = 0) -> Refinement:
+def refine(
+    graph: ObservationGraph, start: Camera | None = None, radial: int = 0, centre: bool = False
+) -> Refinement:
     """Fit focal length and, where the residuals ask for them, up to `radial` coefficients to a run's graph.
 
-    straight: whose distortion is kept where none is fitted; that of the graph's camera if None
+    start:  whose distortion is kept where none is fitted, the graph's camera if None
+    centre: its principal point is a guess, too: the images move it as far as they are surer than the guess
     """
     camera = with_radial_terms(graph.camera)
-    base = camera if straight is None else with_radial_terms(straight)
+    base = camera if start is None else with_radial_terms(start)
     problem = problem_of(replace(graph, camera=camera))
     fits = []
     for n in range(radial + 1):
@@ -89,15 +93,15 @@ def refine(graph: ObservationGraph, straight: Camera | None = None, radial: int 
     count = max(1, int(best.moved_points[problem.point_index].sum()))
     at = replace(problem, T_cw=best.T_cw, points_w=best.points_w, camera=best.camera)
     doubt = _disagreement(at, _fitted(num_radial))
-    held = {} if radial == 0 else {CX: CENTRE_STD, CY: CENTRE_STD}
     bend = float((fits[1].camera.params - base.params)[4]) if radial and not num_radial else None
-    covariance, std = _errors(at, _fitted(num_radial), doubt, held, bend)
+    guess = base.params[2:4] if centre else None
+    params, stds, given_rest = _with_the_rest(at, _fitted(num_radial), doubt, bend, guess)
     return Refinement(
-        simplest(best.camera),
+        simplest(best.camera.with_params(params)),
         num_radial,
-        std,
-        doubt * math.sqrt(float(covariance[0, 0])),
-        tuple((doubt * covariance.diagonal()[1:].sqrt()).tolist()),
+        stds[0],
+        given_rest,
+        tuple(stds[1:]),
         costs[num_radial] / count,
         float(fits[-1].convergence.initial_cost) / count,
     )
@@ -107,32 +111,40 @@ def _fitted(num_radial: int) -> list[int]:
     return [FOCAL, K1, K2][: 1 + num_radial]
 
 
-def _errors(
-    at: BundleProblem,
-    fitted: list[int],
-    doubt: float,
-    held: dict[int, float],
-    bend: float | None,
-) -> tuple[Tensor, float]:
-    """Formal covariance (n, n) of what was fitted, and the relative error of the focal length with what was not.
+def _with_the_rest(
+    at: BundleProblem, fitted: list[int], doubt: float, bend: float | None, guess: Tensor | None
+) -> tuple[Tensor, list[float], float]:
+    """The parameters (K,) once the centre has moved, their errors, and that of the focal length given the rest.
 
-    at:    the problem at its solution
-    doubt: factor on the formal errors; held: standard errors of parameters that were held fixed
+    What was fitted follows what was held in proportion; the centre is the mean of the guess and of what the images say
+    of it, weighted by how sure they are.
+
+    at:    the problem at its solution; doubt: factor on the formal errors
     bend:  k1 by a fit that was not believed, where there was one
+    guess: (2,) the principal point before the images were asked; None where it is given
     """
-    others = [K1] * (bend is not None) + list(held)
-    covariance = adjust(at, fitted + others, iterations=0).covariance().camera
-    n = len(fitted)
+    n, k, centre = len(fitted), int(bend is not None), [CX, CY] if guess is not None else []
+    which = fitted + [K1] * k + centre
+    free = adjust(at, which)
+    covariance = doubt**2 * free.covariance().camera
     if not bool((covariance.diagonal() > 0).all()):
-        return torch.full_like(covariance[:n, :n], math.inf), math.inf
+        return at.camera.params, [math.inf] * n, math.inf
     information = torch.linalg.inv(covariance)
-    given_rest = torch.linalg.inv(information[:n, :n])
-    follows = (given_rest @ information[:n, n:])[0]  # how the focal length follows what is held
-    stds = [held.get(which, 0.0) for which in others]
+    own = torch.linalg.inv(information[:n, :n])
+    follows = -own @ information[:n, n:]
+    held = torch.zeros_like(information[n:, n:])
+    move = at.camera.params.new_zeros(len(which))
     if bend is not None:
-        stds[0] = min(K1_STD, math.hypot(bend, doubt * math.sqrt(float(covariance[n, n]))))
-    variance = doubt**2 * given_rest[0, 0] + (follows * follows.new_tensor(stds)).square().sum()
-    return given_rest, math.sqrt(float(variance))
+        held[0, 0] = min(K1_STD, math.hypot(bend, float(covariance[n, n].sqrt()))) ** 2
+    if guess is not None:
+        said = torch.linalg.inv(covariance[n + k :, n + k :])
+        prior = torch.eye(2, dtype=said.dtype, device=said.device) / CENTRE_STD**2
+        held[k:, k:] = torch.linalg.inv(said + prior)
+        found = guess + held[k:, k:] @ said @ (free.camera.params[2:4] - guess)
+        move[n + k :] = (found - at.camera.params[2:4]) / at.camera.width
+    move[:n] = follows @ move[n:]
+    stds = (own + follows @ held @ follows.mT).diagonal().sqrt().tolist()
+    return at.camera.params + directions(at.camera, which) @ move, stds, math.sqrt(float(own[0, 0]))
 
 
 def _disagreement(at: BundleProblem, fitted: list[int]) -> float:

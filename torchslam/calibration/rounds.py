@@ -100,7 +100,7 @@ def calibrate(
     """Find the camera of a sequence, started at the one it has.
 
     radial: how many coefficients of the distortion may be fitted, where the residuals ask for them
-    guess:  the sequence's camera is a guess: other focal lengths are tried, and no distortion of it is kept
+    guess:  the sequence's camera is a guess: other focal lengths are tried, and its principal point may move
     extractor: the configured one if None
     told:   of every round
 
@@ -114,7 +114,7 @@ def calibrate(
         run = SLAM(camera, config, extractor).run(sequence.part(stop=frames))
         if run.interrupted:
             raise KeyboardInterrupt
-        refined = None if run.failure else refine(run.graph, start, radial)
+        refined = None if run.failure else refine(run.graph, start, radial, guess)
         rounds.append(Round(camera, frames, run, refined))
         if told is not None:
             told(rounds[-1])
