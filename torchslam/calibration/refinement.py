@@ -54,7 +54,7 @@ class Refinement:
     std:         relative standard error of the focal length, with all that is not certain
     given_rest:  the same if principal point and distortion are as they are said to be
     k_std:       standard errors of the coefficients that were fitted
-    cost, cost_before: per observation, with this camera and with the one of the run
+    cost, cost_before: the least ones per observation, with this camera and with the one of the run
     """
 
     camera: Camera
@@ -93,6 +93,8 @@ def refine(
     count = max(1, int(best.moved_points[problem.point_index].sum()))
     at = replace(problem, T_cw=best.T_cw, points_w=best.points_w, camera=best.camera)
     doubt = _disagreement(at, _fitted(num_radial))
+    if int(graph.is_keyframe.sum()) < 2 * PART_KEYFRAMES:  # frames between the same keyframes err together
+        doubt = max(doubt, UNCHECKED)
     bend = float((fits[1].camera.params - base.params)[4]) if radial and not num_radial else None
     guess = base.params[2:4] if centre else None
     params, stds, given_rest = _with_the_rest(at, _fitted(num_radial), doubt, bend, guess)
@@ -103,7 +105,7 @@ def refine(
         given_rest,
         tuple(stds[1:]),
         costs[num_radial] / count,
-        float(fits[-1].convergence.initial_cost) / count,
+        float(adjust(problem, []).cost) / count,
     )
 
 

@@ -1,5 +1,7 @@
 """Run SLAM on a sequence and write trajectory, map, figures and pictures.
 
+Without a calibration, and with `--camera auto`, the images say what the camera is: calibration.txt in the results.
+
 Exit status: 0 done, 2 an error, 3 no map could be initialised or no frame be localised; 130 and 143 ended by Ctrl-C
 and by SIGTERM (what there is by then is written, and --resume goes on from the last checkpoint).
 """
