@@ -44,7 +44,7 @@ def find_camera(
         remarks.append(f"relative standard error of the focal length: {calibrated.refined.std:.2g}")
     write_calibration(path, calibrated.camera, remarks)
     print(f"torchslam: camera: {said}", file=sys.stderr)
-    return sequence.with_camera(calibrated.camera), said
+    return sequence.with_camera(calibrated.camera.to("cpu")), said
 
 
 def judged(finished: Run) -> str:
