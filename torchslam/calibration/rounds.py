@@ -25,7 +25,9 @@ from torchslam.values import Features, Frame
 GUESSES = 0.6, 1.2, 1.7
 FIRST_FRAMES, MOST_FRAMES = 80, 800
 FEW_KEYFRAMES = 3  # a map of fewer does not decide
-SETTLED = 5e-3  # change of the focal length that the discrete choices of a run make by themselves
+# Change of the focal length that the discrete choices of a run make by themselves, and that is not worth another run,
+# as a share of its error.
+SETTLED, SETTLED_SHARE = 5e-3, 0.3
 PRECISE = 0.03  # relative error with which more frames are not worth their time
 MOST_ROUNDS = 10
 SURE, NEAR = 0.05, 0.15  # relative error, and change of the focal length, with which no other guess is tried
@@ -136,7 +138,9 @@ def calibrate(
         if last.refined is None:  # also where a rotation that a wrong camera took for a motion shows as one
             break
         camera = last.refined.camera
-        if _alike(camera, last.camera) and last.refined.num_radial == _bends(last.camera, start):
+        moved = abs(math.log(float(camera.focal) / float(last.camera.focal)))
+        settled = moved < max(SETTLED, SETTLED_SHARE * last.refined.std)
+        if settled and last.refined.num_radial == _bends(last.camera, start):
             if last.refined.std < PRECISE or frames == most:
                 break
             frames = min(2 * frames, most)
@@ -146,10 +150,6 @@ def calibrate(
 
 def _scaled(camera: Camera, factor: float) -> Camera:
     return camera.with_params(torch.cat([factor * camera.params[:2], camera.params[2:]]))
-
-
-def _alike(one: Camera, other: Camera) -> bool:
-    return abs(math.log(float(one.focal) / float(other.focal))) < SETTLED
 
 
 def _bends(camera: Camera, start: Camera) -> int:
