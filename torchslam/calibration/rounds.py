@@ -28,7 +28,8 @@ FEW_KEYFRAMES = 3  # a map of fewer does not decide
 # Change of the focal length that the discrete choices of a run make by themselves, and that is not worth another run,
 # as a share of its error.
 SETTLED, SETTLED_SHARE = 5e-3, 0.3
-PRECISE = 0.03  # relative error with which more frames are not worth their time
+# Relative error with which more frames are not worth their time: of a camera from nothing, and of one to refine.
+PRECISE, PRECISE_REFINED = 0.01, 0.005
 MOST_ROUNDS = 10
 SURE, NEAR = 0.05, 0.15  # relative error, and change of the focal length, with which no other guess is tried
 
@@ -141,7 +142,7 @@ def calibrate(
         moved = abs(math.log(float(camera.focal) / float(last.camera.focal)))
         settled = moved < max(SETTLED, SETTLED_SHARE * last.refined.std)
         if settled and last.refined.num_radial == _bends(last.camera, start):
-            if last.refined.std < PRECISE or frames == most:
+            if last.refined.std < (PRECISE if guess else PRECISE_REFINED) or frames == most:
                 break
             frames = min(2 * frames, most)
         last = one(camera, frames)
