@@ -84,7 +84,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
         plain = {"T_cw": None, "covariance": None}
         assert replace(after, **plain) == replace(before, **plain, stage_ms=times)
     assert resumed.last_frame == slam.last_frame
-    assert resumed.session == 0
+    assert resumed.session.number == 0
     assert resumed.is_settled
     assert resumed.world is not None
     assert slam.world is not None

@@ -6,26 +6,38 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
-from torchslam.front_end import simulated_extractor
+from torchslam.front_end import Extractor, simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.mapping.local_bundle import adjust_all
+from torchslam.session import Session
 from torchslam.solvers.graph import join, solve
 from torchslam.solvers.levenberg import Progress
-from torchslam.values import State, StepResult, Trajectory
+from torchslam.values import Frame, State, StepResult, Trajectory
 from torchslam.world.history import History, RunGraph
 from torchslam.world.map import Map
 from torchslam.world.world import World
 from torchslam.world.worlds import main_of
 
-if TYPE_CHECKING:
-    from torchslam.slam import SLAM
+
+class System(Protocol):
+    """What a run needs of what it feeds its frames to: of `torchslam.slam.SLAM`."""
+
+    camera: Camera
+    config: Config
+    extractor: Extractor | None
+    session: Session
+    last_frame: tuple[int, float] | None
+
+    def step(self, frame: Frame) -> StepResult: ...
+
+    def settle(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -114,7 +126,7 @@ class Progressed:
 
 
 def run_sequence(
-    slam: SLAM,
+    slam: System,
     sequence: Sequence,
     progress: Callable[[StepResult], None] | None = None,
     so_far: Progressed | None = None,
@@ -157,7 +169,7 @@ def run_sequence(
 
 
 def finish(
-    slam: SLAM,
+    slam: System,
     results: list[StepResult],
     skipped: list[str],
     interrupted: bool,
@@ -167,23 +179,23 @@ def finish(
     with torch.no_grad():
         slam.settle()
     try:
-        for world in slam.worlds:
-            if slam.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
+        for world in slam.session.worlds:
+            if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
                 adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
                 graph = world.history.graph(world.map, slam.camera)
                 world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
     except KeyboardInterrupt:
         interrupted = True
     return Run(
-        tuple(slam.worlds),
+        tuple(slam.session.worlds),
         slam.camera,
         slam.config,
         results,
         skipped,
         interrupted,
         why_no_pose(slam, results, skipped),
-        slam.session,
-        slam.sessions,
+        slam.session.number,
+        slam.session.count,
     )
 
 
@@ -203,11 +215,11 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
     return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
 
 
-def why_no_pose(slam: SLAM, results: list[StepResult], skipped: list[str]) -> str:
+def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> str:
     """Why no frame of the session has a pose, in one sentence; empty where some have."""
-    if len(slam.worlds) == 0:
+    if len(slam.session.worlds) == 0:
         return why_no_map(results, skipped)
-    if any(world.history.count(slam.session) for world in slam.worlds):
+    if any(world.history.count(slam.session.number) for world in slam.session.worlds):
         return ""
     return f"none of {len(results)} frames was recognised in the map"
 

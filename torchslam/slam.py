@@ -14,7 +14,7 @@ import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import ConfigError, ResultsError
+from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
 from torchslam.geometry import Camera
 from torchslam.loops.memory import Memory
@@ -23,6 +23,7 @@ from torchslam.mapping.founding import Founder
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
+from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.backwards import track_back
 from torchslam.tracking.initialization import Initializer
@@ -37,8 +38,6 @@ from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajector
 from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.map_check import why_not_alike
-from torchslam.world.map_file import Saved, read_worlds, write_worlds
-from torchslam.world.track import Track
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
@@ -72,7 +71,7 @@ class SLAM:
         """Forget everything and wait for a new start."""
         # None: `run` makes simulated features from the true poses of the sequence
         self.extractor = self._image_extractor
-        self._enter(Worlds(self.camera.params), session=0, mapping=True)
+        self.enter(Session(self.camera, Worlds(self.camera.params)))
 
     @classmethod
     def load(
@@ -89,46 +88,37 @@ class SLAM:
 
         Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
         """
-        saved = read_worlds(path, device)
-        if not mapping and len(saved.worlds) == 0:
-            raise ResultsError(f"{path}: there is no world in it to localise in")
-        slam = cls(saved.camera, config, extractor)
-        slam.enter(saved, mapping)
-        for world in slam.worlds if mapping else ():
-            world.map.forget_frames()
+        session = Session.load(path, mapping, device)
+        slam = cls(session.camera, config, extractor)
+        slam.enter(session)
         return slam
 
     def save(self, path: str | Path) -> None:
         """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
-        write_worlds(path, self.worlds, self.camera, self.sessions)
+        self.session.save(path)
 
-    @property
-    def sessions(self) -> int:
-        """How many sessions the worlds know."""
-        return self.session + int(self.mapping)
+    def enter(
+        self, session: Session, world: World | None = None, last_frame: tuple[int, float] | None = None
+    ) -> None:
+        """Begin a session, lost at first; or go on in one of its worlds, from where the camera was in `last_frame`.
 
-    def enter(self, saved: Saved, mapping: bool = True) -> None:
-        """Begin a session in saved worlds; `mapping` as in `load`."""
-        self._enter(saved.worlds, saved.sessions, mapping)
-        for world in self.worlds:
-            for keyframe in range(world.map.num_keyframes):
-                self.memory.add(world.map, keyframe)
+        last_frame: index and timestamp
+        """
+        self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
+        self.tracker.counts = session.mapping
+        self.last_frame = last_frame
+        self.memory = Memory(self.camera, self.config, self.worlds)
+        self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
+        self.waiting = Waiting(self.config.initialization.max_waiting)
+        self._seek()
+        self.world: World | None = world  # the one that is followed
+        if world is not None:
+            self.state = State.TRACKING
 
     @property
     def is_settled(self) -> bool:
         """Whether a world is followed that has proved itself, and no frame is held back."""
         return self.world is not None and self.youth is None and not self.probation
-
-    def _enter(self, worlds: Worlds, session: int, mapping: bool) -> None:
-        """Begin a session: which worlds there are, and nothing else."""
-        self.worlds, self.session, self.mapping = worlds, session, mapping
-        self.tracker.counts = mapping
-        self.last_frame: tuple[int, float] | None = None  # index and timestamp
-        self.memory = Memory(self.camera, self.config, self.worlds)
-        self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
-        self.waiting = Waiting(self.config.initialization.max_waiting)
-        self.world: World | None = None  # the one that is followed
-        self._seek()
 
     # --- the way of a frame ----------------------------------------------------------------------------------
 
@@ -147,19 +137,19 @@ class SLAM:
 
     def trajectory(self) -> Trajectory:
         """Every posed frame of this session in its main world, by the map as it is now."""
-        world = self.worlds.main(self.session)
-        return Trajectory.empty() if world is None else world.trajectory(self.session)
+        world = self.worlds.main(self.session.number)
+        return Trajectory.empty() if world is None else world.trajectory(self.session.number)
 
     @property
     def map(self) -> Map:
         """Of the world that is followed, or else of the one with most frames; empty where there is none."""
-        world = self.world or self.worlds.main(self.session)
+        world = self.world or self.worlds.main(self.session.number)
         return Map() if world is None else world.map
 
     @property
     def history(self) -> History:
         """The posed frames of the same world as `map`."""
-        world = self.world or self.worlds.main(self.session)
+        world = self.world or self.worlds.main(self.session.number)
         return History() if world is None else world.history
 
     def _look(self, frame: Frame) -> View:
@@ -172,7 +162,7 @@ class SLAM:
             check_size(frame, self.camera)
         with self.clock("features"):
             view = View.of(frame, self.extractor(frame), self.camera.params)
-            self.seen = replace(view, session=self.session)
+            self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)
             self.last_frame = frame.index, frame.timestamp
@@ -282,11 +272,6 @@ class SLAM:
         self.stillness.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
-
-    def resume(self, world: World, track: Track, last_frame: tuple[int, float]) -> None:
-        """Go on in one of the worlds from where the camera was, as if nothing had happened in between."""
-        world.track = track
-        self.world, self.state, self.last_frame = world, State.TRACKING, last_frame
 
     def _find(self, view: View) -> StepResult:
         """Come back to a known place, or else begin a new world; the frame waits until there is a pose for it."""

@@ -26,6 +26,9 @@ class Memory:
         self.places = Places()
         self.recognizer = Recognizer(camera, config, worlds, self.places)
         self.recalls: list[Recall] = []  # what was recognised so far, for the record
+        for world in worlds:
+            for keyframe in range(world.map.num_keyframes):
+                self.add(world.map, keyframe)
 
     def add(self, slam_map: Map, keyframe: int) -> None:
         """The place of a keyframe can be recognised from now on."""

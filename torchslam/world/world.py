@@ -9,12 +9,6 @@ from torch import Tensor
 
 from torchslam.geometry import rigid, sim3_inverse, sim3_scale, transform
 from torchslam.values import Trajectory
-from torchslam.world.compaction import (
-    Renumbering,
-    drop_dead_points,
-    is_worth_compacting,
-    remove_keyframes,
-)
 from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.track import Track
@@ -80,14 +74,6 @@ class World:
     def move(self, S_ba: Tensor) -> None:
         """Give the world another frame and unit: points p become S_ba p, S_ba (4, 4) a similarity."""
         self.correct(self.map.T_cw @ sim3_inverse(S_ba))
-
-    def remove(self, keyframes: Tensor) -> Renumbering:
-        """Take keyframes (k,) out of the map, see `compaction.remove_keyframes`; returns where rows went."""
-        return remove_keyframes(self, keyframes)
-
-    def compact(self) -> Renumbering | None:
-        """Give back the rows of dead points where that is worth it; returns where rows went, None if they stay."""
-        return drop_dead_points(self) if is_worth_compacting(self) else None
 
     def absorb(self, other: World, S_ab: Tensor) -> None:
         """Take over everything of another world, moved by S_ab (4, 4) into this one; the other is empty afterwards.
