@@ -109,6 +109,29 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
 
+def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk = Gap(arc(60)[:42])
+    with monkeypatch.context() as patch:
+        patch.setattr(SLAM, "conclude", SLAM.settle)
+        without = run_walk(walk)
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    run = slam.run(walk)
+    assert [r.state for r in run.results[-2:]] == [State.UNCERTAIN] * 2
+    assert run.history.frames["frame_index"][-2:].tolist() == [40, 41]
+    assert len(run.trajectory) == 37
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
+    assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
+    assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
+    whole = Gap(arc(60))
+    states = [slam.step(whole[index]).state for index in range(42, 46)]
+    assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
+    assert states[-1] is State.TRACKING
+    frames = slam.history.frames["frame_index"]
+    assert len(torch.unique(frames)) == len(frames) == 41
+
+
 class Glimpse(Walk):
     """From frame 25 on the camera is where nothing was ever seen, but for one frame that shows frame 20 again."""
 

@@ -37,7 +37,7 @@ class System(Protocol):
 
     def step(self, frame: Frame) -> StepResult: ...
 
-    def settle(self) -> None: ...
+    def conclude(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def finish(
 ) -> Run:
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.no_grad():
-        slam.settle()
+        slam.conclude()
     try:
         for world in slam.session.worlds:
             if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:

@@ -335,6 +335,13 @@ class SLAM:
         self.tracker.follow(behind, 0)
         self._pose_waiting(behind, before=int(world.map.keyframes["frame_index"][0]))
 
+    def conclude(self) -> None:
+        """The last frame has come: what is held back keeps its pose, uncertain as it is, and nothing is built on it."""
+        self.settle()
+        for held in self.probation.hand_over():
+            assert self.world is not None  # nothing is held back without one
+            self.world.history.add(*held)
+
     def _track_back(self, world: World, view: View, tracked: Tracked) -> None:
         """Pose the frames that were lost before a frame that was found again."""
         behind = world.aside()
