@@ -14,7 +14,7 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, there_and_elsewhere, turn
 from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
 from torchslam.errors import ConfigError, FrameError
-from torchslam.evaluation import ate
+from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
@@ -193,6 +193,8 @@ def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
     assert set(worlds) == {0, 1}
     assert worlds[0] == worlds[-1] == 0
     assert len(run.worlds) == 1
+    assert sum(len(part) for part in run.online_parts) == len(worlds) > len(run.online)
+    assert ate_apart(run.online_parts, walk.groundtruth) < 0.01
     assert len(run.trajectory) == len(walk)
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 

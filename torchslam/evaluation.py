@@ -7,6 +7,7 @@ Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 20
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -125,6 +126,31 @@ def evaluate(
         groundtruth=Trajectory(times[valid], reference),
         errors_m=errors,
     )
+
+
+def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
+    """The ATE of poses that were given in several worlds: RMS over all of them, metres.
+
+    Each part is aligned by a similarity of its own. When these poses were given, nothing was known of how their worlds
+    lie to each other; what was learned later would either better or worsen what was given then. The price: errors
+    between the parts do not show. Options as `evaluate` has them by default. Parts with fewer than three true poses,
+    which fit any path, are left out; raises TrajectoryError where none is left.
+    """
+    errors = [
+        evaluate(part, groundtruth).errors_m for part in parts if _compared(part, groundtruth) >= MIN_POSES
+    ]
+    if not errors:
+        raise TrajectoryError(
+            f"no world has {MIN_POSES} estimated poses with a true one within {TOLERANCE:g} s"
+        )
+    return float(_rms(torch.cat(errors).square()))
+
+
+def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
+    """How many poses of the estimate have a true one."""
+    truth = Trajectory(groundtruth.timestamps.double(), groundtruth.T_wc.detach().double())
+    times = estimate.timestamps.to(truth.T_wc)
+    return int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum())
 
 
 def ate(

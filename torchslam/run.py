@@ -15,6 +15,8 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
 from torchslam.front_end import Extractor, simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.loops.memory import Memory
+from torchslam.loops.recognition import Recall
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.session import Session
 from torchslam.solvers.graph import join, solve
@@ -33,6 +35,7 @@ class System(Protocol):
     config: Config
     extractor: Extractor | None
     session: Session
+    memory: Memory
     last_frame: tuple[int, float] | None
 
     def step(self, frame: Frame) -> StepResult: ...
@@ -49,6 +52,7 @@ class Run:
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
     failure:     why no frame has a pose; empty when some have
+    recalls:     the places that were recognised, which may have joined worlds
     session:     number of the run among those over the same map; frames and trajectories are those of this session
     sessions:    how many sessions the map has; one that was only localised is none of them
     """
@@ -60,6 +64,7 @@ class Run:
     skipped: list[str]
     interrupted: bool
     failure: str
+    recalls: tuple[Recall, ...] = ()
     session: int = 0
     sessions: int = 1
 
@@ -91,7 +96,24 @@ class Run:
     @property
     def online(self) -> Trajectory:
         """The poses as they were given, frame by frame, in the main world."""
-        number = None if self.main is None else self.main.number
+        return Trajectory.empty() if self.main is None else self._given_in(self.main.number)
+
+    @property
+    def online_parts(self) -> list[Trajectory]:
+        """The poses as they were given: in the main world, and in each world that became a part of it, each in its own.
+
+        What was given in worlds that were taken back, or that are still beside the main one, is not among them.
+        """
+        if self.main is None:
+            return []
+        numbers = [self.main.number]
+        joined = {frozenset((recall.world, recall.other)) for recall in self.recalls}
+        for number in numbers:
+            numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
+        return [part for number in numbers if len(part := self._given_in(number))]
+
+    def _given_in(self, number: int) -> Trajectory:
+        """The poses as they were given in the world of a number."""
         given = [result for result in self.results if result.T_cw is not None and result.world == number]
         if not given:
             return Trajectory.empty()
@@ -194,6 +216,7 @@ def finish(
         skipped,
         interrupted,
         why_no_pose(slam, results, skipped),
+        tuple(slam.memory.recalls),
         slam.session.number,
         slam.session.count,
     )

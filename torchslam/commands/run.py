@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -21,7 +23,7 @@ from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.errors import ConfigError, ResultsError, TrajectoryError
-from torchslam.evaluation import Evaluation, evaluate
+from torchslam.evaluation import ate_apart, evaluate
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CHECKPOINT, CONFIG, MAP, read_results, write_results
@@ -32,6 +34,7 @@ from torchslam.values import StepResult, Trajectory
 DONE = 0
 NO_MAP = 3
 CHECKPOINT_EVERY = 20  # keyframes
+Errors = TypeVar("Errors")
 
 
 @dataclass(frozen=True)
@@ -163,20 +166,20 @@ def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]
     """Evaluate, write, draw; returns the figures."""
     figures = metrics(
         finished,
-        _evaluate(finished, finished.trajectory, sequence),
-        _evaluate(finished, finished.online, sequence),
+        _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
+        _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
     write_results(finished, sequence, figures, output)
     draw(read_results(output), output)
     return figures
 
 
-def _evaluate(finished: Run, trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
-    """The errors against ground truth, where there is one and the run has poses to compare."""
+def _measured(finished: Run, sequence: Sequence, measure: Callable[[Trajectory], Errors]) -> Errors | None:
+    """Errors against ground truth, where there is one and the run has poses to compare."""
     if sequence.groundtruth is None or finished.failure:
         return None
     try:
-        return evaluate(trajectory, sequence.groundtruth)
+        return measure(sequence.groundtruth)
     except TrajectoryError as error:
         print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
         return None
