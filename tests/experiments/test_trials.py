@@ -7,12 +7,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from experiments.trials import edits, outcome
+from experiments.trials import edits, outcome, picture
 from experiments.trials.edited import Edited, Shot, fitted, shots, strangers
 from experiments.trials.faults import FAULTS, halved
 from experiments.trials.gradient import SETTINGS, Round
@@ -375,3 +376,11 @@ def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pyte
     result, _ = outcome.perform(Trial(lambda: made))
     assert (result.ate, result.misled, result.recalls, result.posed, result.possible) == (None, [], [], 0, 3)
     assert "no map was initialised" in cells("x", result, "m")[3]
+
+
+def test_the_picture_of_the_faults_is_small() -> None:
+    path = Path(picture.__file__).with_name("faults.png")
+    drawn = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert drawn is not None
+    assert len(np.unique(drawn)) == picture.GREYS
+    assert path.stat().st_size < 300_000
