@@ -45,7 +45,7 @@ def test_image_lists(tmp_path: Path, text: str) -> None:
 @given(LINES)
 def test_calibrations(text: str) -> None:
     with contextlib.suppress(CalibrationError):
-        camera = parse_camera(text).camera((64, 48))
+        camera = parse_camera(text, (64, 48))
         assert camera.params.isfinite().all()
         assert (camera.params[:2] > 0).all()
 

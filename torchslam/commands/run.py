@@ -108,7 +108,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     with Stopping() as stopping:
-        bar = ProgressBar(len(sequence), lambda: slam.map.num_points, stopping, so_far.next)
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
@@ -166,6 +166,7 @@ def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]
         _evaluate(finished, finished.trajectory, sequence),
         _evaluate(finished, finished.online, sequence),
     )
+    figures["dropped"] = sequence.dropped
     write_results(finished, sequence, figures, output)
     draw(read_results(output), output)
     return figures
