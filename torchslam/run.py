@@ -140,7 +140,7 @@ def run_sequence(
         slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
     interrupted = False
     try:
-        for index in range(so_far.next, len(sequence)):
+        for index in sequence.indices(so_far.next):
             try:
                 so_far.results.append(slam.step(sequence[index]))
             except EndOfSequence:

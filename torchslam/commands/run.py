@@ -134,7 +134,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
         slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
-        print(f"torchslam: going on at frame {so_far.next} of {len(sequence)}", file=sys.stderr)
+        print(f"torchslam: going on at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
         return slam, so_far
     if plan.resume:
         print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)

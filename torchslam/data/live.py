@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import threading
 import time
 from pathlib import Path
@@ -42,9 +41,9 @@ class Capture(Protocol):
 class LiveSequence(Sequence):
     """Frames as they come, by a thread that keeps the newest one; `image` waits for one that is newer than the last.
 
-    Frames are numbered as they are given, without gaps, whatever was dropped between them. How many there will be
-    nobody knows: `len` is the largest number there is, and behind the last frame comes `EndOfSequence`. Timestamps are
-    seconds since 1970 at which a frame was captured, by the source's own clock where it has one that runs.
+    Frames are numbered as they are given, without gaps, whatever was dropped between them. Nobody knows how many there
+    will be, so that there is no `len`; behind the last frame comes `EndOfSequence`. Timestamps are seconds since 1970
+    at which a frame was captured, by the source's own clock where it has one that runs.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class LiveSequence(Sequence):
         self._newest: tuple[float, np.ndarray] | None = None
         self._ended = self._closing = False
         self._dropped = 0
-        self._limit = sys.maxsize
+        self._limit: int | None = None
         self._given, self._time = 0, 0.0
         self._thread = threading.Thread(target=self._watch, name=f"torchslam {name}", daemon=True)
         self._thread.start()
@@ -79,6 +78,12 @@ class LiveSequence(Sequence):
         )
 
     def __len__(self) -> int:
+        if self._limit is None:
+            raise TypeError(f"{self.name}: nobody knows how many frames there will be")
+        return self._limit
+
+    @property
+    def known_length(self) -> int | None:
         return self._limit
 
     @property
@@ -89,7 +94,7 @@ class LiveSequence(Sequence):
         """The first `stop` frames: nothing else can be chosen of what is not there yet. Raises SequenceError."""
         if start or stride != 1:
             raise SequenceError(f"{self.name}: of a live source only the end can be chosen (--stop, --limit)")
-        self._limit = sys.maxsize if stop is None else stop
+        self._limit = stop
         return self
 
     def image(self, index: int) -> Tensor:

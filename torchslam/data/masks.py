@@ -60,6 +60,8 @@ class Masked(Transformed):
 
 def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
     """Which file is the mask of which frame."""
+    if sequence.known_length is None:
+        raise SequenceError(f"{folder}: a live source takes one mask for all frames")
     files = sorted(
         (
             file

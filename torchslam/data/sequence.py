@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from enum import Enum
@@ -91,8 +91,13 @@ class Sequence(ABC):
 
     @property
     def known_length(self) -> int | None:
-        """How many frames there are; None for a live source without an end."""
-        return len(self) if len(self) < sys.maxsize else None
+        """How many frames there are; None for a live source without an end, which has no `len`."""
+        return len(self)
+
+    def indices(self, start: int = 0) -> Iterable[int]:
+        """The indices of the frames from `start` on; of a live source without an end they do not end either."""
+        length = self.known_length
+        return itertools.count(start) if length is None else range(start, length)
 
     @property
     def dropped(self) -> int:
@@ -120,9 +125,11 @@ class Sequence(ABC):
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError where its image cannot be read, IndexError beyond the end."""
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        index %= len(self)
+        length = self.known_length
+        if length is not None:
+            if not -length <= index < length:
+                raise IndexError(f"frame {index} of {length}")
+            index %= length
         image = self.image(index)
         return Frame(
             index=index,
@@ -134,7 +141,7 @@ class Sequence(ABC):
         )
 
     def __iter__(self) -> Iterator[Frame]:
-        for index in range(len(self)):
+        for index in self.indices():
             try:
                 frame = self[index]
             except EndOfSequence:
@@ -223,6 +230,10 @@ class Transformed(Sequence):
 
     def __len__(self) -> int:
         return len(self._whole) if self._indices is None else len(self._indices)
+
+    @property
+    def known_length(self) -> int | None:
+        return self._whole.known_length if self._indices is None else len(self._indices)
 
     @property
     def dropped(self) -> int:

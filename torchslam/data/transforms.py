@@ -34,6 +34,7 @@ def cut(sequence: Sequence, start: str | int = 0, stop: str | int | None = None)
 
 def thin(sequence: Sequence, rate: float) -> Sequence:
     """At most `rate` frames per second, by their timestamps: all of them where there are fewer."""
+    _check_known(sequence, "--fps")
     elapsed = (sequence.timestamps - sequence.timestamps[:1]).tolist()
     chosen: list[int] = []
     last = -1
@@ -111,6 +112,15 @@ def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
     if found is None:
         raise SequenceError(f"--{which}: expected a frame, as 120, or a time, as 12.5s or 1:30, got `{text}`")
     seconds = 3600 * int(found[1] or 0) + 60 * int(found[2] or 0) + float(found[3])
+    _check_known(sequence, f"--{which} as a time")
     elapsed = sequence.timestamps - sequence.timestamps[:1]
     # Times as text are rounded; half a microsecond is less than any frame lasts.
     return int(torch.searchsorted(elapsed, seconds - 5e-7))
+
+
+def _check_known(sequence: Sequence, what: str) -> None:
+    """Raises SequenceError where the times of the frames are not known in advance."""
+    if not len(sequence.timestamps):
+        raise SequenceError(
+            f"{sequence.name}: {what} needs times that are known in advance, a live source has none"
+        )

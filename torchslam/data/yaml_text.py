@@ -17,7 +17,7 @@ def yaml_value(text: str, key: str) -> str | None:
     line, _, below = rest.partition("\n")
     line = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
     if line.startswith("["):
-        return _bracketed(rest)
+        return _bracketed(rest.lstrip(" \t"))
     if line and not line.startswith("!!"):
         return line.strip("\"'")
     block = _block(below, len(found[1]))
