@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from torchslam.errors import FrameError
@@ -17,7 +19,7 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp",
 
 MAX_BYTES = 1 << 29
 """An image file above this size is not read."""
-MAX_PIXELS = 1 << 27
+MAX_PIXELS = 1 << 26
 """Pixels of the largest image that is decoded: a small file may promise any number of them."""
 
 
@@ -76,10 +78,16 @@ def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
 
 
 def _promised_pixels(data: bytes) -> int:
-    """How many pixels a PNG or JPEG header promises; 0 where it is left to the decoder's own limit."""
-    if data.startswith(b"\x89PNG"):
-        return int.from_bytes(data[16:20], "big") * int.from_bytes(data[20:24], "big")
-    return 0
+    """How many pixels a header promises; 0 where that is left to the decoder's own limit."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return image.width * image.height
+    except Image.DecompressionBombError:
+        return MAX_PIXELS + 1
+    except (
+        Exception
+    ):  # a damaged header fails in any way there is, and a format may be one that only OpenCV knows
+        return 0
 
 
 def _is_truncated(data: bytes) -> bool:
