@@ -178,6 +178,8 @@ def test_nothing_is_read_without_a_limit(
             patch.setattr(image_files, "MAX_PIXELS", 48 * 64 - 1)
             with pytest.raises(FrameError, match=rf"0\.{suffix} is not an image"):
                 image_files.read_grey(image, "here")
+        if suffix != "png":
+            image.unlink()
     monkeypatch.setattr(image_files, "MAX_BYTES", 100)
     with pytest.raises(FrameError, match="more than the 100 of an image"):
         image_files.read_grey(tmp_path / "0.png", "here")
