@@ -10,6 +10,8 @@ import pytest
 from tests.data.mp4 import set_durations, set_rotation, write_mp4
 from torchslam.data import Calibrated, open_sequence
 from torchslam.data.video import _rising
+from torchslam.errors import CalibrationError
+from torchslam.geometry.camera import Camera
 
 CAMERA = "60,60,32,24"
 MILLISECONDS = [40, 200, 17, 333, 5, 40, 81, 40]
@@ -65,6 +67,14 @@ def test_a_video_is_read_without_a_camera(clip: Path) -> None:
     assert sequence.describe()["camera"].startswith("missing")
     assert open_sequence(clip, "fov=65").calibrated is Calibrated.GUESSED
     assert open_sequence(clip, CAMERA).calibrated is Calibrated.GIVEN
+
+
+def test_a_camera_found_later(clip: Path) -> None:
+    sequence, given = open_sequence(clip), open_sequence(clip, CAMERA).camera
+    sequence.camera = given
+    assert (sequence.camera, sequence.calibrated) == (given, Calibrated.GIVEN)
+    with pytest.raises(CalibrationError, match="these are"):
+        sequence.camera = Camera.pinhole(1, 1, 1, 1, size=(2, 2))
 
 
 def test_times_that_do_not_rise_are_left_out() -> None:

@@ -19,6 +19,7 @@ from torchslam.data.yaml_text import yaml_numbers, yaml_value
 from torchslam.errors import CalibrationError
 
 HALF_PIXEL = 0.5
+LARGEST = 1e12  # numbers in JSON have any number of digits
 FISHEYES = ("equidistant", "fisheye", "kannala", "opencv_fisheye")
 BROWN = ("plumb_bob", "radtan", "radial-tangential", "radial_tangential", "rational_polynomial", "none", "")
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
@@ -39,7 +40,7 @@ COLMAP_MODELS = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+\s")
+COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -205,9 +206,10 @@ def _from_transforms(path: Path, text: str) -> Calibration:
         content: Any = json.loads(text)
     except (ValueError, RecursionError) as cause:
         raise CalibrationError(f"{path}: not valid JSON: {cause}") from cause
-    numeric = {key: float(value) for key, value in content.items() if isinstance(value, int | float)}
-    if not all(map(math.isfinite, numeric.values())):
+    numbers = {key: value for key, value in content.items() if isinstance(value, int | float)}
+    if not all(abs(value) < LARGEST for value in numbers.values()):  # not so NaN either
         raise CalibrationError(f"{path}: a number in it is not finite")
+    numeric = {key: float(value) for key, value in numbers.items()}
     width, height = numeric.get("w"), numeric.get("h")
     size = _size([width] if width else None, [height] if height else None)
     focal = numeric.get("fl_x")

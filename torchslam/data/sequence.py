@@ -89,6 +89,15 @@ class Sequence(ABC):
             )
         return self._camera
 
+    @camera.setter
+    def camera(self, camera: Camera) -> None:
+        """Another one, or one that was found out. Raises CalibrationError for another size than the images have."""
+        if camera.size != self.size:
+            raise CalibrationError(
+                f"{self.name}: a camera for images of {camera.size}, these are {self.size}"
+            )
+        self._camera, self.calibrated = camera, Calibrated.GIVEN
+
     @property
     def known_length(self) -> int | None:
         """How many frames there are; None for a live source without an end, which has no `len`."""
