@@ -127,6 +127,16 @@ def test_the_end_can_be_chosen(clip: Path) -> None:
     part.close()
 
 
+def test_what_comes_after_the_last_frame_is_not_counted(clip: Path) -> None:
+    sequence = LiveSequence("clip", Played(clip), None).part(stop=2)
+    for _ in sequence:
+        time.sleep(0.1)
+    dropped = sequence.dropped
+    assert dropped > 0
+    time.sleep(0.2)
+    assert sequence.dropped == dropped
+
+
 def test_capture_clock() -> None:
     clock = CaptureClock()
     assert clock.at(5.0, 1000.0) == 1000.0
@@ -160,10 +170,13 @@ def test_what_is_live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert live.matches("rtsp://user@camera:554/stream?x=1")
     assert live.matches("http://camera/video.mjpg")
     assert not live.matches("video.mp4")
+    assert not live.matches("https://server/video.mp4")
     (tmp_path / "0").mkdir()
     assert not live.matches("0")
     with pytest.raises(SequenceError, match="97: cannot be opened as a camera"):
         open_sequence("97")
+    with pytest.raises(SequenceError, match=r"^rtsp://127\.0\.0\.1:9/x: cannot be opened as a stream"):
+        open_sequence("rtsp://user:secret@127.0.0.1:9/x")
 
 
 def test_a_run_ends_with_the_source(clip: Path) -> None:

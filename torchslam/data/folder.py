@@ -6,7 +6,15 @@ from pathlib import Path
 
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.eth3d_tum import find_calibration
-from torchslam.data.frame_names import FOLDERS, Found, find_frames, is_pattern, match_pattern, subfolder
+from torchslam.data.frame_names import (
+    FOLDERS,
+    Found,
+    find_frames,
+    folder_kind,
+    is_pattern,
+    match_pattern,
+    subfolder,
+)
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 
 LOOKS_FOR = f"images, or a folder {'/, '.join(FOLDERS)}/ with images"
@@ -19,7 +27,9 @@ def matches(path: str) -> bool:
     if is_pattern(path):
         return bool(match_pattern(path).frames)
     folder = Path(path)
-    return folder.is_dir() and bool(subfolder(folder) or find_frames(folder).frames)
+    if not folder.is_dir() or folder_kind(folder):
+        return False
+    return bool(subfolder(folder) or find_frames(folder).frames)
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:

@@ -89,6 +89,11 @@ def other_kind(file: Path) -> str | None:
     return next((OTHER_KINDS[word] for word in words if word in OTHER_KINDS), None)
 
 
+def folder_kind(folder: Path) -> str | None:
+    """What all images of a folder are by its name, `depth/` or `masks/`, that are no frames; None for frames."""
+    return OTHER_KINDS.get(folder.resolve().name.lower())
+
+
 def subfolder(folder: Path) -> Path | None:
     """The folder inside another one that has frames by its name and content: `images/`, `rgb/` and the like."""
     for name in FOLDERS:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.image_file import grey_to_tensor
 from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.data.video import SUFFIXES
 from torchslam.errors import FrameError, SequenceError
 
 LOOKS_FOR = "a camera's number, or an rtsp:// or http:// address"
@@ -56,7 +57,7 @@ class LiveSequence(Sequence):
         self._fresh = threading.Condition()
         self._newest: tuple[float, np.ndarray] | None = None
         self._ended = self._closing = False
-        self._dropped = 0
+        self._dropped = self._replaced = 0
         self._limit: int | None = None
         self._given, self._time = 0, 0.0
         self._thread = threading.Thread(target=self._watch, name=f"torchslam {name}", daemon=True)
@@ -109,7 +110,8 @@ class LiveSequence(Sequence):
                 self.close()
                 raise EndOfSequence(f"{self.name}: ended after {self._given} frames")
             self._time, frame = self._newest
-            self._newest = None
+            self._dropped += self._replaced  # what comes after the last frame that is asked for is not missed
+            self._newest, self._replaced = None, 0
         self._given = index + 1
         if (frame.shape[1], frame.shape[0]) != self.size:
             raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
@@ -143,7 +145,7 @@ class LiveSequence(Sequence):
                 if not decoded:
                     continue
                 with self._fresh:
-                    self._dropped += self._newest is not None
+                    self._replaced += self._newest is not None
                     self._newest = (captured, frame)
                     self._fresh.notify_all()
         finally:
@@ -175,15 +177,18 @@ class CaptureClock:
 
 def matches(path: str) -> bool:
     """Whether this is an address, or the number of a camera and no file."""
-    return bool(ADDRESS.fullmatch(path)) or (
-        re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
-    )
+    if ADDRESS.fullmatch(path):
+        return (
+            not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
+        )  # a file does not drop frames
+    return re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
+    shown = re.sub(r"//[^/@]*@", "//", path)  # without a password
     capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
     if not capture.isOpened():
-        raise SequenceError(f"{path}: cannot be opened as a {'camera' if number else 'stream'}")
-    return LiveSequence(f"camera {path}" if number else path, capture, camera)
+        raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
+    return LiveSequence(f"camera {path}" if number else shown, capture, camera)

@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 from torchslam.data import archive, bag, video
-from torchslam.data.frame_names import other_kind, subfolder
+from torchslam.data.frame_names import folder_kind, other_kind, subfolder
 from torchslam.data.image_file import SUFFIXES
 from torchslam.data.readers import READERS, find_reader
 
@@ -34,7 +34,7 @@ def why_nothing(path: str) -> str:
 def _why_no_folder(folder: Path) -> str:
     entries = _entries(folder)
     kinds = Counter(
-        other_kind(entry) or "images"
+        other_kind(entry) or folder_kind(folder) or "images"
         for entry in entries
         if entry.is_file() and entry.suffix.lower() in SUFFIXES
     )
