@@ -94,7 +94,7 @@ def fingerprint(of: Sequence | Config) -> str:
     """What tells one sequence, or one configuration, from another."""
     if isinstance(of, Config):
         return hashlib.sha256(to_toml(of).encode()).hexdigest()
-    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), len(of)])
+    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.known_length])
     return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
 
 

@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 
 from torchslam.config import Config
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
 from torchslam.front_end import Extractor, simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
@@ -174,9 +174,11 @@ def run_sequence(
         slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
     interrupted = False
     try:
-        for index in range(so_far.next, len(sequence)):
+        for index in sequence.indices(so_far.next):
             try:
                 so_far.results.append(slam.step(sequence[index]))
+            except EndOfSequence:
+                break
             except FrameError as error:
                 warnings.warn(f"skipped a frame: {error}", stacklevel=2)
                 so_far.skipped.append(str(error))
@@ -269,7 +271,8 @@ def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
 
 def true_poses(sequence: Sequence) -> torch.Tensor:
     """(F, 4, 4) the true poses, world to camera, of the frames that have one."""
-    known = (sequence.pose(index) for index in range(len(sequence)))
+    frames = len(sequence) if sequence.groundtruth is not None else 0
+    known = (sequence.pose(index) for index in range(frames))
     poses = [pose for pose in known if pose is not None]
     if not poses:
         raise ConfigError(

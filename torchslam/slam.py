@@ -10,9 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchslam.config import Config
+from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
@@ -130,6 +132,16 @@ class SLAM:
         """
         view = self._look(frame)
         return self._find(view) if self.world is None else self._follow(self.world, view)
+
+    def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
+        """Process an image of one's own loop: the frame after the last one.
+
+        image: (H, W) or (H, W, C), uint8, or floats in [0, 1]; channels: their order, `channel_orders`
+
+        Raises FrameError for an image that cannot be taken, and as `step` does.
+        """
+        index = 0 if self.last_frame is None else self.last_frame[0] + 1
+        return self.step(Frame(index, float(timestamp), image_tensor(image, channels), f"image {index}"))
 
     def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""

@@ -111,7 +111,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     with Stopping() as stopping:
-        bar = ProgressBar(len(sequence), lambda: slam.map.num_points, stopping, so_far.next)
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
@@ -137,7 +137,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
         slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
-        print(f"torchslam: going on at frame {so_far.next} of {len(sequence)}", file=sys.stderr)
+        print(f"torchslam: going on at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
         return slam, so_far
     if plan.resume:
         print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
@@ -169,6 +169,7 @@ def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
         _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
+    figures["dropped"] = sequence.dropped
     write_results(finished, sequence, figures, output)
     draw(read_results(output), output)
     return figures

@@ -102,6 +102,8 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     """The metrics of a run in words, label by label, for `table`."""
     frames, skipped = figures["frames"], len(figures["skipped"])
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
+    if figures.get("dropped"):
+        rows["dropped"] = f"{figures['dropped']} frames that came while there was no time for them"
     if figures["initialised_at"] is None:
         return rows | {"map": "none"}
     rows |= {

@@ -12,17 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.image_file import grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, room, wall
-from torchslam.errors import SequenceError
+from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.values import Trajectory
 
+LOOKS_FOR = "synthetic:room"
 FRAME_RATE = 20.0
 SIZE = (640, 480)
 FOCAL = 500.0
@@ -105,6 +107,18 @@ class SyntheticSequence(Sequence):
 
     def image_name(self, index: int) -> str:
         return f"synthetic:{self.name}#{index}"
+
+
+def matches(path: str) -> bool:
+    """Whether this is the name of a rendered sequence."""
+    return path.startswith("synthetic:")
+
+
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> SyntheticSequence:
+    """A rendered sequence; it has a camera of its own. Raises SequenceError, CalibrationError for another camera."""
+    if camera is not None:
+        raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
+    return open_synthetic(path)
 
 
 def open_synthetic(name: str) -> SyntheticSequence:
