@@ -120,19 +120,13 @@ class Initializer:
         others = self._relative_pose(view, first[~still], second[~still])
         if others.model[0] != "essential":
             return None if self._relative_pose(view, first, second).model[0] == "essential" else everyone
-        errors = self._epipolar_errors(view, first[still], second[still], others.T_21[0])
+        pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
+        errors = epipolar_errors(pixels_1, pixels_2, others.T_21[0], self.camera)
         explained = errors.abs() < self.config.initialization.threshold_px
         if float(explained.double().mean()) >= EXPLAINED_SHARE:
             return everyone
         self.still = view.keypoints[second[still]]
         return ~still
-
-    def _epipolar_errors(self, view: View, first: Tensor, second: Tensor, T_21: Tensor) -> Tensor:
-        """(n,) Sampson distances in pixels of matches (n,), (n,) under a motion (4, 4)."""
-        rays_1 = self.camera.unproject(self.reference.keypoints[first])
-        rays_2 = self.camera.unproject(view.keypoints[second])
-        x_1, x_2 = rays_1[:, :2] / rays_1[:, 2:], rays_2[:, :2] / rays_2[:, 2:]
-        return self.camera.focal * sampson_errors(essential_from_pose(T_21[:3, :3], T_21[:3, 3]), x_1, x_2)
 
     def _relative_pose(self, view: View, first: Tensor, second: Tensor) -> RelativePose:
         """The motion from the reference frame to a view by matching keypoints (n,), (n,) of the two."""
@@ -169,6 +163,13 @@ class Initializer:
             )
         keep = keep[accurate]
         return Start(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
+
+
+def epipolar_errors(pixels_1: Tensor, pixels_2: Tensor, T_21: Tensor, camera: Camera) -> Tensor:
+    """(n,) Sampson distances in pixels of matches (n, 2), (n, 2) under a motion (4, 4)."""
+    rays_1, rays_2 = camera.unproject(pixels_1), camera.unproject(pixels_2)
+    x_1, x_2 = rays_1[:, :2] / rays_1[:, 2:], rays_2[:, :2] / rays_2[:, 2:]
+    return camera.focal * sampson_errors(essential_from_pose(T_21[:3, :3], T_21[:3, 3]), x_1, x_2)
 
 
 def is_good(seen: Triangulation, scales: Tensor, camera: Camera, settings: InitializationConfig) -> Tensor:
