@@ -247,7 +247,7 @@ def test_an_interrupt_keeps_what_there_is() -> None:
 
 def test_simulated_features_need_true_poses() -> None:
     walk = Walk(arc(5))
-    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
     with pytest.raises(ConfigError, match="true poses"):
         slam.step(walk[0])
 
