@@ -18,8 +18,10 @@ from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
-from torchslam.slam import FOUND_AGAIN
+from torchslam.slam import FOUND_AGAIN, STARTED_ANEW
 from torchslam.tracking.tracker import Tracker
+from torchslam.values import Start, View
+from torchslam.world.world import World
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -169,6 +171,39 @@ def test_a_start_must_explain_the_frames_since_its_reference(
     )
     assert (len(run.worlds) == 1) is believed
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
+
+
+@pytest.mark.parametrize("explained", [True, False])
+def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
+    explained: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No support is enough here: whatever start the first and the last frame make is a rival."""
+    few = ("initialization.min_matches=30", "initialization.min_points=20")
+    walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
+    monkeypatch.setattr("torchslam.tracking.youth.LEAST_SUPPORT", 2.0)
+    found, founded = Founder.found, []
+
+    def counted(founder: Founder, world: World, start: Start, views: list[View]) -> str:
+        founded.append(views)
+        return found(founder, world, start, views) if explained or len(founded) == 1 else "it does not"
+
+    monkeypatch.setattr(Founder, "found", counted)
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
+    run = slam.run(walk)
+    anew = [r for r in run.results if r.reason == STARTED_ANEW]
+    assert len(founded) > 1
+    assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
+    assert len(run.trajectory) == 30
+    assert len(run.worlds) == 1
+    assert run.worlds[0].number == len(anew)
+    if explained:
+        assert len(anew) == len(founded) - 1
+        assert all(r.is_keyframe and r.state is State.TRACKING for r in anew)
+        assert len(slam.memory.places) == run.map.num_keyframes
+        assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-4
+    else:
+        assert not anew
+        assert torch.equal(run.trajectory.T_wc, plain.trajectory.T_wc)
 
 
 def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:

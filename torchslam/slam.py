@@ -44,6 +44,7 @@ from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
 STARTED = "started the map"
+STARTED_ANEW = "later frames contradict the start: started the map anew"
 FOUND_AGAIN = "found again"
 
 
@@ -211,6 +212,8 @@ class SLAM:
             why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
         if self.youth is not None:
             self.youth.grow(view)
+            if self._replace(self.youth):
+                return self._result(view, STARTED_ANEW, self.world, is_keyframe=True)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
         return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
@@ -301,7 +304,7 @@ class SLAM:
             start, reason = self.initializer.step(view)
             self.stillness.add(self.initializer.still)
             if start is not None:
-                reason = self._begin(start)
+                reason = self._begin(start, self.initializer.views)
         if reason:
             return self._result(view, reason)
         return self._result(view, STARTED, self.world, is_keyframe=True)
@@ -316,13 +319,15 @@ class SLAM:
 
     # --- a new world -----------------------------------------------------------------------------------------
 
-    def _begin(self, start: Start) -> str:
-        """Begin a world with two views; why it is not believed after all, or nothing."""
-        world, views = self.worlds.begin(), self.initializer.views
+    def _begin(self, start: Start, views: list[View]) -> str:
+        """Begin a world with two views, in the place of a young one; why it is not believed, or nothing."""
+        world = self.worlds.begin()
         reason = self.founder.found(world, start, views)
         if reason:
             self.worlds.forget(world)
             return reason
+        if self.youth is not None:
+            self._take_back(self.youth)
         for keyframe in range(world.map.num_keyframes):
             self.memory.add(world.map, keyframe)
         known = set(world.history.frames["frame_index"].tolist()) if len(world.history) else set()
@@ -337,6 +342,15 @@ class SLAM:
         self.memory.remove(youth.world.map.keys)
         self.worlds.forget(youth.world)
         self.youth = None
+
+    def _replace(self, youth: Youth) -> bool:
+        """Begin anew with the first and the last frame of a young world, if these contradict it."""
+        with self.clock("initialization"):
+            start = youth.rival(self.camera, self.config)
+            replaced = start is not None and not self._begin(start, youth.views)
+        if replaced:
+            self.stillness.forget_last()  # its pose was one of the map before
+        return replaced
 
     def settle(self) -> None:
         """A young world has proved itself: pose the frames from before its start."""
