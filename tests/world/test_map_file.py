@@ -133,12 +133,12 @@ def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
     [
         (None, "not a torchslam map"),
         ({"author": "somebody"}, "not a torchslam map"),
-        ({"torchslam": '{"format": 3}', "author": "somebody"}, "not a torchslam map"),
-        ({"torchslam": "format 3"}, "not a torchslam map"),
+        ({"torchslam": '{"format": 4}', "author": "somebody"}, "not a torchslam map"),
+        ({"torchslam": "format 4"}, "not a torchslam map"),
         ({"torchslam": "[3]"}, "not a torchslam map"),
         ({"torchslam": '{"size": 3}'}, "not a torchslam map"),
-        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 3"),
-        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 3"),
+        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 4"),
+        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 4"),
     ],
 )
 def test_other_programs_and_formats_are_refused(

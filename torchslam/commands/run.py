@@ -20,8 +20,10 @@ from torchslam.commands.progress import ProgressBar
 from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
+from torchslam.data.opening import full_name
 from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
+from torchslam.export.colours import paint
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CHECKPOINT, CONFIG, MAP, read_results, write_results
@@ -36,13 +38,15 @@ CHECKPOINT_EVERY = 20  # keyframes
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a run reads and writes, beside its sequence.
+    """Where a run reads and writes.
 
+    source:     what the sequence was opened from, for those that need its images again
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     """
 
+    source: str
     output: Path
     device: torch.device
     overwrite: bool = False
@@ -91,6 +95,7 @@ def execute(options: argparse.Namespace) -> int:
         options.config = options.config or (beside if beside.is_file() else None)
         saved = saved / MAP
     plan = Plan(
+        source=options.path,
         output=options.output,
         device=options.device,
         overwrite=options.overwrite,
@@ -117,7 +122,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan.output)
+        figures = _write(finished, sequence, plan)
     print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
@@ -159,15 +164,17 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
 
 
-def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]:
-    """Evaluate, write, draw; returns the figures."""
+def _write(finished: Run, sequence: Sequence, plan: Plan) -> dict[str, object]:
+    """Evaluate, colour the map, write, draw; returns the figures."""
     figures = metrics(
         finished,
         _evaluate(finished, finished.trajectory, sequence),
         _evaluate(finished, finished.online, sequence),
     )
-    write_results(finished, sequence, figures, output)
-    draw(read_results(output), output)
+    figures["source"] = full_name(plan.source)
+    paint([world.map for world in finished.worlds], sequence, finished.session)
+    write_results(finished, sequence, figures, plan.output)
+    draw(read_results(plan.output), plan.output)
     return figures
 
 

@@ -19,16 +19,25 @@ def read_grey(path: str | Path, where: str) -> Tensor:
 
     Raises FrameError at `where` for a file that is missing, truncated or not an image.
     """
+    return grey_to_tensor(_read(path, where, cv2.IMREAD_GRAYSCALE))
+
+
+def read_colour(path: str | Path, where: str) -> Tensor:
+    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_grey` does."""
+    return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
+
+
+def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     try:
         data = Path(path).read_bytes()
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
-    grey = _decode(data)
-    if grey is None:
+    image = _decode(data, flags)
+    if image is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
-    return grey_to_tensor(grey)
+    return image
 
 
 def grey_to_tensor(grey: np.ndarray) -> Tensor:
@@ -36,12 +45,17 @@ def grey_to_tensor(grey: np.ndarray) -> Tensor:
     return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
 
 
-def _decode(data: bytes) -> np.ndarray | None:
-    """(H, W) uint8 grey; None for anything that is not a whole image."""
+def bgr_to_tensor(image: np.ndarray) -> Tensor:
+    """(H, W, 3) uint8 blue, green, red, as OpenCV has it -> red, green, blue."""
+    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def _decode(data: bytes, flags: int) -> np.ndarray | None:
+    """(H, W) or (H, W, 3) uint8; None for anything that is not a whole image."""
     if not data:
         return None
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # a header that promises more pixels than OpenCV takes
         return None
 

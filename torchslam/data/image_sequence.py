@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration, fit_camera, size_text
-from torchslam.data.image_file import read_grey
+from torchslam.data.image_file import read_colour, read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
@@ -60,15 +60,23 @@ class ImageSequence(Sequence):
     def image(self, index: int) -> Tensor:
         entry = self._entries[index]
         image = read_grey(entry.path, entry.where)
-        size = (image.shape[-1], image.shape[-2])
-        if size != self.size:
-            raise FrameError(
-                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
-            )
+        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        return image
+
+    def colour(self, index: int) -> Tensor:
+        entry = self._entries[index]
+        image = read_colour(entry.path, entry.where)
+        self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 
     def image_name(self, index: int) -> str:
         return str(self._entries[index].path)
+
+    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
+        if size != self.size:
+            raise FrameError(
+                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
+            )
 
 
 def _check_order(name: str, entries: Listed[ImageEntry]) -> None:

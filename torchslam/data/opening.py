@@ -17,6 +17,8 @@ from torchslam.data.video import VideoSequence
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
+RENDERED = "synthetic:"  # names of sequences that lie nowhere begin with it
+
 
 def open_sequence(
     path: str | Path,
@@ -45,8 +47,13 @@ def open_sequence(
     return sequence.part(stop=None if limit is None else limit * stride, stride=stride)
 
 
+def full_name(path: str | Path) -> str:
+    """What opens the same sequence from another folder too."""
+    return str(path) if str(path).startswith(RENDERED) else str(Path(path).resolve())
+
+
 def _open(path: str | Path, camera: Camera | Calibration | None, fps: float | None) -> Sequence:
-    if str(path).startswith("synthetic:"):
+    if str(path).startswith(RENDERED):
         if camera is not None:
             raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
         return open_synthetic(str(path))

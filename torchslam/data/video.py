@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import Calibration, fit_camera
 from torchslam.data.folder import DEFAULT_RATE
-from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.image_file import bgr_to_tensor, grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import CalibrationError, FrameError, SequenceError
 from torchslam.geometry.camera import Camera
@@ -42,16 +42,22 @@ class VideoSequence(Sequence):
         super().__init__(path.stem, "video", camera, torch.arange(count, dtype=torch.float64) / rate)
 
     def image(self, index: int) -> Tensor:
-        grey = self._read(index)
-        if grey is None:
-            raise FrameError(f"{self.image_name(index)}: cannot be decoded, or the video ends before it")
-        return grey_to_tensor(grey)
+        return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
+
+    def colour(self, index: int) -> Tensor:
+        return bgr_to_tensor(self._frame(index))
 
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
 
+    def _frame(self, index: int) -> np.ndarray:
+        frame = self._read(index)
+        if frame is None:
+            raise FrameError(f"{self.image_name(index)}: cannot be decoded, or the video ends before it")
+        return frame
+
     def _read(self, index: int) -> np.ndarray | None:
-        """The (H, W) uint8 grey frame `index`; frames in between are skipped without conversion."""
+        """The (H, W, 3) uint8 frame `index`, blue first; frames in between are skipped without conversion."""
         if index < self._position:
             self._capture.release()
             self._capture.open(str(self._path))
@@ -62,4 +68,4 @@ class VideoSequence(Sequence):
             self._position += 1
         self._position += 1
         decoded, frame = self._capture.read()
-        return cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if decoded else None
+        return frame if decoded else None

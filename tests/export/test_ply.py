@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchslam.output.ply import CAMERA_COLOUR, VERTEX, write_ply
+from torchslam.export.ply import CAMERA_COLOUR, VERTEX, write_ply
 
 
 def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator) -> None:
