@@ -17,10 +17,10 @@ VERTEX = np.dtype(
     [
         *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
         *((name, "u1") for name in ("red", "green", "blue")),
-        ("observations", "<i4"),
+        ("observations", "<f4"),  # COLMAP refuses a file with integers of more than a byte
     ]
 )
-PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
+PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
 CAMERA_COLOUR = (213, 73, 63)
 
 

@@ -34,6 +34,8 @@ def pinhole_within(camera: Camera) -> Camera:
 
 def undistorted(scene: Scene) -> Scene:
     """The scene as `pinhole_within` of its camera sees it; keypoints may lie outside of the new images."""
+    if scene.camera.model == "pinhole":
+        return scene
     pinhole = pinhole_within(scene.camera)
     pixels = scene.camera.normalize(scene.pixels) * pinhole.params[:2] + pinhole.params[2:]
     return replace(scene, camera=pinhole, pixels=pixels)
@@ -53,7 +55,7 @@ class Undistorter:
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """(H, W, C) uint8 -> the same."""
-        # A pixel of the rim may come to lie outside by a rounding error.
+        # A pixel of the rim may come to lie outside by a thousandth: the rim is sampled at its pixels.
         return cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
