@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -75,6 +76,18 @@ def test_a_loaded_map_can_grow(path: Path) -> None:
         torch.zeros(2, 3, dtype=torch.float64), torch.zeros(2, 32, dtype=torch.uint8), keyframe=0
     )
     assert loaded.num_points == before + 2
+
+
+def test_a_file_from_before_there_were_colours_is_read(path: Path, worlds: list[World]) -> None:
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        about = json.loads(file.metadata()["torchslam"])
+    del tensors["worlds.0.points.colors"]
+    save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 3})})
+    loaded, _ = read_map(path)
+    assert torch.equal(loaded.positions_w, worlds[0].map.positions_w)
+    assert loaded.points["colors"].shape == (len(loaded.points), 3)
+    assert not loaded.points["colors"].any()
 
 
 def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[World], camera: Camera) -> None:
