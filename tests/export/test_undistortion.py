@@ -26,8 +26,8 @@ def test_all_of_the_new_image_is_seen_and_its_edges_touch(lens: Camera) -> None:
     size = torch.tensor(lens.size).double() - 1
     assert bool(((pixels > -0.01) & (pixels < size + 0.01)).all())  # the rim is sampled at its pixels
     room = torch.stack((pixels.amin(0), size - pixels.amax(0)))  # left, top; right, bottom
-    assert bool((room.abs() < 0.05).all())
-    assert pinhole.size == lens.size
+    assert bool((room.abs() < 1.5).all())  # the last column and row of pixels may not fit
+    assert torch.equal(pinhole.params[:2], lens.params[:2])
 
 
 def test_keypoints_are_those_of_opencv(scene: Scene) -> None:
@@ -46,7 +46,7 @@ def test_images_are_those_of_opencv(lens: Camera) -> None:
     new, K = pinhole_within(lens).K.numpy(), lens.K.numpy()
     k = lens.params[4:].numpy() if lens.model != "pinhole" else np.zeros(5)
     maps = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
-    x, y = maps(K, k, np.eye(3), new, lens.size, cv2.CV_32FC1)
+    x, y = maps(K, k, np.eye(3), new, pinhole_within(lens).size, cv2.CV_32FC1)
     expected = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = np.abs(Undistorter(lens)(image).astype(int) - expected)
     assert difference.max() <= 2
@@ -63,9 +63,14 @@ def test_only_a_pinhole_camera_stays(scene: Scene) -> None:
     assert (undistorted(scene) is scene) == (scene.camera.model == "pinhole")
 
 
+def test_a_wide_view_does_not_make_a_huge_image() -> None:
+    """The left and right edges are 100 degrees from the axis, where a pinhole camera sees nothing."""
+    wide = pinhole_within(Camera.fisheye(90.0, 90.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))
+    assert wide.size[0] in (640, 641)
+    assert float(wide.fx) == pytest.approx(float(wide.fy))
+    assert float(wide.fx) < 1.0
+
+
 def test_a_view_that_no_pinhole_camera_has_is_refused() -> None:
-    # The horizontal edges are 100 degrees from the axis: there x/z has no meaning.
-    wide = Camera.fisheye(90.0, 90.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240))
-    assert pinhole_within(wide).fx < 5
     with pytest.raises(ResultsError, match="too wide"):
         pinhole_within(Camera.fisheye(90.0, 90.0, 600.0, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))

@@ -1,7 +1,8 @@
 """Give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo.
 
   colmap      sparse/0/ with the model, binary and text, and images/; keyframes, points, tracks
-  nerfstudio  transforms.json (OpenGL axes, z up), sparse_pc.ply and images/; keyframes
+  nerfstudio  transforms.json (OpenGL axes, z up), sparse_pc.ply and images/; keyframes, of which a slow camera has
+              few: --frames all gives a trainer more images
   ply         the points in the colours of the images, the keyframes in red, z up
   rerun       a recording (.rrd): points, path, every camera; images and keypoints of the keyframes, undistorted, z up
   tum, kitti  every pose, camera to world: a file with times; a folder with poses.txt and times.txt
