@@ -17,7 +17,7 @@ PINHOLE = (200.0, 210.0, 158.0, 121.5)
 CAMERAS = {
     "pinhole": Camera.pinhole(*PINHOLE, size=SIZE),
     "tangential": Camera.radial_tangential(*PINHOLE, -0.2, 0.05, 0.002, -0.001, size=SIZE),
-    "third": Camera.radial_tangential(*PINHOLE, -0.2, 0.05, 0.002, -0.001, 0.01, size=SIZE),
+    "third": Camera.radial_tangential(*PINHOLE, -0.2, 0.05, 0.002, -0.001, 0.3, size=SIZE),
     "fisheye": Camera.fisheye(*PINHOLE, 0.02, -0.01, 0.003, -0.001, size=SIZE),
 }
 NOISE_PX = 0.5

@@ -90,6 +90,13 @@ def only_keyframes(scene: Scene) -> Scene:
     )
 
 
+def test_keypoints_have_the_colours_of_their_points(flat: Scene, recorded: Rows) -> None:
+    frame, colors = recorded["/world/keyframe/keypoints", "Points2D:colors"][-1]
+    ids = flat.point_index[flat.frame_index == flat.frame_ids.tolist().index(frame)]
+    red = np.array(colors, dtype=np.uint32) >> 24  # red, green, blue, opacity
+    np.testing.assert_array_equal(red, flat.colors[ids, 0])
+
+
 def test_every_frame_has_a_pose_and_a_time(flat: Scene, recorded: Rows) -> None:
     frames = [frame for frame, _ in recorded["/world/camera", "Transform3D:translation"]]
     assert frames == flat.frame_ids.tolist()

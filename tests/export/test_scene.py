@@ -71,6 +71,17 @@ def test_all_frames_come_in_order_of_time(world: World, camera: Camera) -> None:
     torch.testing.assert_close(made.T_cw[made.is_keyframe], world.map.T_cw)
 
 
+def test_rows_of_the_map_may_stand_in_any_order(world: World, camera: Camera) -> None:
+    """Keyframes that were found on the way back come later in the map."""
+    facing(world.map)
+    before = scene_of(world, camera, 0, keyframes_alone=True)
+    world.map.keyframes.keep(torch.tensor((2, 0, 1, 5, 3, 4)))
+    world.map.reindex()
+    after = scene_of(world, camera, 0, keyframes_alone=True)
+    for name in ("frame_ids", "T_cw", "points_w", "frame_index", "point_index", "pixels"):
+        assert torch.equal(getattr(after, name), getattr(before, name)), name
+
+
 def test_frames_between_bring_their_observations(world: World, camera: Camera) -> None:
     facing(world.map)
     point = torch.nonzero(world.map.points["times_observed"] >= 2)[:1, 0]
