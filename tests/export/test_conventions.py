@@ -54,12 +54,18 @@ def test_a_world_whose_y_points_down_is_stood_upright() -> None:
     "tilt", [(1.2, 0.3, 0.0), (-2.9, 0.0, 0.4), (0.0, 0.0, math.pi / 2), (0.0, 0.0, -1.5)]
 )
 def test_the_mean_up_direction_becomes_z(tilt: tuple[float, float, float]) -> None:
-    T_wc = looking(tilt, (tilt[0] + 0.2, tilt[1], tilt[2] + 0.1))[: 1 if tilt[0] == 0 else 2]
+    T_wc = looking(tilt, (tilt[0] + 0.2, tilt[1], tilt[2] + 0.1))
     R = upright_rotation(T_wc)
     up = -R @ T_wc[:, :3, 1].mean(dim=0)
     torch.testing.assert_close(up / up.norm(), torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64))
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64))
     assert torch.linalg.det(R).item() == pytest.approx(1.0)
+
+
+def test_up_along_the_worlds_x() -> None:
+    T_wc = torch.tensor([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]], dtype=torch.float64)
+    expected = torch.tensor(((0, 0, 1), (0, -1, 0), (1, 0, 0)), dtype=torch.float64)
+    torch.testing.assert_close(upright_rotation(T_wc), expected)
 
 
 def test_without_an_up_direction_y_points_down() -> None:
