@@ -36,7 +36,8 @@ def pinhole_within(camera: Camera) -> Camera:
         raise ResultsError("the camera's field of view is too wide for an image without distortion")
     scale = (MAX_GROWTH * size / extent).min().clamp(max=1.0)
     width, height = (int(side) + 1 for side in scale * extent)
-    return Camera.pinhole(*(scale * focal), *(-scale * focal * low), size=(width, height))
+    params = torch.cat((scale * focal, -scale * focal * low))
+    return Camera("pinhole", params, (width, height))
 
 
 def undistorted(scene: Scene) -> Scene:
