@@ -22,8 +22,10 @@ from torchslam.commands.progress import ProgressBar
 from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
+from torchslam.data.opening import full_name
 from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate
+from torchslam.export.colours import paint
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CHECKPOINT, CONFIG, MAP, read_results, write_results
@@ -39,13 +41,15 @@ Errors = TypeVar("Errors")
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a run reads and writes, beside its sequence.
+    """Where a run reads and writes.
 
+    source:     what the sequence was opened from, for those that need its images again
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     """
 
+    source: str
     output: Path
     device: torch.device
     overwrite: bool = False
@@ -94,6 +98,7 @@ def execute(options: argparse.Namespace) -> int:
         options.config = options.config or (beside if beside.is_file() else None)
         saved = saved / MAP
     plan = Plan(
+        source=options.path,
         output=options.output,
         device=options.device,
         overwrite=options.overwrite,
@@ -120,7 +125,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan.output)
+        figures = _write(finished, sequence, plan)
     print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
@@ -162,16 +167,18 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
 
 
-def _write(finished: Run, sequence: Sequence, output: Path) -> dict[str, object]:
-    """Evaluate, write, draw; returns the figures."""
+def _write(finished: Run, sequence: Sequence, plan: Plan) -> dict[str, object]:
+    """Evaluate, colour the map, write, draw; returns the figures."""
     figures = metrics(
         finished,
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
         _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
     figures["dropped"] = sequence.dropped
-    write_results(finished, sequence, figures, output)
-    draw(read_results(output), output)
+    figures["source"] = full_name(plan.source)
+    paint([world.map for world in finished.worlds], sequence, finished.session)
+    write_results(finished, sequence, figures, plan.output)
+    draw(read_results(plan.output), plan.output)
     return figures
 
 

@@ -17,6 +17,7 @@ from torchslam.errors import FrameError
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
 
+AS_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
 """An image file above this size is not read."""
 MAX_PIXELS = 1 << 26
@@ -33,8 +34,17 @@ def read_grey(path: str | Path, where: str, bits: int = 8) -> Tensor:
     return grey_to_tensor(read_pixels(path, where), bits)
 
 
+def read_colour(path: str | Path, where: str) -> Tensor:
+    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_grey` does."""
+    return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
+
+
 def read_pixels(path: str | Path, where: str) -> np.ndarray:
     """An image file as (H, W) grey, uint8 or uint16. Raises FrameError as `read_grey`."""
+    return _read(path, where, AS_GREY)
+
+
+def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     try:
         size = Path(path).stat().st_size
         data = Path(path).read_bytes() if size <= MAX_BYTES else b""
@@ -46,21 +56,22 @@ def read_pixels(path: str | Path, where: str) -> np.ndarray:
         )
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
-    grey = decode_pixels(data)
-    if grey is None:
+    image = decode_pixels(data, flags)
+    if image is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
-    return grey
+    return image
 
 
-def decode_pixels(data: bytes) -> np.ndarray | None:
-    """An image file's bytes as (H, W) grey, uint8 or uint16; None for anything that is not a whole image."""
+def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
+    """An image file's bytes as (H, W) grey, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
+    whole image."""
     if not data or _promised_pixels(data) > MAX_PIXELS:
         return None
     try:
-        grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # a header that promises more pixels than OpenCV takes
         return None
-    return grey if grey is not None and grey.dtype in (np.uint8, np.uint16) else None
+    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:
@@ -77,6 +88,11 @@ def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
     return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
 
 
+def bgr_to_tensor(image: np.ndarray) -> Tensor:
+    """(H, W, 3) uint8 blue, green, red, as OpenCV has it -> red, green, blue."""
+    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
 def _promised_pixels(data: bytes) -> int:
     """How many pixels a header promises; 0 where that is left to the decoder's own limit."""
     try:
@@ -84,9 +100,7 @@ def _promised_pixels(data: bytes) -> int:
             return image.width * image.height
     except Image.DecompressionBombError:
         return MAX_PIXELS + 1
-    except (
-        Exception
-    ):  # a damaged header fails in any way there is, and a format may be one that only OpenCV knows
+    except Exception:  # a damaged header fails in any way, and a format may be one that only OpenCV knows
         return 0
 
 

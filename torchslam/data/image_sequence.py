@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import size_text
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.image_file import bit_depth, read_grey, read_pixels
+from torchslam.data.image_file import bit_depth, read_colour, read_grey, read_pixels
 from torchslam.data.sequence import Sequence
 from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
@@ -74,15 +74,23 @@ class ImageSequence(Sequence):
     def image(self, index: int) -> Tensor:
         entry = self._entries[index]
         image = read_grey(entry.path, entry.where, self._bits)
-        size = (image.shape[-1], image.shape[-2])
-        if size != self.size:
-            raise FrameError(
-                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
-            )
+        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        return image
+
+    def colour(self, index: int) -> Tensor:
+        entry = self._entries[index]
+        image = read_colour(entry.path, entry.where)
+        self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 
     def image_name(self, index: int) -> str:
         return str(self._entries[index].path)
+
+    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
+        if size != self.size:
+            raise FrameError(
+                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
+            )
 
 
 def _check_order(name: str, entries: Listed[ImageEntry]) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from torchslam.data import archive
+from torchslam.data import archive, live
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, parse_calibration
 from torchslam.data.masks import Masked
 from torchslam.data.readers import find_reader
 from torchslam.data.sequence import Sequence
 from torchslam.data.suggestions import why_nothing
+from torchslam.data.synthetic import sequence as synthetic
 from torchslam.data.transforms import cut, resize, thin
 from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
@@ -56,6 +57,12 @@ def open_sequence(
     if limit is not None or stride != 1:
         sequence = sequence.part(stop=None if limit is None else limit * stride, stride=stride)
     return sequence if resize_to is None else resize(sequence, resize_to)
+
+
+def full_name(path: str | Path) -> str:
+    """What opens the same sequence from another folder too."""
+    path = str(path)
+    return path if synthetic.matches(path) or live.matches(path) else str(Path(path).absolute())
 
 
 def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:

@@ -63,17 +63,21 @@ class Resized(Transformed):
         super().__init__(whole, camera=None if camera is None else scale_camera(camera, size), size=size)
 
     def image(self, index: int) -> Tensor:
-        grey = super().image(index)[0, 0].numpy()
-        smaller = self.size[0] <= grey.shape[1] and self.size[1] <= grey.shape[0]
-        return torch.from_numpy(
-            cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-        )[None, None]
+        return self._resized(super().image(index)[0, 0])[None, None]
+
+    def colour(self, index: int) -> Tensor:
+        return self._resized(super().colour(index))
 
     def mask(self, index: int) -> Tensor | None:
         mask = super().mask(index)
         if mask is None:
             return None
         return F.interpolate(mask.float(), self.size[::-1], mode="nearest-exact") > 0
+
+    def _resized(self, image: Tensor) -> Tensor:
+        smaller = self.size[0] <= image.shape[1] and self.size[1] <= image.shape[0]
+        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        return torch.from_numpy(cv2.resize(image.numpy(), self.size, interpolation=interpolation))
 
 
 def scale_camera(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.image_file import bgr_to_tensor, grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
 
@@ -64,12 +64,10 @@ class VideoSequence(Sequence):
         )
 
     def image(self, index: int) -> Tensor:
-        grey = self._read(self._frames[index])
-        if grey is None:
-            raise FrameError(f"{self.image_name(index)}: cannot be decoded")
-        if (grey.shape[1], grey.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
-        return grey_to_tensor(grey)
+        return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
+
+    def colour(self, index: int) -> Tensor:
+        return bgr_to_tensor(self._frame(index))
 
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
@@ -82,8 +80,16 @@ class VideoSequence(Sequence):
             self._position += 1
         return times
 
+    def _frame(self, index: int) -> np.ndarray:
+        frame = self._read(self._frames[index])
+        if frame is None:
+            raise FrameError(f"{self.image_name(index)}: cannot be decoded")
+        if (frame.shape[1], frame.shape[0]) != self.size:
+            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        return frame
+
     def _read(self, frame: int) -> np.ndarray | None:
-        """The (H, W) uint8 grey frame; those in between are skipped without conversion."""
+        """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion."""
         if frame < self._position:
             self._capture.release()
             self._capture.open(str(self._path))
@@ -95,7 +101,7 @@ class VideoSequence(Sequence):
             self._position += 1
         self._position += 1
         decoded, image = self._capture.read()
-        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if decoded else None
+        return image if decoded else None
 
 
 def matches(path: str) -> bool:

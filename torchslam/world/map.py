@@ -128,6 +128,7 @@ class Map:
             positions_w=positions_w,
             covariances_w=like.new_zeros(n, 3, 3) if covariances_w is None else covariances_w,
             descriptors=descriptors,
+            colors=torch.zeros(n, 3, dtype=torch.uint8, device=like.device),
             normals_w=like.new_zeros(n, 3),
             reach=like.new_zeros(n),
             angles=like.new_zeros(n),
