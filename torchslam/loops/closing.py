@@ -22,7 +22,9 @@ from torchslam.world.map import Map
 from torchslam.world.world import World
 
 _ITERATIONS = 20
-_SIDE = 20  # keyframes on either side of a seam that are searched for the other side's points: what a visit has
+_SIDE = (
+    20  # keyframes on either side of a seam that are searched for the other side's points: what a visit has
+)
 
 
 def close_loop(found: Recognition, camera: Camera, config: Config) -> None:
@@ -87,6 +89,9 @@ def sew_on(world: World, keyframe: int, camera: Camera, config: Config) -> None:
     earlier = other_visits(world.map, keyframe)
     if len(earlier):
         sew(world.map, world.map.ids(keyframe), earlier, camera, config)
+        track = world.track  # looks for the heirs of merged points
+        track.local_points = torch.unique(world.map.resolve(track.local_points))
+        track.seen_last = world.map.resolve(track.seen_last)
 
 
 def other_visits(slam_map: Map, keyframe: int) -> Tensor:
