@@ -12,10 +12,12 @@ from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, sim3_inverse
 from torchslam.geometry.alignment import umeyama
 from torchslam.loops.closing import close_loop, corrected, join, other_visits, sew, sew_on, weld
+from torchslam.loops.memory import Memory
 from torchslam.loops.recognition import Recognition
 from torchslam.loops.relation import Relation, relate
 from torchslam.tracking.tracker import Tracker
 from torchslam.world.world import World
+from torchslam.world.worlds import Worlds
 
 CONFIG = Config()
 SCENE = Scene.of(300)
@@ -209,3 +211,16 @@ def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) ->
     (loose, _), (tied, different) = counts
     assert loose > 1.2 * different
     assert tied == different
+
+
+def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
+    for enabled in (True, False):
+        world, worlds = two_visits(S_21), Worlds(CAMERA.params)
+        worlds._worlds = [world]
+        memory = Memory(CAMERA, load_config(None, [f"loops.enabled={str(enabled).lower()}"]), worlds)
+        for keyframe in range(world.map.num_keyframes):
+            memory.add(world.map, keyframe)
+        last = world.map.num_keyframes - 1
+        points = world.map.num_points
+        assert memory.recognize(world, last) is None
+        assert (world.map.num_points < points) is enabled
