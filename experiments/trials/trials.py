@@ -36,6 +36,8 @@ LOOKALIKE_CAMERA = "460.8,460.8,255.5,191.5"  # a guess: the focal length is 0.9
 CUTS = {"redkitchen": (20, 190), "machine_hall": (0, 130), "shelf_bin": (0, 50)}
 LENDERS = {"redkitchen": "machine_hall", "machine_hall": "redkitchen", "shelf_bin": "machine_hall"}
 HARD_LOOP = "synthetic:loop?noise=12&blur=1.5"
+STOREY = "synthetic:storey?noise=6&blur=1"
+SEEDS = (1, 2, 3)  # of textures, furniture and noise of the hard loop, beside 0
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,13 @@ TRIALS: dict[str, Trial] = {
     "loss/two_parts": Trial(partial(frames, "redkitchen", (0, 250), (720, 1000))),
     "loop/closed": Trial(partial(frames, HARD_LOOP)),
     "loop/open": Trial(partial(frames, HARD_LOOP), ("loops.enabled=false",)),
+    **{f"loop/closed_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}")) for seed in SEEDS},
+    **{
+        f"loop/open_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}"), ("loops.enabled=false",))
+        for seed in SEEDS
+    },
+    "loop/storey": Trial(partial(frames, STOREY)),
+    "loop/storey_open": Trial(partial(frames, STOREY), ("loops.enabled=false",)),
     "loop/corridors": Trial(partial(frames, "synthetic:corridors")),
     "loop/lookalike": Trial(lookalike),
     **{

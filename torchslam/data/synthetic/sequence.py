@@ -19,6 +19,7 @@ from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, room, wall
+from torchslam.data.synthetic.storey import storey
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
@@ -55,6 +56,8 @@ SCENES = {
     "loop": Scene(rooms, paths.round_the_core, 670, 720),
     # Ends before the start comes into sight: what looks like a return is none. With 720 frames it returns.
     "corridors": Scene(corridors, paths.round_the_core, 670, 560),
+    # A corridor all around with a room on the way, and 100 frames on, over the start.
+    "storey": Scene(storey, paths.round_the_storey, 1160, 1260),
 }
 
 
