@@ -16,6 +16,7 @@ from typing import Any, Literal, Protocol, get_args
 import torch
 from torch import Tensor
 from torch._C import _are_functorch_transforms_active
+from torch._C._functorch import TransformType, get_interpreter_stack
 from torch.func import grad, vjp, vmap
 
 from torchslam.geometry.precision import full_precision
@@ -79,7 +80,15 @@ class Minimization(Protocol):
 
 
 def minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
-    """What `problem.minimize` finds: theta with its implicit derivatives to the inputs, the rest detached."""
+    """What `problem.minimize` finds: theta with its implicit derivatives to the inputs, the rest detached.
+
+    Raises RuntimeError for forward mode within forward mode, in which torch would drop a part without a word.
+    """
+    stack = (get_interpreter_stack() or ()) if _are_functorch_transforms_active() else ()
+    if sum(transform.key() == TransformType.Jvp for transform in stack) > 1:
+        raise RuntimeError(
+            "forward mode within forward mode is not supported: take torch.func.jacfwd of torch.func.jacrev"
+        )
     return _Minimum.apply(problem, *inputs)
 
 
