@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
 
 # Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
@@ -34,6 +35,7 @@ class _Nearest(NamedTuple):
     mutual: Tensor
 
 
+@full_precision
 def match(
     features_1: Features,
     features_2: Features,
@@ -84,6 +86,7 @@ def match(
     return _matches(nearest.column, nearest.distance, mask, weights)
 
 
+@full_precision
 def match_projected(
     descriptors: Tensor,
     pixels: Tensor,

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.lie import so3_exp, vee
+from torchslam.geometry.precision import full_precision
 
 
+@full_precision
 def umeyama(
     source: Tensor,
     target: Tensor,

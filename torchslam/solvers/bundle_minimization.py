@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.solvers.bundle_model import Bundle, Estimate, Inputs, Layout, build_layout
-from torchslam.solvers.implicit import Tensors
+from torchslam.solvers.folding import Tensors
+from torchslam.solvers.implicit import Ndims
 from torchslam.solvers.levenberg import Progress, minimize
 from torchslam.solvers.residuals import Observations, linearize
 from torchslam.solvers.robust import Kernel
@@ -44,7 +45,7 @@ class BundleMinimization:
 
     num_unknowns = 3
     num_vectors = 3
-    ndims = None
+    ndims: tuple[Ndims, Ndims, Ndims] | None = None
 
     def __init__(
         self,

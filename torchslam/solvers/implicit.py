@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 from torch._C import _are_functorch_transforms_active
 from torch._C._functorch import TransformType, get_interpreter_stack
-from torch.func import grad, vjp, vmap
+from torch.func import grad, vjp
 
 from torchslam.geometry.precision import full_precision
+from torchslam.solvers.folding import InDims, Tensors, folded, leading, looped, many_times
 
 Backward = Literal["implicit", "unroll", "truncated", "detached"]
 """How gradients pass a minimisation.
@@ -30,8 +31,7 @@ Backward = Literal["implicit", "unroll", "truncated", "detached"]
 "detached":  none
 """
 
-Tensors = tuple[Tensor, ...]
-InDims = Sequence[int | None]
+Ndims = tuple[int, ...]
 
 
 def check_backward(backward: str) -> None:
@@ -50,7 +50,7 @@ class Minimization(Protocol):
 
     num_unknowns: int
     num_vectors: int
-    ndims: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]] | None
+    ndims: tuple[Ndims, Ndims, Ndims] | None
     """Dimensions of the tensors of a vector, of found and of inputs without that of a batch, which may lead each of
     them; None where there are no batches."""
 
@@ -140,9 +140,9 @@ class _Minimum(torch.autograd.Function):
             return _Minimum.apply(problem, *tensors)
 
         if problem.ndims is None:
-            found = _looped(apply, info.batch_size, in_dims[1:], inputs)
+            found = looped(apply, info.batch_size, in_dims[1:], inputs)
         else:
-            found = _folded(apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs))
+            found = folded(apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs))
         return found, (0,) * len(found)
 
 
@@ -153,7 +153,7 @@ class _Solve(torch.autograd.Function):
     @full_precision
     def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
         right, found, inputs = _parts(problem, num_found, tensors)
-        return tuple(_many(problem.factorized(found, inputs), many)(right))
+        return tuple(many_times(problem.factorized(found, inputs), many)(right))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
@@ -171,7 +171,7 @@ class _Solve(torch.autograd.Function):
 
         def curvature(tensors: Tensors) -> Tensor:
             at = _split(tensors, len(found))
-            return -_many(lambda ends: _curvature(problem, *at, *ends), many)((direction, adjoint)).sum()
+            return -many_times(lambda ends: _curvature(problem, *at, *ends), many)((direction, adjoint)).sum()
 
         needed = ctx.needs_input_grad[3 + problem.num_vectors :]
         return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
@@ -186,7 +186,9 @@ class _Solve(torch.autograd.Function):
         def change_of_curvature(probe: Tensors) -> Tensor:
             def curvature(tensors: Tensors) -> Tensor:
                 at = _split(tensors, len(found))
-                return _many(lambda ends: _curvature(problem, *at, *ends), many)((direction, probe)).sum()
+                return many_times(lambda ends: _curvature(problem, *at, *ends), many)(
+                    (direction, probe)
+                ).sum()
 
             return _along(curvature, (*found, *inputs), changes[len(right) :])
 
@@ -204,16 +206,16 @@ class _Solve(torch.autograd.Function):
         dims, count = in_dims[3:], problem.num_vectors
         if all(dim is None for dim in dims[count:]):
             right, found, inputs = _parts(problem, num_found, tensors)
-            right = tuple(_leading(x, dim, info.batch_size) for x, dim in zip(right, dims, strict=False))
+            right = tuple(leading(x, dim, info.batch_size) for x, dim in zip(right, dims, strict=False))
             return _solve(problem, right, found, inputs, many + 1), (0,) * count
 
         def apply(*tensors: Tensor) -> Tensors:
             return _Solve.apply(problem, many, num_found, *tensors)
 
         if problem.ndims is None:
-            return _looped(apply, info.batch_size, dims, tensors), (0,) * count
+            return looped(apply, info.batch_size, dims, tensors), (0,) * count
         before = (many,) * count + (0,) * (len(tensors) - count)
-        solved = _folded(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
+        solved = folded(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
         return tuple(part.movedim(many, 0) for part in solved), (0,) * count
 
 
@@ -223,10 +225,13 @@ def _solve(
     return _Solve.apply(problem, many, len(found), *right, *found, *inputs)
 
 
-def _parts(problem: Minimization, num_found: int, tensors: Sequence[Tensor]) -> tuple[Tensors, ...]:
+def _parts(
+    problem: Minimization, num_found: int, tensors: Sequence[Tensor]
+) -> tuple[Tensors, Tensors, Tensors]:
     """A vector, found and inputs."""
     right, rest = _split(tensors, problem.num_vectors)
-    return right, *_split(rest, num_found)
+    found, inputs = _split(rest, num_found)
+    return right, found, inputs
 
 
 def _split(tensors: Sequence[Tensor], count: int) -> tuple[Tensors, Tensors]:
@@ -271,7 +276,7 @@ def _gradient(
         given = iter(wanted)
         return function(tuple(next(given) if need else x for x, need in zip(tensors, needed, strict=True)))
 
-    value, pull = vjp(of, *(x for x, need in zip(tensors, needed, strict=True) if need))
+    value, pull = vjp(of, *(x for x, need in zip(tensors, needed, strict=True) if need))[:2]
     grads = iter(pull(torch.ones_like(value)))
     return [next(grads) if need else None for need in needed]
 
@@ -287,55 +292,3 @@ def _along(
         if slope is not None and change is not None
     ]
     return torch.stack(products).sum()
-
-
-def _many(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
-    """A function of tensors, over `many` more leading dimensions of them."""
-    for _ in range(many):
-        function = vmap(function)
-    return function
-
-
-def _leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
-    """A tensor whose elements run along its first dimension."""
-    return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
-
-
-def _looped(function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]) -> Tensors:
-    """One element after the other."""
-    rows = [
-        function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
-        for row in range(size)
-    ]
-    return tuple(torch.stack(parts) for parts in zip(*rows, strict=True))
-
-
-def _folded(
-    function: Callable[..., Tensors],
-    size: int,
-    dims: InDims,
-    tensors: Sequence[Tensor],
-    ndims: Sequence[int],
-    before: Sequence[int],
-) -> Tensors:
-    """All elements at once, in the batch that the function knows, which comes after `before` dimensions."""
-    batched = [
-        x.ndim - (dim is not None) > ndim + skip
-        for x, dim, ndim, skip in zip(tensors, dims, ndims, before, strict=True)
-    ]
-    batch = next(
-        x.shape[skip + (dim is not None and dim <= skip)]
-        for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True)
-        if has
-    )
-    folded = []
-    for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True):
-        if dim is None and not has:
-            folded.append(x)
-            continue
-        x = _leading(x, dim, size).movedim(0, skip)
-        if not has:
-            x = x.unsqueeze(skip + 1).expand(*x.shape[: skip + 1], batch, *x.shape[skip + 1 :])
-        folded.append(x.flatten(skip, skip + 1))
-    skip = before[0]
-    return tuple(part.unflatten(skip, (size, batch)) for part in function(*folded))

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.solvers.implicit import Backward, Tensors, check_backward, minimum
+from torchslam.solvers.folding import Tensors
+from torchslam.solvers.implicit import Backward, Ndims, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence, minimize
 from torchslam.solvers.linear import factorize
 from torchslam.solvers.pose_expansion import PoseModel, PoseObservations
@@ -96,12 +97,12 @@ def refine_pose(
     else:
         attached = backward == "implicit"
         found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
-    refined, success, cost, *convergence = found
+    refined, success, cost, steps, converged, initial_cost = found
     if backward == "truncated":
         problem = _PoseProblem(inputs)
         last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))
         refined = torch.where(success[:, None, None], last, refined)
-    return RefinedPose(refined, cost, success, Convergence(*convergence, cost), inputs)
+    return RefinedPose(refined, cost, success, Convergence(steps, converged, initial_cost, cost), inputs)
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,7 @@ class _Minimization:
     def __init__(self, inputs: _Inputs, iterations: int, tolerance: float) -> None:
         self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
         prior = () if inputs.prior is None else (2, 2)
-        self.ndims = (1,), (2, 0, 0, 0, 0, 0), (2, 2, 2, 1, 1, 1, *prior)
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (1,), (2, 0, 0, 0, 0, 0), (2, 2, 2, 1, 1, 1, *prior)
 
     def minimize(self, inputs: Tensors) -> Tensors:
         T_cw, problem = inputs[0], _PoseProblem(self.inputs.replaced(inputs[1:]))

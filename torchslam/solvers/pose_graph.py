@@ -97,7 +97,7 @@ def pose_graph_optimize(
     else:
         attached = backward == "implicit"
         found = minimum(minimization, tensors if attached else [x.detach() for x in tensors])
-    solution, success, moving, cost, *convergence = found
+    solution, success, moving, cost, steps, converged, initial_cost = found
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
     if backward == "implicit":
         solution = torch.where(moving[..., None, None], solution, inputs.S_cw)
@@ -108,7 +108,7 @@ def pose_graph_optimize(
 
     row = slice(None) if graph.S_cw.ndim == 4 else 0
     return PoseGraphSolution(
-        solution[row], cost[row], success[row], moving[row], Convergence(*convergence, cost)
+        solution[row], cost[row], success[row], moving[row], Convergence(steps, converged, initial_cost, cost)
     )
 
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchslam.solvers.implicit import Tensors
+from torchslam.solvers.folding import Tensors
+from torchslam.solvers.implicit import Ndims
 from torchslam.solvers.levenberg import minimize
 from torchslam.solvers.pose_graph_layout import Layout, build_layout
 from torchslam.solvers.pose_graph_model import Inputs, PoseGraphProblem, linearize, pull_back, push, retract
@@ -22,7 +23,7 @@ class PoseGraphMinimization:
 
     num_unknowns = 1
     num_vectors = 1
-    ndims = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1))
+    ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1))
 
     def __init__(self, edges: Tensor, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
         self.edges, self.dims, self.kernel = edges, dims, kernel
