@@ -13,7 +13,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 
 from tests.solvers.test_graph import simulated
 from tests.solvers.test_pose_graph import make_scene
-from torchslam.geometry import se3_exp, sim3_exp
+from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
 from torchslam.solvers import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
 from torchslam.solvers.graph import solve
 
@@ -28,7 +28,7 @@ def pose_problem(pose_scene, model="pinhole", with_prior=False) -> Problem:
 
     def poses(x: Tensor) -> Tensor:
         """Of what all enter: pixels, points, weights, camera, scale and prior."""
-        pixels = scene.pixels + x[:2, None]
+        pixels = scene.pixels + x[:2]
         points = torch.cat((scene.points_w[:, :1] + 0.01 * x[None, None, 2:5], scene.points_w[:, 1:]), dim=1)
         weights = 1 + x[5].square() * torch.linspace(0, 1, 12, dtype=torch.float64).view(2, 6)
         camera = scene.camera.with_params(scene.camera.params * (1 + 0.01 * x[6]))
@@ -67,7 +67,7 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
 
 
 def graph_problem() -> Problem:
-    _, graph = simulated(frames=5, points=10)
+    _, graph = simulated(frames=7, points=12)
 
     def poses(x: Tensor) -> Tensor:
         ramp = torch.linspace(-1, 1, len(graph.pixels), dtype=torch.float64)[:, None]
@@ -77,13 +77,15 @@ def graph_problem() -> Problem:
             weights=graph.weights * (1 + x[2] * ramp[:, 0].square()),
             camera=graph.camera.with_params(graph.camera.params * (1 + 0.01 * x[3])),
         )
-        return solve(moved, "cauchy", 3.0, **CONVERGED).T_cw[:, :3]
+        T_cw = solve(moved, "cauchy", 3.0, **CONVERGED).T_cw
+        centres = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
+        return torch.cat((T_cw[:, :3, :3].flatten(), (centres / centres.norm()).flatten()))
 
     return poses, torch.linspace(-0.3, 0.4, 4, dtype=torch.float64)
 
 
 def pose_graph_problem(with_scale=True) -> Problem:
-    graph = make_scene(nodes=5, with_scale=with_scale).graph
+    graph = make_scene(nodes=4, with_scale=with_scale).graph
 
     def nodes(x: Tensor) -> Tensor:
         twist = torch.nn.functional.pad(x[:3] * torch.ones(len(graph.edges), 1, dtype=torch.float64), (1, 3))

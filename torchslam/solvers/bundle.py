@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.solvers.bundle_minimization import BundleMinimization, Found
+from torchslam.solvers.bundle_minimization import BundleMinimization, Found, Given
 from torchslam.solvers.bundle_model import Inputs
 from torchslam.solvers.implicit import Backward, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence, Progress
@@ -119,26 +119,16 @@ def bundle_adjust(
     counted, finite_frames, inputs = _sanitized(problem, scale)
     free_frames = ~_as_mask(problem.fixed_frames, len(problem.T_cw), problem.T_cw.device)
     free_points = ~_as_mask(problem.fixed_points, len(problem.points_w), problem.T_cw.device)
-    minimization = BundleMinimization(
-        problem.frame_index,
-        problem.point_index,
-        free_frames,
-        free_points,
-        problem.camera,
-        kernel,
-        free_camera,
-        iterations,
-        tolerance,
-        progress,
-    )
-    tensors = (*inputs, counted, finite_frames)
+    minimization = BundleMinimization(problem.camera, kernel, free_camera, iterations, tolerance, progress)
+    indices = problem.frame_index, problem.point_index
+    tensors = Given(*inputs, counted, finite_frames, *indices, free_frames, free_points)
     if backward == "unroll":
         found = Found(*minimization.minimize(tensors))
     else:
         attached = backward == "implicit"
         found = Found(*minimum(minimization, tensors if attached else [x.detach() for x in tensors]))
     detached = [x.detach() for x in tensors]
-    solution = minimization.at_minimum(found, inputs) if backward == "implicit" else found.estimate
+    solution = minimization.at_minimum(found, tensors) if backward == "implicit" else found.estimate
     if backward == "truncated":
         solution = minimization.last_step(found, tensors)
     return BundleSolution(

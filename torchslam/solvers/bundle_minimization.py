@@ -39,9 +39,27 @@ class Found(NamedTuple):
         return Estimate(self.T_cw, self.points_w, self.params)
 
 
+class Given(NamedTuple):
+    """All that a bundle adjustment is made of: the tensors of `bundle_model.Inputs`, which observations count (O,) and
+    which frames are finite (F,), and the rows of `BundleProblem` and what may move, (F,), (P,)."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    pixels: Tensor
+    weights: Tensor
+    params: Tensor
+    scale: Tensor
+    counted: Tensor
+    finite_frames: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    free_frames: Tensor
+    free_points: Tensor
+
+
 class BundleMinimization:
-    """A bundle adjustment; its inputs are those of `bundle_model.Inputs`, which observations count (O,) and which
-    frames are finite (F,). Vectors are frames (F, 6), points (P, 3) and camera (K,), K = 0 where that is fixed."""
+    """A bundle adjustment of inputs `Given`; vectors are frames (F, 6), points (P, 3) and camera (K,), K = 0 where that
+    is fixed."""
 
     num_unknowns = 3
     num_vectors = 3
@@ -49,10 +67,6 @@ class BundleMinimization:
 
     def __init__(
         self,
-        frame_index: Tensor,
-        point_index: Tensor,
-        free_frames: Tensor,
-        free_points: Tensor,
         camera: Camera,
         kernel: Kernel,
         free_camera: bool,
@@ -60,21 +74,22 @@ class BundleMinimization:
         tolerance: float,
         progress: Progress | None,
     ) -> None:
-        self.frame_index, self.point_index = frame_index, point_index
-        self.free_frames, self.free_points = free_frames, free_points
         self.camera, self.kernel, self.free_camera = camera, kernel, free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
         self._last: tuple[Tensor, Layout] | None = None
 
     def minimize(self, inputs: Tensors) -> Found:
-        bundle, finite_frames = self._bundle(inputs), inputs[-1]
+        given = Given(*inputs)
+        bundle = self._bundle(given)
         layout = bundle.layout
         model, convergence = minimize(bundle, bundle.start, self.iterations, self.tolerance, self.progress)
         with torch.no_grad():
-            success = bundle.solvable[0] & bundle.factorized(model).reduced.definite & finite_frames.all()
-        moved_frames = torch.zeros_like(self.free_frames)
+            success = (
+                bundle.solvable[0] & bundle.factorized(model).reduced.definite & given.finite_frames.all()
+            )
+        moved_frames = torch.zeros_like(given.free_frames)
         moved_frames[layout.free_frames] = True
-        used = torch.zeros_like(inputs[-2])
+        used = torch.zeros_like(given.counted)
         used[layout.observations] = True
         T_cw, points_w, params = model.estimate
         return Found(
@@ -93,7 +108,7 @@ class BundleMinimization:
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         found = Found(*found)
-        bundle = self._bundle(inputs)
+        bundle = self._bundle(Given(*inputs))
         layout = bundle.layout
         with torch.no_grad():
             exact = bundle.exact_factorized(self._ordered(found, layout))
@@ -112,18 +127,18 @@ class BundleMinimization:
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
         frames, points, camera = direction
-        found, given = Found(*found), Inputs(*inputs[:6])
+        found, given = Found(*found), Given(*inputs)
         T_cw, points_w, params = self.at_minimum(found, given)
-        T_cw = T_cw.index_select(0, self.frame_index)
-        points_c = (T_cw[:, :3, :3] @ points_w.index_select(0, self.point_index)[..., None]).squeeze(-1)
+        T_cw = T_cw.index_select(0, given.frame_index)
+        points_c = (T_cw[:, :3, :3] @ points_w.index_select(0, given.point_index)[..., None]).squeeze(-1)
         points_c = points_c + T_cw[:, :3, 3]
         weights = torch.where(found.used, given.weights, 0.0)
         observed = Observations(
             given.pixels, weights, self.camera.with_params(params), self.kernel, given.scale
         )
         lin = linearize(observed, points_c, self.free_camera)
-        velocity = move(points_c, frames.index_select(0, self.frame_index))
-        moving = points.index_select(0, self.point_index)[..., None]
+        velocity = move(points_c, frames.index_select(0, given.frame_index))
+        moving = points.index_select(0, given.point_index)[..., None]
         velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
         if self.free_camera:
             velocity = torch.cat((velocity, camera.expand(len(velocity), -1)), dim=-1)
@@ -143,7 +158,7 @@ class BundleMinimization:
         frames, points, params = gradient
         return pull_back(found[0], frames), points, params if self.free_camera else params[:0]
 
-    def at_minimum(self, found: Found, inputs: Inputs) -> Estimate:
+    def at_minimum(self, found: Found, inputs: Given) -> Estimate:
         """The minimum where things moved, the inputs, with their derivatives, where they did not."""
         return Estimate(
             torch.where(found.moved_frames[:, None, None], found.T_cw, inputs.T_cw),
@@ -153,29 +168,28 @@ class BundleMinimization:
 
     def last_step(self, found: Found, inputs: Tensors) -> Estimate:
         """The estimate after one more step from the minimum, with the gradient of that step."""
-        bundle = self._bundle(inputs)
-        start = self._ordered(self.at_minimum(found, Inputs(*inputs[:6])), bundle.layout)
+        bundle = self._bundle(Given(*inputs))
+        start = self._ordered(self.at_minimum(found, Given(*inputs)), bundle.layout)
         model = bundle.evaluate(start, ~bundle.solvable)
         solution, _ = bundle.step(model, torch.zeros_like(model.cost))
         return solution._replace(points_w=solution.points_w[bundle.layout.point_rank])
 
     def marginals(self, found: Found, inputs: Sequence[Tensor]) -> Marginals:
         with torch.no_grad():
-            bundle = self._bundle(inputs)
+            bundle = self._bundle(Given(*inputs))
             return bundle.marginals(self._ordered(found, bundle.layout))
 
     def _ordered(self, estimate: Found | Estimate, layout: Layout) -> Estimate:
         return Estimate(estimate.T_cw, estimate.points_w.index_select(0, layout.point_order), estimate.params)
 
-    def _bundle(self, inputs: Sequence[Tensor]) -> Bundle:
-        layout = self._layout(inputs[-2])
-        return Bundle(layout, Inputs(*inputs[:6]), self.camera, self.kernel, self.free_camera)
+    def _bundle(self, given: Given) -> Bundle:
+        return Bundle(self._layout(given), Inputs(*given[:6]), self.camera, self.kernel, self.free_camera)
 
-    def _layout(self, counted: Tensor) -> Layout:
+    def _layout(self, given: Given) -> Layout:
         """The layout for the observations that count; the last one is kept, which mostly is the next one."""
-        if self._last is None or not torch.equal(self._last[0], counted):
+        if self._last is None or not torch.equal(self._last[0], given.counted):
             layout = build_layout(
-                self.frame_index, self.point_index, counted, self.free_frames, self.free_points
+                given.frame_index, given.point_index, given.counted, given.free_frames, given.free_points
             )
-            self._last = counted, layout
+            self._last = given.counted, layout
         return self._last[1]

@@ -16,17 +16,18 @@ from torchslam.solvers.robust import Kernel
 
 
 class PoseGraphMinimization:
-    """A pose graph; its inputs are those of `pose_graph_model.Inputs`, edges that count (B, E), fixed nodes (B, K).
+    """A pose graph; its inputs are those of `pose_graph_model.Inputs`, edges that count (B, E), fixed nodes (B, K), and
+    the edges (E, 2).
 
     Found are the nodes (B, K, 4, 4), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
     """
 
     num_unknowns = 1
     num_vectors = 1
-    ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1))
+    ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1, 2))
 
-    def __init__(self, edges: Tensor, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
-        self.edges, self.dims, self.kernel = edges, dims, kernel
+    def __init__(self, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
+        self.dims, self.kernel = dims, kernel
         self.iterations, self.tolerance = iterations, tolerance
         self._last: tuple[tuple[Tensor, Tensor], Layout] | None = None
 
@@ -50,7 +51,7 @@ class PoseGraphMinimization:
         return solve
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
-        given, (xi,), (i, j) = Inputs(*inputs[:4]), direction, self.edges.unbind(-1)
+        given, (xi,), (i, j) = Inputs(*inputs[:4]), direction, inputs[6].unbind(-1)
         S_cw = torch.where(found[2][..., None, None], found[0], given.S_cw)
         lin = linearize(S_cw, i, j, inputs[4], given, self.kernel)
         xi_i, xi_j = xi.index_select(1, i)[..., None], xi.index_select(1, j)[..., None]
@@ -75,9 +76,9 @@ class PoseGraphMinimization:
     def _problem(self, inputs: Tensors) -> PoseGraphProblem:
         return PoseGraphProblem(self._layout(*inputs[4:]), Inputs(*inputs[:4]), self.kernel)
 
-    def _layout(self, counted: Tensor, fixed: Tensor) -> Layout:
+    def _layout(self, counted: Tensor, fixed: Tensor, edges: Tensor) -> Layout:
         """The layout for what counts and is fixed; the last one is kept, which mostly is the next one."""
         key = counted, fixed
         if self._last is None or not all(map(torch.equal, self._last[0], key)):
-            self._last = key, build_layout(self.edges, counted, fixed, self.dims)
+            self._last = key, build_layout(edges, counted, fixed, self.dims)
         return self._last[1]
