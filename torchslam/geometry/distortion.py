@@ -46,9 +46,9 @@ def first_positive_root(coefficients: Tensor) -> Tensor:
     monic whichever coefficients vanish.
     """
     degree = coefficients.shape[-1]
-    companion = torch.zeros(*coefficients.shape, degree, dtype=coefficients.dtype, device=coefficients.device)
-    companion[..., 0, :] = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)
-    companion[..., 1:, :-1] = torch.eye(degree - 1, dtype=companion.dtype, device=companion.device)
+    first = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)[..., None, :]
+    shift = torch.eye(degree, dtype=first.dtype, device=first.device)[:-1]
+    companion = torch.cat((first, shift.expand(*first.shape[:-2], degree - 1, degree)), dim=-2)
     inverse = torch.linalg.eigvals(companion)
     real = inverse.imag.abs() <= 1e-6 * inverse.abs()
     largest = torch.where(real, inverse.real, 0.0).amax(-1)
