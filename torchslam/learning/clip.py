@@ -72,11 +72,11 @@ def clip_loss(
                 is left; with a number each of them costs that much, without gradient. A failed clip never counts as one
                 without error: a front end could learn to fail.
     """
+    if isinstance(on_failure, str) and on_failure not in ("raise", "skip"):
+        raise ValueError(f"on_failure must be 'raise', 'skip' or a number, not {on_failure!r}")
     reasons = [f"clip {index}: {reason}" for index, reason in enumerate(poses.reason) if reason]
     if reasons and (on_failure == "raise" or (on_failure == "skip" and len(reasons) == len(poses.reason))):
         raise ClipError(f"{len(reasons)} of {len(poses.reason)} clips failed; {'; '.join(reasons)}")
-    if isinstance(on_failure, str) and on_failure not in ("raise", "skip"):
-        raise ValueError(f"on_failure must be 'raise', 'skip' or a number, not {on_failure!r}")
     price = 0.0 if isinstance(on_failure, str) else float(on_failure)
     errors = torch.where(poses.success, error(poses.T_cw, T_cw_groundtruth, poses.posed), price)
     counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success

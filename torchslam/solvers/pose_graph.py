@@ -88,8 +88,7 @@ def pose_graph_optimize(
     """
     check_backward(backward)
     counted, fixed, inputs = _sanitized(graph, scale)
-    minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance
-    )
+    minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
     tensors = (*inputs, counted, fixed, graph.edges)
     if backward == "unroll":
         found = minimization.minimize(tensors)
