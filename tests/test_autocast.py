@@ -131,7 +131,7 @@ def estimator_cases() -> dict[str, Case]:
         "rpe": (evaluation.rpe, (se3_exp(normal(9, 6)), se3_exp(normal(9, 6, seed=1)))),
         "match": (
             lambda a, b: torchslam.match(features(a, a[..., :2]), features(b, b[..., :2]), temperature=0.1),
-            (unit(1, 30, 64), unit(1, 30, 64) + 0.05 * normal(1, 30, 64, seed=1)),
+            (unit(1, 30, 64), unit(1, 30, 64, seed=1)),
         ),
         "match_projected": (
             lambda a, at: torchslam.match_projected(a, at, 9.0, features(a.flip(1), at.flip(1))),
