@@ -23,8 +23,8 @@ def umeyama(
     may hold anything. Returns scale (...), R (..., 3, 3), t (..., 3).
 
     Differentiable (once; a second time raises RuntimeError) in points and weights, on exact data and at repeated
-    singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors. With fewer
-    than three points, or collinear ones, the result is finite and one of many minimisers, and its gradient
+    singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
+    With fewer than three points, or collinear ones, the result is finite and one of many minimisers, and its gradient
     leaves out the free direction.
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
