@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from torch.func import jacfwd, jacrev
 
 from torchslam.data import open_sequence
 from torchslam.data.association import interpolate_poses
@@ -268,3 +269,28 @@ def test_agrees_with_evo_on_real_trajectories(name: str, data_dir: Path, generat
     assert evaluation.ate_se3_m == pytest.approx(expected["ate_se3_m"], rel=1e-9)
     assert evaluation.rpe_translation_m == pytest.approx(expected["translation_m"], rel=1e-9)
     assert evaluation.rpe_rotation_deg == pytest.approx(expected["rotation_deg"], rel=1e-6)
+
+
+def test_too_few_poses_have_no_error(generator: torch.Generator) -> None:
+    poses = _poses(generator, 4).requires_grad_()
+    truth = _poses(generator, 4)
+    for count in range(5):
+        mask = torch.arange(4) < count
+        errors = torch.stack((ate(poses, truth, mask), *rpe(poses, truth, mask=mask)))
+        assert errors.isnan().all() == (count < 3)
+        (gradient,) = torch.autograd.grad(errors.sum(), poses)
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any() == (count >= 3)
+    alone = rpe(poses, truth, delta=2, mask=torch.tensor([True, True, False, False]), with_scale=False)
+    assert torch.stack(alone).isnan().all()
+
+
+def test_the_error_has_derivatives_in_both_directions_once(generator: torch.Generator) -> None:
+    poses, truth = _poses(generator, 5), _poses(generator, 5)
+    reverse, forward = (transform(lambda x: ate(x, truth))(poses) for transform in (jacrev, jacfwd))
+    torch.testing.assert_close(forward, reverse, rtol=0, atol=1e-12)
+    assert (reverse != 0).any()
+    leaf = poses.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(ate(leaf, truth), leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivative"):
+        gradient.square().sum().backward()

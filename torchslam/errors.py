@@ -35,3 +35,7 @@ class DownloadError(TorchslamError):
 
 class InitializationError(TorchslamError):
     """No map could be initialised; the message says why (standstill, pure rotation, too few matches)."""
+
+
+class ClipError(TorchslamError):
+    """A clip to learn from has no poses to compare."""

@@ -320,3 +320,12 @@ def test_numpy_reference_of_the_windows() -> None:
     assert set(zip(row.tolist(), column.tolist(), strict=True)) == set(
         zip((b * 60 + i).tolist(), (b * 70 + j).tolist(), strict=True)
     )
+
+
+def test_descriptors_of_another_length_are_an_error():
+    generator = torch.Generator().manual_seed(0)
+    descriptors = torch.nn.functional.normalize(torch.randn(1, 5, 8, generator=generator), dim=-1)
+    ones = torch.ones(1, 5)
+    features = Features(torch.zeros(1, 5, 2), ones, ones, 0 * ones, descriptors, ones > 0)
+    with pytest.raises(ValueError, match="unit length"):
+        match(features, replace(features, descriptors=1.1 * descriptors))

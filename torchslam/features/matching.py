@@ -13,12 +13,15 @@ import torch
 from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
 
 # Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
 _AMPLITUDE = 64
 _INDEX_BITS = 13
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
+
+_LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
@@ -34,6 +37,7 @@ class _Nearest(NamedTuple):
     mutual: Tensor
 
 
+@full_precision
 def match(
     features_1: Features,
     features_2: Features,
@@ -84,6 +88,7 @@ def match(
     return _matches(nearest.column, nearest.distance, mask, weights)
 
 
+@full_precision
 def match_projected(
     descriptors: Tensor,
     pixels: Tensor,
@@ -318,3 +323,7 @@ def _check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
             f"descriptors must be two (B, N, D) of one type, got {tuple(descriptors_1.shape)} {descriptors_1.dtype} "
             f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"
         )
+    for descriptors in (descriptors_1, descriptors_2) if descriptors_1.is_floating_point() else ():
+        lengths = torch.linalg.vector_norm(descriptors.detach(), dim=-1)
+        if bool(((lengths - 1).abs() > _LENGTH_TOLERANCE)[lengths > 0].any()):
+            raise ValueError("descriptors must have unit length, or be zero where there is no keypoint")

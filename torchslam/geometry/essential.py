@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import skew
+from torchslam.geometry.precision import full_precision
 
 # The unknowns are x, y, z in E = x E_0 + y E_1 + z E_2 + E_3. The monomials by their powers of x, y, z: first those
 # that are eliminated, then x, y and 1 times powers of z (Nister, 2004, table 1).
@@ -25,6 +26,7 @@ _GRID = 256  # intervals in which to look for sign changes
 _NEWTON_STEPS = 5
 
 
+@full_precision
 def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     """Essential matrices of samples of five matches, with the sample that each belongs to.
 
@@ -197,11 +199,13 @@ def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(inverse, 1 / z, z), row
 
 
+@full_precision
 def essential_from_pose(R_21: Tensor, t_21: Tensor) -> Tensor:
     """E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
     return skew(t_21) @ R_21
 
 
+@full_precision
 def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
     """The two rotations and the direction, up to sign, of essential matrices of any scale.
 
@@ -223,6 +227,7 @@ def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
     return R / size[..., None, None, None], t * size[..., None].rsqrt()
 
 
+@full_precision
 def sampson_errors(
     E: Tensor,
     x_1: Tensor,

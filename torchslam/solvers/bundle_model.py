@@ -25,10 +25,9 @@ from torchslam.solvers.schur import (
     Marginals,
     NormalEquations,
     Structure,
-    Tangent,
     build_structure,
 )
-from torchslam.solvers.tangent import move, pull_back, retract
+from torchslam.solvers.tangent import retract
 
 _MIN_POINTS_PER_FRAME = 3
 _MIN_FRAMES_PER_POINT = 2
@@ -192,21 +191,9 @@ class Bundle:
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         return Marginals(factor * frames, factor * points[layout.point_rank], factor * camera)
 
-    def adjoint(self, minimum: Estimate, gradient: Estimate) -> Tensor:
-        """g(minimum, inputs) . lambda with H lambda = gradient of the loss in the unknowns, for `implicit.attach`."""
-        layout = self.layout
-        with torch.no_grad():
-            exact = self._exact_equations(minimum).factorized(gauge=self._gauge(minimum.T_cw))
-            direction = exact.solve(self._tangent(minimum, gradient))
-        at = self.at_minimum(minimum)
-        lin, points_c, R_cw = self._linearize(at)
-        motion = direction.frames.new_zeros(len(at.T_cw), 6).index_copy(
-            0, layout.free_frames, direction.frames
-        )
-        velocity = move(points_c, motion[layout.frame_index])
-        velocity = velocity + (R_cw @ direction.points[layout.point_index][..., None]).squeeze(-1)
-        velocity = torch.cat((velocity, direction.camera.expand(len(velocity), -1)), dim=-1)
-        return (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
+    def exact_factorized(self, estimate: Estimate) -> FactorizedEquations:
+        """The exact Hessian at a minimum, ready to be solved."""
+        return self._exact_equations(estimate).factorized(gauge=self._gauge(estimate.T_cw))
 
     def _linearize(self, estimate: Estimate) -> tuple[Linearization, Tensor, Tensor]:
         """Errors, points in the camera frame (O', 3) and rotations (O', 3, 3) of the observing frames."""
@@ -227,22 +214,3 @@ class Bundle:
         expansion = exact_expansion(self._observations(estimate), points_c, self.free_camera)
         layout = self.layout
         return assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
-
-    def _tangent(self, estimate: Estimate, gradient: Estimate) -> Tangent:
-        """The gradient of a loss in the unknowns, from its gradient in poses, points and parameters."""
-        frames = self.layout.free_frames
-        return Tangent(
-            pull_back(estimate.T_cw[frames], gradient.T_cw[frames]),
-            gradient.points_w,
-            gradient.params if self.free_camera else gradient.params[:0],
-        )
-
-    def at_minimum(self, minimum: Estimate) -> Estimate:
-        """The minimum where things move, the inputs, with their graph, where they are fixed."""
-        frames = torch.zeros(len(minimum.T_cw), dtype=torch.bool, device=minimum.T_cw.device)
-        frames[self.layout.free_frames] = True
-        return Estimate(
-            torch.where(frames[:, None, None], minimum.T_cw, self.start.T_cw),
-            torch.where(self.layout.free_points[:, None], minimum.points_w, self.start.points_w),
-            minimum.params if self.free_camera else self.start.params,
-        )
