@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
-from torchslam.features import hamming, match, match_projected
+from torchslam.features import match, match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.values import View
 from torchslam.world.map import Map
@@ -28,13 +28,6 @@ class Projected:
 def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
     """The threshold for this kind of descriptor: bits, or 1 - cosine."""
     return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
-
-
-def descriptor_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """(n1, n2) float32 distances of all pairs: Hamming for bits, 1 - cosine for floats."""
-    if descriptors_1.dtype == torch.uint8:
-        return hamming(descriptors_1[None], descriptors_2[None])[0].float()
-    return 1.0 - descriptors_1.float() @ descriptors_2.float().mT
 
 
 def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:

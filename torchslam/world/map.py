@@ -141,8 +141,8 @@ class Map:
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
 
-    def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
-        """Note that keypoints (n,) of a keyframe, which see nothing yet, see points (n,)."""
+    def observe(self, keyframe: int | Tensor, keypoint_index: Tensor, point_ids: Tensor) -> None:
+        """Note that keypoints (n,) of a keyframe, or of one each (n,), which see nothing yet, see points (n,)."""
         self._index_of_points.add(point_ids, keyframe * self._keypoints + keypoint_index)
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)
