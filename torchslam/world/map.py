@@ -85,6 +85,13 @@ class Map:
             mask=points["alive"][point_ids][None],
         )
 
+    def features(self, keyframes: Tensor) -> Features:
+        """What keyframes (k,) saw, as a batch, for matching."""
+        table = self.keyframes
+        scales, mask = table["scales"][keyframes], table["mask"][keyframes]
+        keypoints, angles, descriptors = (table[name][keyframes] for name in ("keypoints", "angles", "descriptors"))
+        return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
+
     def centre_covariances_w(self) -> Tensor:
         """(K, 3, 3) covariances of the positions of the keyframes, zero where unknown."""
         R_cw = self.T_cw[:, :3, :3]
