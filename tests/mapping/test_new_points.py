@@ -32,7 +32,7 @@ def half_known(T_cw: Tensor, noise: float = 0.0) -> Map:
 def triangulated(slam_map: Map, *overrides: str) -> Tensor:
     """(n,) rows of the points that keyframes 1 and 0 make."""
     before = len(slam_map.points)
-    triangulate_against(slam_map, 1, [0], CAMERA, load_config(None, overrides))
+    triangulate_against(slam_map, 1, 0, CAMERA, load_config(None, overrides))
     return torch.arange(before, len(slam_map.points))
 
 

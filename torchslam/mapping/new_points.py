@@ -21,54 +21,35 @@ from torchslam.geometry import (
 from torchslam.tracking.correspondences import max_distance
 from torchslam.values import Features, View
 from torchslam.world.map import NO_POINT, Map
-from torchslam.world.observers import first_of_each
 
 
-def triangulate_against(
-    slam_map: Map, keyframe: int, neighbours: list[int], camera: Camera, config: Config
-) -> None:
-    """Add the points that a keyframe and one of others see with enough parallax and that neither has in the map yet.
-
-    A keypoint that might make a point with several of them makes it with the first.
-    """
+def triangulate_against(slam_map: Map, keyframe: int, neighbour: int, camera: Camera, config: Config) -> None:
+    """Add the points that two keyframes see with enough parallax and that neither has in the map yet."""
     settings = config.mapping
-    T_1w, view_1 = slam_map.T_cw[keyframe], slam_map.view(keyframe)
-    found = []
-    for neighbour in neighbours:
-        if has_baseline(slam_map, keyframe, neighbour, settings.min_baseline):
-            rows = (free_keypoints(slam_map, each) for each in (keyframe, neighbour))
-            T_21 = slam_map.T_cw[neighbour] @ se3_inverse(T_1w)
-            first, second = match_along_epipolar_lines(
-                view_1, slam_map.view(neighbour), *rows, T_21, camera, settings.epipolar_px, config.matching
-            )
-            found.append(torch.stack([first, second, torch.full_like(first, neighbour)]))
-    if not found:
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbour]
+    if not has_baseline(slam_map, keyframe, neighbour, settings.min_baseline):
         return
-    first, second, others = torch.cat(found, dim=1)
-    # Each match is a batch of one point, as it has a second camera of its own.
-    T_2w = slam_map.T_cw[others]
-    pixels_1, scale_1 = view_1.keypoints[first, None], view_1.scales[first, None]
-    pixels_2, scale_2 = (slam_map.keyframes[name][others, second, None] for name in ("keypoints", "scales"))
-    seen = triangulate(T_1w, T_2w, pixels_1, pixels_2, camera, camera)
+    view_1, view_2 = slam_map.view(keyframe), slam_map.view(neighbour)
+    free_1 = torch.nonzero(view_1.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))[:, 0]
+    free_2 = torch.nonzero(view_2.mask & (slam_map.keyframes["point_ids"][neighbour] == NO_POINT))[:, 0]
+    T_21 = T_2w @ se3_inverse(T_1w)
+    first, second = match_along_epipolar_lines(
+        view_1, view_2, free_1, free_2, T_21, camera, settings.epipolar_px, config.matching
+    )
+    seen = triangulate(T_1w, T_2w, view_1.keypoints[first], view_2.keypoints[second], camera, camera)
+    scale_1, scale_2 = view_1.scales[first], view_2.scales[second]
     limit = config.measurement.chi_square
     good = seen.mask & fits(seen.errors_1**2, scale_1, limit) & fits(seen.errors_2**2, scale_2, limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
-    good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_1.scale_range)
+    good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, view_2.scale_range)
     keep = torch.nonzero(good)[:, 0]
-    keep = keep[first_of_each(first[keep])]
-    first, second, others, points_w = first[keep], second[keep], others[keep], seen.points_w[keep]
+    points_w = seen.points_w[keep]
     covariances_w = triangulation_covariance(
-        T_1w, T_2w[keep], points_w, scale_1[keep], scale_2[keep], camera, camera
+        T_1w, T_2w, points_w, scale_1[keep], scale_2[keep], camera, camera
     )
-    ids = slam_map.add_points(points_w[:, 0], view_1.descriptors[first], keyframe, covariances_w[:, 0])
-    slam_map.observe(keyframe, first, ids)
-    slam_map.observe(others, second, ids)
-
-
-def free_keypoints(slam_map: Map, keyframe: int) -> Tensor:
-    """(n,) the keypoints of a keyframe that see no point yet."""
-    keyframes = slam_map.keyframes
-    return torch.nonzero(keyframes["mask"][keyframe] & (keyframes["point_ids"][keyframe] == NO_POINT))[:, 0]
+    ids = slam_map.add_points(points_w, view_1.descriptors[first[keep]], keyframe, covariances_w)
+    slam_map.observe(keyframe, first[keep], ids)
+    slam_map.observe(neighbour, second[keep], ids)
 
 
 def has_baseline(slam_map: Map, keyframe: int, neighbour: int, least: float) -> bool:
@@ -128,7 +109,7 @@ def has_consistent_scale(
     scale_range: tuple[float, float],
     factor: float = 1.8,
 ) -> Tensor:
-    """(..., n) whether a point's size in the two images agrees with its distances: scale falls as distance grows."""
+    """(n,) whether a point's size in the two images agrees with its distances: scale falls as distance grows."""
     distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
     expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(*scale_range)
