@@ -54,6 +54,21 @@ def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
     assert torch.equal(here.map.points["times_observed"][points], before[points] + 1)
 
 
+def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
+    together, apart = world(4), world(4)
+    for here in (together, apart):
+        points, _ = free(here.map, 3, 6)
+        double(here.map, 2, 6)
+        free(here.map, 1, 9)
+    points = together.map.points_seen_by(torch.arange(4))
+    found = find_in(together.map, torch.tensor([3, 1, 2]), points, CAMERA, Config())
+    one_by_one = [find_in(apart.map, torch.tensor([k]), points, CAMERA, Config()) for k in (3, 1, 2)]
+    for pairs, wanted in zip(found, zip(*one_by_one, strict=True), strict=True):
+        assert torch.equal(pairs, torch.cat(wanted))
+    assert torch.equal(together.map.keyframes["point_ids"], apart.map.keyframes["point_ids"])
+    assert len(found[0]) >= 6
+
+
 def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
     here = world()
     seen = here.map.points_seen_by(torch.tensor([1]))

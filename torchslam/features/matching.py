@@ -179,9 +179,7 @@ def _nearest_bits(
     return _Nearest(column, nearest, second, nearest <= distance(column_best).gather(1, column))
 
 
-def _nearest_floats(
-    similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
-) -> _Nearest:
+def _nearest_floats(similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> _Nearest:
     """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
     values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
     best, column = values.max(2)

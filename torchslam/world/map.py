@@ -89,7 +89,9 @@ class Map:
         """What keyframes (k,) saw, as a batch, for matching."""
         table = self.keyframes
         scales, mask = table["scales"][keyframes], table["mask"][keyframes]
-        keypoints, angles, descriptors = (table[name][keyframes] for name in ("keypoints", "angles", "descriptors"))
+        keypoints, angles, descriptors = (
+            table[name][keyframes] for name in ("keypoints", "angles", "descriptors")
+        )
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
 
     def centre_covariances_w(self) -> Tensor:

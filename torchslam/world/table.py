@@ -13,8 +13,8 @@ class Table:
 
     The schema fixes names, shapes and kinds; the first `append` fixes dtypes, device and the sizes that the schema
     leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. What is appended
-    is detached: a world holds values, not graphs. Memory is made outside of inference mode, so that autograd may read it
-    and anybody write it, whoever made the world.
+    is detached: a world holds values, not graphs. Its memory is made outside of inference mode, so that autograd may
+    read it and anybody may write it.
     """
 
     def __init__(self, schema: Schema) -> None:
