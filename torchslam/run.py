@@ -200,7 +200,7 @@ def finish(
     adjusting: Progress | None = None,
 ) -> Run:
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
-    with torch.no_grad():
+    with torch.inference_mode():
         slam.conclude()
     try:
         for world in slam.session.worlds:

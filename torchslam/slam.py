@@ -125,7 +125,7 @@ class SLAM:
 
     # --- the way of a frame ----------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, frame: Frame) -> StepResult:
         """Process one frame. A frame without a pose is no error: the result says why there is none.
 
@@ -381,6 +381,7 @@ class SLAM:
             posed = track_back(self.tracker, behind, reversed(earlier), self.config.judge, self._take)
         self.waiting.remove(posed)
 
+    @torch.inference_mode(False)  # poses that leave may become part of a graph
     def _result(
         self,
         view: View,
@@ -395,7 +396,7 @@ class SLAM:
             state=self.state,
             T_cw=None if world is None else world.T_cw,
             world=None if world is None else world.number,
-            covariance=None if tracked is None else tracked.covariance,
+            covariance=None if tracked is None else tracked.covariance.clone(),
             is_keyframe=is_keyframe,
             matches=tracked.matches if tracked else 0,
             inliers=tracked.inliers if tracked else 0,

@@ -109,5 +109,5 @@ def sew(slam_map: Map, here: Tensor, there: Tensor, camera: Camera, config: Conf
     """Find what keyframes (k,) see in others (l,), and the other way round; merge what turns out to be one point."""
     for keyframes, others in ((here, there), (there, here)):
         points = slam_map.points_seen_by(others)
-        merge(slam_map, [find_in(slam_map, one, points, camera, config) for one in keyframes.tolist()])
+        merge(slam_map, *find_in(slam_map, keyframes, points, camera, config))
     slam_map.refresh(torch.unique(torch.cat([here, there])))
