@@ -25,6 +25,7 @@ from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.backwards import track_back
+from torchslam.tracking.independent_motion import NOTHING, IndependentMotion, Movement
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
@@ -126,6 +127,9 @@ class SLAM:
         self.last_frame: tuple[int, float] | None = None  # index and timestamp
         self.memory = Memory(self.camera, self.config, self.worlds)
         self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
+        self.independent_motion = IndependentMotion(
+            self.camera, self.config.independent_motion, self.config.matching
+        )
         self.waiting = Waiting(self.config.initialization.max_waiting)
         self.world: World | None = None  # the one that is followed
         self._seek()
@@ -176,7 +180,7 @@ class SLAM:
             if self.last_frame is None:
                 self._check_kind(self.seen)
             self.last_frame = frame.index, frame.timestamp
-            return self.stillness.clear_of(self.seen)
+            return self.independent_motion.clear_of(self.stillness.clear_of(self.seen))
 
     def _check_kind(self, view: View) -> None:
         """Raises ConfigError where the front end is another one than that of the worlds."""
@@ -195,6 +199,9 @@ class SLAM:
         if tracked is None:
             return self._lose(world, view)
         doubt = why_doubt(tracked, expected, world.track, self.config.judge)
+        moves = NOTHING if doubt else self._independent(tracked)
+        if moves.is_doubt:
+            doubt = moves.words
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
@@ -207,11 +214,19 @@ class SLAM:
         if watch and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
             drop_covered(world, self.stillness.covers)
             why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
+        why = "; ".join(filter(None, [why, moves.words]))
         if self.youth is not None:
             self.youth.grow(view)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
         return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
+
+    def _independent(self, tracked: Tracked) -> Movement:
+        """What moves against the scene, by a pose that is believed so far."""
+        if not self.config.independent_motion.enabled:
+            return NOTHING
+        steady = self.stillness.clear_of(self.seen)
+        return self.independent_motion.observe(steady, tracked)
 
     def _take(self, world: World, view: View, tracked: Tracked) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing."""
@@ -235,6 +250,7 @@ class SLAM:
             self.world, keyframe = self.memory.take_up(found)
             self.tracker.follow(self.world, keyframe)
             self.stillness.forget_last()  # its pose was one of the map before
+            self.independent_motion.forget_last()
         return self.world
 
     def _tidy(self, world: World) -> None:
@@ -280,6 +296,7 @@ class SLAM:
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)
         self.stillness.forget_last()
+        self.independent_motion.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
 
