@@ -56,7 +56,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "asked": [each.asked for each in slam.worlds],
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
-    write_tensors(path, tensors | track | results | {"run.evidence": slam.stillness.evidence}, about)
+    write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
 
 
 def read_checkpoint(
@@ -121,7 +121,7 @@ def _go_on(
     session = Session(saved.camera, saved.worlds, saved.sessions - 1)
     slam.enter(session, world, (int(index), float(timestamp)))
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
-    slam.stillness.evidence.copy_(tensors["run.evidence"])
+    slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
 
 
 def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:

@@ -28,11 +28,11 @@ from torchslam.run import Run, run_sequence
 from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.backwards import track_back
+from torchslam.tracking.foreign import Foreign
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Relocalizer
-from torchslam.tracking.stillness import Stillness
 from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
@@ -111,7 +111,7 @@ class SLAM:
         self.tracker.counts = session.mapping
         self.last_frame = last_frame
         self.memory = Memory(self.camera, self.config, self.worlds)
-        self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
+        self.foreign = Foreign(self.camera, self.config)
         self.waiting = Waiting(self.config.initialization.max_waiting)
         self._seek()
         self.world: World | None = world  # the one that is followed
@@ -179,7 +179,7 @@ class SLAM:
             if self.last_frame is None:
                 self._check_kind(self.seen)
             self.last_frame = frame.index, frame.timestamp
-            return self.stillness.clear_of(self.seen)
+            return self.foreign.clear_of(self.seen)
 
     def _check_kind(self, view: View) -> None:
         """Raises ConfigError where the front end is another one than that of the worlds."""
@@ -198,6 +198,9 @@ class SLAM:
         if tracked is None:
             return self._lose(world, view)
         doubt = why_doubt(tracked, expected, world.track, self.config.judge)
+        moved = None if doubt else self.foreign.moves(tracked)
+        if moved and moved.is_doubt:
+            doubt = moved.words
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
@@ -206,10 +209,11 @@ class SLAM:
         if is_keyframe:
             world = self._recall(world)
             self._tidy(world)
-        watch = self.config.stillness.enabled and self.mapping
-        if watch and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
-            drop_covered(world, self.stillness.covers)
-            why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
+        foreign = moved.words if moved else ""
+        if self.mapping and self.foreign.stays(world.T_cw, tracked.depth):
+            drop_covered(world, self.foreign.stillness.covers)
+            foreign = "some of the image does not move with the scene and is left out"
+        why = "; ".join(filter(None, [why, foreign]))
         if self.youth is not None:
             self.youth.grow(view)
             if self._replace(self.youth):
@@ -239,7 +243,7 @@ class SLAM:
                 self.settle()
             self.world, keyframe = self.memory.take_up(found)
             self.tracker.follow(self.world, keyframe)
-            self.stillness.forget_last()  # its pose was one of the map before
+            self.foreign.forget_last()  # its pose was one of the map before
         return self.world
 
     def _tidy(self, world: World) -> None:
@@ -284,7 +288,7 @@ class SLAM:
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)
-        self.stillness.forget_last()
+        self.foreign.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
 
@@ -302,7 +306,7 @@ class SLAM:
             return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
-            self.stillness.add(self.initializer.still)
+            self.foreign.stillness.add(self.initializer.still)
             if start is not None:
                 reason = self._begin(start, self.initializer.views)
         if reason:
@@ -349,7 +353,7 @@ class SLAM:
             start = youth.rival(self.camera, self.config)
             replaced = start is not None and not self._begin(start, youth.views)
         if replaced:
-            self.stillness.forget_last()  # its pose was one of the map before
+            self.foreign.forget_last()  # its pose was one of the map before
         return replaced
 
     def settle(self) -> None:
