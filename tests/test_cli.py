@@ -231,6 +231,7 @@ BAD_ARGUMENTS = [
     (["run", "synthetic:palace"], "palace"),
     (["info", "nowhere"], "nowhere"),
     (["plot", "nowhere"], "nowhere"),
+    (["export", "nowhere", "--to", "ply"], "nowhere"),
     (["eval", "nowhere.txt", "nowhere.txt"], "nowhere.txt"),
     (["download", "kitti/00"], "eth3d/NAME"),
 ]
@@ -321,7 +322,7 @@ def test_plot_of_an_incomplete_folder_names_what_is_missing(
     assert "trajectory.txt" in err
 
 
-@pytest.mark.parametrize("command", ["run", "demo", "eval", "plot", "info", "download"])
+@pytest.mark.parametrize("command", ["run", "demo", "eval", "plot", "export", "info", "download"])
 def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
@@ -334,6 +335,8 @@ def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
         ["run", ROOM, "-o", "x", "--resume", "--overwrite"],
         ["run", ROOM],
         ["run", ROOM, "-o", "x", "--features", "sift"],
+        ["export", "x"],
+        ["export", "x", "--to", "obj"],
         ["fly"],
         [],
     ):

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from torch.func import jacfwd, jacrev
 
 from torchslam.data import open_sequence
 from torchslam.data.association import interpolate_poses
 from torchslam.errors import TrajectoryError
-from torchslam.evaluation import ate, evaluate, rpe
+from torchslam.evaluation import ate, ate_apart, evaluate, rpe
 from torchslam.geometry.lie import quaternion_from_matrix, rigid, se3_exp, se3_inverse, so3_exp
 from torchslam.values import Trajectory
 
@@ -103,6 +104,29 @@ def test_too_few_poses_in_common(generator: torch.Generator) -> None:
         evaluate(Trajectory(_times(2), T_wc[:2]), groundtruth)
     with pytest.raises(TrajectoryError, match="0 of 0 estimated poses"):
         evaluate(Trajectory(_times(0), T_wc[:0]), groundtruth)
+
+
+def test_parts_in_frames_of_their_own_are_aligned_each_by_itself(generator: torch.Generator) -> None:
+    truth = Trajectory(_times(40), _poses(generator, 40))
+    first = Trajectory(truth.timestamps[:10], _moved(truth.T_wc[:10], 0.25))
+    second = Trajectory(truth.timestamps[10:], truth.T_wc[10:])
+    together = Trajectory(truth.timestamps, torch.cat([first.T_wc, second.T_wc]))
+    assert ate_apart([first, second], truth) < 1e-12 < evaluate(together, truth).ate_m
+    noisy = [Trajectory(part.timestamps, _noisy(part.T_wc, generator)) for part in (first, second)]
+    errors = [evaluate(part, truth).ate_m for part in noisy]
+    expected = math.sqrt((10 * errors[0] ** 2 + 30 * errors[1] ** 2) / 40)  # every pose counts alike
+    assert ate_apart(noisy, truth) == pytest.approx(expected)
+    assert ate_apart(noisy[:1], truth) == pytest.approx(errors[0])
+
+
+def test_parts_that_fit_any_path_are_left_out(generator: torch.Generator) -> None:
+    truth = Trajectory(_times(20), _poses(generator, 20))
+    part = Trajectory(truth.timestamps[:10], _noisy(truth.T_wc[:10], generator))
+    late = Trajectory(truth.timestamps[17:] + 0.2, truth.T_wc[17:])  # of its three poses, two have a true one
+    late.timestamps[0] = 1.8
+    assert ate_apart([part, late], truth) == pytest.approx(evaluate(part, truth).ate_m)
+    with pytest.raises(TrajectoryError, match="no world has 3 estimated poses"):
+        ate_apart([late], truth)
 
 
 def test_a_path_that_stands_still_is_finite() -> None:
@@ -245,3 +269,28 @@ def test_agrees_with_evo_on_real_trajectories(name: str, data_dir: Path, generat
     assert evaluation.ate_se3_m == pytest.approx(expected["ate_se3_m"], rel=1e-9)
     assert evaluation.rpe_translation_m == pytest.approx(expected["translation_m"], rel=1e-9)
     assert evaluation.rpe_rotation_deg == pytest.approx(expected["rotation_deg"], rel=1e-6)
+
+
+def test_too_few_poses_have_no_error(generator: torch.Generator) -> None:
+    poses = _poses(generator, 4).requires_grad_()
+    truth = _poses(generator, 4)
+    for count in range(5):
+        mask = torch.arange(4) < count
+        errors = torch.stack((ate(poses, truth, mask), *rpe(poses, truth, mask=mask)))
+        assert errors.isnan().all() == (count < 3)
+        (gradient,) = torch.autograd.grad(errors.sum(), poses)
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any() == (count >= 3)
+    alone = rpe(poses, truth, delta=2, mask=torch.tensor([True, True, False, False]), with_scale=False)
+    assert torch.stack(alone).isnan().all()
+
+
+def test_the_error_has_derivatives_in_both_directions_once(generator: torch.Generator) -> None:
+    poses, truth = _poses(generator, 5), _poses(generator, 5)
+    reverse, forward = (transform(lambda x: ate(x, truth))(poses) for transform in (jacrev, jacfwd))
+    torch.testing.assert_close(forward, reverse, rtol=0, atol=1e-12)
+    assert (reverse != 0).any()
+    leaf = poses.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(ate(leaf, truth), leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivative"):
+        gradient.square().sum().backward()

@@ -62,7 +62,7 @@ def half(config: Config = CONFIG) -> tuple[SLAM, Progressed]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
-    slam.stillness.evidence[3, 4] = 1  # too little to matter
+    slam.foreign.stillness.evidence[3, 4] = 1  # too little to matter
     slam.memory.recalls.append(Recall(20, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
@@ -84,7 +84,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
         plain = {"T_cw": None, "covariance": None}
         assert replace(after, **plain) == replace(before, **plain, stage_ms=times)
     assert resumed.last_frame == slam.last_frame
-    assert resumed.session == 0
+    assert resumed.session.number == 0
     assert resumed.is_settled
     assert resumed.world is not None
     assert slam.world is not None
@@ -96,7 +96,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
         assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
             column.name
         )
-    assert torch.nonzero(resumed.stillness.evidence).tolist() == [[3, 4]]
+    assert torch.nonzero(resumed.foreign.stillness.evidence).tolist() == [[3, 4]]
 
 
 def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def test_a_saved_map_is_loaded_and_saved_with_the_same_bytes(
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == first[2].read_bytes()
     assert loaded.camera.size == WALK.camera.size
-    assert loaded.session == 1
+    assert loaded.session.number == 1
 
 
 def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_pat
     assert len(run.graph.timestamps) == len(both)  # frames of the same number in both sessions are two
     assert evaluate(world.trajectory(0), WALK.groundtruth).ate_m < 1e-3
     slam.save(tmp_path / "grown")
-    assert SLAM.load(tmp_path / "grown", config_of(), eyes()).session == 2
+    assert SLAM.load(tmp_path / "grown", config_of(), eyes()).session.number == 2
 
 
 def test_a_third_session_knows_the_keyframes_of_both(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
@@ -198,5 +198,5 @@ def test_a_second_run_is_refused_until_reset(before: Callable[[SLAM], object]) -
     with pytest.raises(TorchslamError, match=r"reset\(\).*SLAM.load\(\)"):
         slam.run(WALK.part(0, 5))
     slam.reset()
-    assert slam.session == 0
+    assert slam.session.number == 0
     assert len(slam.run(WALK.part(0, 12)).trajectory) == 12

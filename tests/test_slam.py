@@ -14,12 +14,14 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, there_and_elsewhere, turn
 from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
 from torchslam.errors import ConfigError, FrameError
-from torchslam.evaluation import ate
+from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
-from torchslam.slam import FOUND_AGAIN
+from torchslam.slam import FOUND_AGAIN, STARTED_ANEW
 from torchslam.tracking.tracker import Tracker
+from torchslam.values import Start, View
+from torchslam.world.world import World
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -109,6 +111,29 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
 
+def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk = Gap(arc(60)[:42])
+    with monkeypatch.context() as patch:
+        patch.setattr(SLAM, "conclude", SLAM.settle)
+        without = run_walk(walk)
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    run = slam.run(walk)
+    assert [r.state for r in run.results[-2:]] == [State.UNCERTAIN] * 2
+    assert run.history.frames["frame_index"][-2:].tolist() == [40, 41]
+    assert len(run.trajectory) == 37
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
+    assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
+    assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
+    whole = Gap(arc(60))
+    states = [slam.step(whole[index]).state for index in range(42, 46)]
+    assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
+    assert states[-1] is State.TRACKING
+    frames = slam.history.frames["frame_index"]
+    assert len(torch.unique(frames)) == len(frames) == 41
+
+
 class Glimpse(Walk):
     """From frame 25 on the camera is where nothing was ever seen, but for one frame that shows frame 20 again."""
 
@@ -148,6 +173,39 @@ def test_a_start_must_explain_the_frames_since_its_reference(
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
 
 
+@pytest.mark.parametrize("explained", [True, False])
+def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
+    explained: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No support is enough here: whatever start the first and the last frame make is a rival."""
+    few = ("initialization.min_matches=30", "initialization.min_points=20")
+    walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
+    monkeypatch.setattr("torchslam.tracking.youth.LEAST_SUPPORT", 2.0)
+    found, founded = Founder.found, []
+
+    def counted(founder: Founder, world: World, start: Start, views: list[View]) -> str:
+        founded.append(views)
+        return found(founder, world, start, views) if explained or len(founded) == 1 else "it does not"
+
+    monkeypatch.setattr(Founder, "found", counted)
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
+    run = slam.run(walk)
+    anew = [r for r in run.results if r.reason == STARTED_ANEW]
+    assert len(founded) > 1
+    assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
+    assert len(run.trajectory) == 30
+    assert len(run.worlds) == 1
+    assert run.worlds[0].number == len(anew)
+    if explained:
+        assert len(anew) == len(founded) - 1
+        assert all(r.is_keyframe and r.state is State.TRACKING for r in anew)
+        assert len(slam.memory.places) == run.map.num_keyframes
+        assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-4
+    else:
+        assert not anew
+        assert torch.equal(run.trajectory.T_wc, plain.trajectory.T_wc)
+
+
 def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:
     """A camera that stands at first: there is nothing to begin with before it moves."""
     walk = Walk(torch.cat([still(6), arc(60)[1:20]]))
@@ -170,6 +228,8 @@ def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
     assert set(worlds) == {0, 1}
     assert worlds[0] == worlds[-1] == 0
     assert len(run.worlds) == 1
+    assert sum(len(part) for part in run.online_parts) == len(worlds) > len(run.online)
+    assert ate_apart(run.online_parts, walk.groundtruth) < 0.01
     assert len(run.trajectory) == len(walk)
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 

@@ -11,7 +11,7 @@ from torchslam.errors import TorchslamError
 from torchslam.evaluation import evaluate
 from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, triangulate, umeyama
-from torchslam.learning.clip import ClipPoses, ClipSLAM
+from torchslam.learning.clip import ClipPoses, ClipSLAM, clip_loss
 from torchslam.run import Run
 from torchslam.slam import SLAM
 from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
@@ -42,6 +42,7 @@ __all__ = [
     "Trajectory",
     "XFeat",
     "bundle_adjust",
+    "clip_loss",
     "estimate_absolute_pose",
     "estimate_relative_pose",
     "evaluate",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import astuple, fields, replace
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,10 @@ from torchslam.errors import ResultsError
 from torchslam.front_end import Extractor
 from torchslam.loops.recognition import Recall
 from torchslam.run import Progressed
+from torchslam.session import Session
 from torchslam.slam import SLAM
 from torchslam.values import State, StepResult
-from torchslam.world.map_file import pack, read_tensors, unpack, write_tensors
+from torchslam.world.map_file import Saved, pack, read_tensors, unpack, write_tensors
 from torchslam.world.track import Track
 
 STATES = tuple(State)
@@ -38,7 +39,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
     world = slam.world
     if world is None or not slam.is_settled:
         raise ValueError("a checkpoint needs a world that is followed and nothing that is held back")
-    tensors, about = pack(slam.worlds, slam.camera, slam.session + 1, slam.worlds.begun)
+    tensors, about = pack(slam.worlds, slam.camera, slam.session.count, slam.worlds.begun)
     whole = {column.name: getattr(world.track, column.name) for column in fields(Track)}
     track = {TRACK + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
@@ -55,7 +56,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "asked": [each.asked for each in slam.worlds],
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
-    write_tensors(path, tensors | track | results | {"run.evidence": slam.stillness.evidence}, about)
+    write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
 
 
 def read_checkpoint(
@@ -81,10 +82,9 @@ def read_checkpoint(
     own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("run.")}
     saved = unpack(path, tensors, about, device)
     slam = SLAM(saved.camera, config, extractor)
-    slam.enter(replace(saved, sessions=saved.sessions - 1))
     try:
         so_far = Progressed(run["next"], _results(own, run, device), run["skipped"])
-        _go_on(slam, own, run, device)
+        _go_on(slam, saved, own, run, device)
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
         raise ResultsError(f"{path}: {UNKNOWN}: {error}") from None
     return slam, so_far
@@ -94,17 +94,19 @@ def fingerprint(of: Sequence | Config) -> str:
     """What tells one sequence, or one configuration, from another."""
     if isinstance(of, Config):
         return hashlib.sha256(to_toml(of).encode()).hexdigest()
-    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), len(of)])
+    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.known_length])
     return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
 
 
-def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> None:
+def _go_on(
+    slam: SLAM, saved: Saved, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str
+) -> None:
     """Put the system to where it was."""
-    (world,) = (world for world in slam.worlds if world.number == run["world"])
+    (world,) = (world for world in saved.worlds if world.number == run["world"])
     columns: dict[str, Any] = {
         name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
     }
-    track = Track(**run["track"], **columns)
+    world.track = track = Track(**run["track"], **columns)
     for rows, count in (
         (track.seen_last, len(world.map.points)),
         (track.local_points, len(world.map.points)),
@@ -113,12 +115,13 @@ def _go_on(slam: SLAM, tensors: dict[str, Tensor], run: dict[str, Any], device: 
     ):
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
             raise ValueError(f"where the camera was names rows beyond {count}")
-    index, timestamp = run["last_frame"]
-    for each, asked in zip(slam.worlds, run["asked"], strict=True):
+    for each, asked in zip(saved.worlds, run["asked"], strict=True):
         each.asked = int(asked)
+    index, timestamp = run["last_frame"]
+    session = Session(saved.camera, saved.worlds, saved.sessions - 1)
+    slam.enter(session, world, (int(index), float(timestamp)))
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
-    slam.stillness.evidence.copy_(tensors["run.evidence"])
-    slam.resume(world, track, (int(index), float(timestamp)))
+    slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
 
 
 def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:

@@ -105,6 +105,20 @@ class StillnessConfig(Settings, section="stillness"):
 
 
 @dataclass(frozen=True)
+class IndependentMotionConfig(Settings, section="independent_motion"):
+    """When a part of the image moves against the scene, as people and cars do."""
+
+    enabled: bool = True
+    frames: int = setting(5, low=1)  # from one comparison to the next
+    min_error_px: float = setting(4.0, above=0)  # by which a match misses where a point of the scene can be
+    threshold_px: float = setting(2.0, above=0)  # of the motion that they share
+    min_matches: int = setting(20, low=5)
+    min_share: float = setting(0.5, low=0, high=1)  # of the matches that miss the scene
+    max_share: float = setting(2.0, above=0)  # of the image, as a multiple of what agrees with the map
+    max_unseen: int = setting(150, low=1)  # frames that it is followed without being seen to move
+
+
+@dataclass(frozen=True)
 class JudgeConfig(Settings, section="judge"):
     """When a pose is uncertain: it makes no keyframe and no point until later frames confirm it."""
 
@@ -191,6 +205,7 @@ class Config(Settings):
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     stillness: StillnessConfig = field(default_factory=StillnessConfig)
+    independent_motion: IndependentMotionConfig = field(default_factory=IndependentMotionConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)

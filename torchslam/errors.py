@@ -17,10 +17,6 @@ class CalibrationError(SequenceError):
     """A camera calibration is missing or wrong: NaN, negative focal length, too few numbers."""
 
 
-class MissingCalibrationError(CalibrationError):
-    """A sequence says nothing about its camera, and none was given."""
-
-
 class FrameError(TorchslamError):
     """One image of a sequence cannot be read or has another size. A run skips the frame and counts it."""
 
@@ -39,3 +35,7 @@ class DownloadError(TorchslamError):
 
 class InitializationError(TorchslamError):
     """No map could be initialised; the message says why (standstill, pure rotation, too few matches)."""
+
+
+class ClipError(TorchslamError):
+    """A clip to learn from has no poses to compare."""

@@ -7,6 +7,7 @@ Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 20
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,6 +18,7 @@ from torchslam.data.association import interpolate_poses, nearest
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
+from torchslam.geometry.precision import full_precision
 from torchslam.values import Trajectory
 
 TOLERANCE = 0.02
@@ -72,6 +74,7 @@ class Evaluation:
         }
 
 
+@full_precision
 def evaluate(
     estimate: Trajectory,
     groundtruth: Trajectory,
@@ -127,21 +130,49 @@ def evaluate(
     )
 
 
+def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
+    """The ATE of poses that were given in several worlds: RMS over all of them, metres.
+
+    Each part is aligned by a similarity of its own. When these poses were given, nothing was known of how their worlds
+    lie to each other; what was learned later would either better or worsen what was given then. The price: errors
+    between the parts do not show. Options as `evaluate` has them by default. Parts with fewer than three true poses,
+    which fit any path, are left out; raises TrajectoryError where none is left.
+    """
+    errors = [
+        evaluate(part, groundtruth).errors_m for part in parts if _compared(part, groundtruth) >= MIN_POSES
+    ]
+    if not errors:
+        raise TrajectoryError(
+            f"no world has {MIN_POSES} estimated poses with a true one within {TOLERANCE:g} s"
+        )
+    return float(_rms(torch.cat(errors).square()))
+
+
+def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
+    """How many poses of the estimate have a true one."""
+    truth = Trajectory(groundtruth.timestamps.double(), groundtruth.T_wc.detach().double())
+    times = estimate.timestamps.to(truth.T_wc)
+    return int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum())
+
+
+@full_precision
 def ate(
     T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = None, with_scale: bool = True
 ) -> Tensor:
     """Absolute trajectory error: the root mean square distance of camera centres after alignment, metres.
 
     T_cw, T_cw_groundtruth: (..., N, 4, 4), row by row at the same times; mask: (..., N) rows that count
-    Returns (...), differentiable, with a gradient of zero on exact data. Aligned by a similarity, or by a rigid
-    transform without `with_scale`.
+    Returns (...), differentiable, with a gradient of zero on exact data; NaN, with a gradient of zero, where fewer than
+    `MIN_POSES` rows count. Aligned by a similarity, or by a rigid transform without `with_scale`.
     """
     centres, truth = _centres(T_cw), _centres(T_cw_groundtruth)
     s, R, t = umeyama(centres, truth, mask, with_scale)
     moved = s[..., None, None] * centres @ R.mT + t[..., None, :]
-    return _rms((moved - truth).square().sum(-1), mask)
+    error = _rms((moved - truth).square().sum(-1), mask)
+    return torch.where(_enough(T_cw, mask), error, torch.nan)
 
 
+@full_precision
 def rpe(
     T_cw: Tensor,
     T_cw_groundtruth: Tensor,
@@ -153,7 +184,8 @@ def rpe(
 
     T_cw, T_cw_groundtruth: (..., N, 4, 4), row by row at the same times; mask: (..., N) rows that count
     Returns translation (...) metres and rotation (...) radians, differentiable. With `with_scale` the estimate takes
-    its scale from the alignment of `ate`.
+    its scale from the alignment of `ate`. Both are NaN, with a gradient of zero, where no two rows that count are
+    `delta` apart, or fewer than `MIN_POSES` count for that alignment.
     """
     if not 1 <= delta < T_cw.shape[-3]:
         raise ValueError(f"delta must be between 1 and {T_cw.shape[-3] - 1}, got {delta}")
@@ -164,7 +196,10 @@ def rpe(
     pairs = None if mask is None else mask[..., :-delta] & mask[..., delta:]
     translation = error[..., :3, 3].square().sum(-1)
     rotation = so3_log(error[..., :3, :3]).square().sum(-1)
-    return _rms(translation, pairs), _rms(rotation, pairs)
+    known = torch.ones_like(s, dtype=torch.bool) if pairs is None else pairs.any(-1)
+    known = known & _enough(T_cw, mask) if with_scale else known
+    errors = _rms(translation, pairs), _rms(rotation, pairs)
+    return torch.where(known, errors[0], torch.nan), torch.where(known, errors[1], torch.nan)
 
 
 def _associate(truth: Trajectory, times: Tensor, association: str, tolerance: float) -> tuple[Tensor, Tensor]:
@@ -188,6 +223,12 @@ def _ranges(times: Tensor, truth_times: Tensor) -> str:
 def _aligned(T_wc: Tensor, s: Tensor, R: Tensor, t: Tensor) -> Tensor:
     """Camera poses (N, 4, 4) after a similarity of the world."""
     return rigid(R @ T_wc[:, :3, :3], s * T_wc[:, :3, 3] @ R.mT + t)
+
+
+def _enough(T_cw: Tensor, mask: Tensor | None) -> Tensor:
+    """(...) bool, enough rows (..., N) count for an alignment to say something."""
+    rows = T_cw.new_ones(T_cw.shape[:-2], dtype=torch.bool) if mask is None else mask
+    return rows.sum(-1) >= MIN_POSES
 
 
 def _centres(T_cw: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torchslam.config import Config
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures, extractor
+from torchslam.features.masking import only_where
 from torchslam.geometry import Camera
 from torchslam.values import Features, Frame
 
@@ -17,10 +18,18 @@ Extractor = Callable[[Frame], Features]
 
 
 def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extractor:
-    """The front end that reads images, on a device."""
+    """The front end that reads images, on a device; under a frame's mask it finds nothing."""
     settings = config.features
     module = extractor(settings.kind, settings.num_keypoints, settings.weights or None).to(device)
-    return lambda frame: module(frame.image.to(device))
+
+    def extract(frame: Frame) -> Features:
+        if frame.mask is None:
+            return module(frame.image.to(device))
+        wanted = frame.mask.to(device)
+        # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
+        return only_where(module(frame.image.to(device), wanted), wanted)
+
+    return extract
 
 
 def check_size(frame: Frame, camera: Camera) -> None:
@@ -30,6 +39,8 @@ def check_size(frame: Frame, camera: Camera) -> None:
         raise FrameError(
             f"{_name(frame)} has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
         )
+    if frame.mask is not None and frame.mask.shape != frame.image.shape:
+        raise FrameError(f"{_name(frame)} has a mask of another shape, {tuple(frame.mask.shape)}")
 
 
 def check_order(frame: Frame, last: tuple[int, float] | None) -> None:

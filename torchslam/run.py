@@ -6,26 +6,41 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 
 from torchslam.config import Config
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
-from torchslam.front_end import simulated_extractor
+from torchslam.front_end import Extractor, simulated_extractor
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.loops.memory import Memory
+from torchslam.loops.recognition import Recall
 from torchslam.mapping.local_bundle import adjust_all
+from torchslam.session import Session
 from torchslam.solvers.graph import join, solve
 from torchslam.solvers.levenberg import Progress
-from torchslam.values import State, StepResult, Trajectory
+from torchslam.values import Frame, State, StepResult, Trajectory
 from torchslam.world.history import History, RunGraph
 from torchslam.world.map import Map
 from torchslam.world.world import World
 from torchslam.world.worlds import main_of
 
-if TYPE_CHECKING:
-    from torchslam.slam import SLAM
+
+class System(Protocol):
+    """What a run needs of what it feeds its frames to: of `torchslam.slam.SLAM`."""
+
+    camera: Camera
+    config: Config
+    extractor: Extractor | None
+    session: Session
+    memory: Memory
+    last_frame: tuple[int, float] | None
+
+    def step(self, frame: Frame) -> StepResult: ...
+
+    def conclude(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -37,6 +52,7 @@ class Run:
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
     failure:     why no frame has a pose; empty when some have
+    recalls:     the places that were recognised, which may have joined worlds
     session:     number of the run among those over the same map; frames and trajectories are those of this session
     sessions:    how many sessions the map has; one that was only localised is none of them
     """
@@ -48,6 +64,7 @@ class Run:
     skipped: list[str]
     interrupted: bool
     failure: str
+    recalls: tuple[Recall, ...] = ()
     session: int = 0
     sessions: int = 1
 
@@ -79,7 +96,24 @@ class Run:
     @property
     def online(self) -> Trajectory:
         """The poses as they were given, frame by frame, in the main world."""
-        number = None if self.main is None else self.main.number
+        return Trajectory.empty() if self.main is None else self._given_in(self.main.number)
+
+    @property
+    def online_parts(self) -> list[Trajectory]:
+        """The poses as they were given: in the main world, and in each world that became a part of it, each in its own.
+
+        What was given in worlds that were taken back, or that are still beside the main one, is not among them.
+        """
+        if self.main is None:
+            return []
+        numbers = [self.main.number]
+        joined = {frozenset((recall.world, recall.other)) for recall in self.recalls}
+        for number in numbers:
+            numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
+        return [part for number in numbers if len(part := self._given_in(number))]
+
+    def _given_in(self, number: int) -> Trajectory:
+        """The poses as they were given in the world of a number."""
         given = [result for result in self.results if result.T_cw is not None and result.world == number]
         if not given:
             return Trajectory.empty()
@@ -114,7 +148,7 @@ class Progressed:
 
 
 def run_sequence(
-    slam: SLAM,
+    slam: System,
     sequence: Sequence,
     progress: Callable[[StepResult], None] | None = None,
     so_far: Progressed | None = None,
@@ -140,9 +174,11 @@ def run_sequence(
         slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
     interrupted = False
     try:
-        for index in range(so_far.next, len(sequence)):
+        for index in sequence.indices(so_far.next):
             try:
                 so_far.results.append(slam.step(sequence[index]))
+            except EndOfSequence:
+                break
             except FrameError as error:
                 warnings.warn(f"skipped a frame: {error}", stacklevel=2)
                 so_far.skipped.append(str(error))
@@ -157,33 +193,34 @@ def run_sequence(
 
 
 def finish(
-    slam: SLAM,
+    slam: System,
     results: list[StepResult],
     skipped: list[str],
     interrupted: bool,
     adjusting: Progress | None = None,
 ) -> Run:
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
-    with torch.no_grad():
-        slam.settle()
+    with torch.inference_mode():
+        slam.conclude()
     try:
-        for world in slam.worlds:
-            if slam.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
+        for world in slam.session.worlds:
+            if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
                 adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
                 graph = world.history.graph(world.map, slam.camera)
                 world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
     except KeyboardInterrupt:
         interrupted = True
     return Run(
-        tuple(slam.worlds),
+        tuple(slam.session.worlds),
         slam.camera,
         slam.config,
         results,
         skipped,
         interrupted,
         why_no_pose(slam, results, skipped),
-        slam.session,
-        slam.sessions,
+        tuple(slam.memory.recalls),
+        slam.session.number,
+        slam.session.count,
     )
 
 
@@ -203,11 +240,11 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
     return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
 
 
-def why_no_pose(slam: SLAM, results: list[StepResult], skipped: list[str]) -> str:
+def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> str:
     """Why no frame of the session has a pose, in one sentence; empty where some have."""
-    if len(slam.worlds) == 0:
+    if len(slam.session.worlds) == 0:
         return why_no_map(results, skipped)
-    if any(world.history.count(slam.session) for world in slam.worlds):
+    if any(world.history.count(slam.session.number) for world in slam.session.worlds):
         return ""
     return f"none of {len(results)} frames was recognised in the map"
 
@@ -234,7 +271,8 @@ def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
 
 def true_poses(sequence: Sequence) -> torch.Tensor:
     """(F, 4, 4) the true poses, world to camera, of the frames that have one."""
-    known = (sequence.pose(index) for index in range(len(sequence)))
+    frames = len(sequence) if sequence.groundtruth is not None else 0
+    known = (sequence.pose(index) for index in range(frames))
     poses = [pose for pose in known if pose is not None]
     if not poses:
         raise ConfigError(

@@ -10,11 +10,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchslam.config import Config
+from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
-from torchslam.errors import ConfigError, ResultsError
+from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
 from torchslam.geometry import Camera
 from torchslam.loops.memory import Memory
@@ -23,13 +25,14 @@ from torchslam.mapping.founding import Founder
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
+from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.backwards import track_back
+from torchslam.tracking.foreign import Foreign
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Relocalizer
-from torchslam.tracking.stillness import Stillness
 from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
@@ -37,12 +40,11 @@ from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajector
 from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.map_check import why_not_alike
-from torchslam.world.map_file import Saved, read_worlds, write_worlds
-from torchslam.world.track import Track
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
 STARTED = "started the map"
+STARTED_ANEW = "later frames contradict the start: started the map anew"
 FOUND_AGAIN = "found again"
 
 
@@ -72,7 +74,7 @@ class SLAM:
         """Forget everything and wait for a new start."""
         # None: `run` makes simulated features from the true poses of the sequence
         self.extractor = self._image_extractor
-        self._enter(Worlds(self.camera.params), session=0, mapping=True)
+        self.enter(Session(self.camera, Worlds(self.camera.params)))
 
     @classmethod
     def load(
@@ -89,50 +91,41 @@ class SLAM:
 
         Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
         """
-        saved = read_worlds(path, device)
-        if not mapping and len(saved.worlds) == 0:
-            raise ResultsError(f"{path}: there is no world in it to localise in")
-        slam = cls(saved.camera, config, extractor)
-        slam.enter(saved, mapping)
-        for world in slam.worlds if mapping else ():
-            world.map.forget_frames()
+        session = Session.load(path, mapping, device)
+        slam = cls(session.camera, config, extractor)
+        slam.enter(session)
         return slam
 
     def save(self, path: str | Path) -> None:
         """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
-        write_worlds(path, self.worlds, self.camera, self.sessions)
+        self.session.save(path)
 
-    @property
-    def sessions(self) -> int:
-        """How many sessions the worlds know."""
-        return self.session + int(self.mapping)
+    def enter(
+        self, session: Session, world: World | None = None, last_frame: tuple[int, float] | None = None
+    ) -> None:
+        """Begin a session, lost at first; or go on in one of its worlds, from where the camera was in `last_frame`.
 
-    def enter(self, saved: Saved, mapping: bool = True) -> None:
-        """Begin a session in saved worlds; `mapping` as in `load`."""
-        self._enter(saved.worlds, saved.sessions, mapping)
-        for world in self.worlds:
-            for keyframe in range(world.map.num_keyframes):
-                self.memory.add(world.map, keyframe)
+        last_frame: index and timestamp
+        """
+        self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
+        self.tracker.counts = session.mapping
+        self.last_frame = last_frame
+        self.memory = Memory(self.camera, self.config, self.worlds)
+        self.foreign = Foreign(self.camera, self.config)
+        self.waiting = Waiting(self.config.initialization.max_waiting)
+        self._seek()
+        self.world: World | None = world  # the one that is followed
+        if world is not None:
+            self.state = State.TRACKING
 
     @property
     def is_settled(self) -> bool:
         """Whether a world is followed that has proved itself, and no frame is held back."""
         return self.world is not None and self.youth is None and not self.probation
 
-    def _enter(self, worlds: Worlds, session: int, mapping: bool) -> None:
-        """Begin a session: which worlds there are, and nothing else."""
-        self.worlds, self.session, self.mapping = worlds, session, mapping
-        self.tracker.counts = mapping
-        self.last_frame: tuple[int, float] | None = None  # index and timestamp
-        self.memory = Memory(self.camera, self.config, self.worlds)
-        self.stillness = Stillness(self.camera, self.config.stillness, self.config.matching)
-        self.waiting = Waiting(self.config.initialization.max_waiting)
-        self.world: World | None = None  # the one that is followed
-        self._seek()
-
     # --- the way of a frame ----------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, frame: Frame) -> StepResult:
         """Process one frame. A frame without a pose is no error: the result says why there is none.
 
@@ -141,25 +134,35 @@ class SLAM:
         view = self._look(frame)
         return self._find(view) if self.world is None else self._follow(self.world, view)
 
+    def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
+        """Process an image of one's own loop: the frame after the last one.
+
+        image: (H, W) or (H, W, C), uint8, or floats in [0, 1]; channels: their order, `channel_orders`
+
+        Raises FrameError for an image that cannot be taken, and as `step` does.
+        """
+        index = 0 if self.last_frame is None else self.last_frame[0] + 1
+        return self.step(Frame(index, float(timestamp), image_tensor(image, channels), f"image {index}"))
+
     def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
         return run_sequence(self, sequence, progress)
 
     def trajectory(self) -> Trajectory:
         """Every posed frame of this session in its main world, by the map as it is now."""
-        world = self.worlds.main(self.session)
-        return Trajectory.empty() if world is None else world.trajectory(self.session)
+        world = self.worlds.main(self.session.number)
+        return Trajectory.empty() if world is None else world.trajectory(self.session.number)
 
     @property
     def map(self) -> Map:
         """Of the world that is followed, or else of the one with most frames; empty where there is none."""
-        world = self.world or self.worlds.main(self.session)
+        world = self.world or self.worlds.main(self.session.number)
         return Map() if world is None else world.map
 
     @property
     def history(self) -> History:
         """The posed frames of the same world as `map`."""
-        world = self.world or self.worlds.main(self.session)
+        world = self.world or self.worlds.main(self.session.number)
         return History() if world is None else world.history
 
     def _look(self, frame: Frame) -> View:
@@ -172,11 +175,11 @@ class SLAM:
             check_size(frame, self.camera)
         with self.clock("features"):
             view = View.of(frame, self.extractor(frame), self.camera.params)
-            self.seen = replace(view, session=self.session)
+            self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)
             self.last_frame = frame.index, frame.timestamp
-            return self.stillness.clear_of(self.seen)
+            return self.foreign.clear_of(self.seen)
 
     def _check_kind(self, view: View) -> None:
         """Raises ConfigError where the front end is another one than that of the worlds."""
@@ -195,6 +198,9 @@ class SLAM:
         if tracked is None:
             return self._lose(world, view)
         doubt = why_doubt(tracked, expected, world.track, self.config.judge)
+        moved = None if doubt else self.foreign.moves(tracked)
+        if moved and moved.is_doubt:
+            doubt = moved.words
         if doubt or self.probation:
             return self._hold(world, view, tracked, doubt)
         self.state = State.TRACKING
@@ -203,12 +209,15 @@ class SLAM:
         if is_keyframe:
             world = self._recall(world)
             self._tidy(world)
-        watch = self.config.stillness.enabled and self.mapping
-        if watch and self.stillness.observe(self.seen, world.T_cw, tracked.depth):
-            drop_covered(world, self.stillness.covers)
-            why = f"{why}; " * bool(why) + "some of the image does not move with the scene and is left out"
+        foreign = moved.words if moved else ""
+        if self.mapping and self.foreign.stays(world.T_cw, tracked.depth):
+            drop_covered(world, self.foreign.stillness.covers)
+            foreign = "some of the image does not move with the scene and is left out"
+        why = "; ".join(filter(None, [why, foreign]))
         if self.youth is not None:
             self.youth.grow(view)
+            if self._replace(self.youth):
+                return self._result(view, STARTED_ANEW, self.world, is_keyframe=True)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
         return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
@@ -234,7 +243,7 @@ class SLAM:
                 self.settle()
             self.world, keyframe = self.memory.take_up(found)
             self.tracker.follow(self.world, keyframe)
-            self.stillness.forget_last()  # its pose was one of the map before
+            self.foreign.forget_last()  # its pose was one of the map before
         return self.world
 
     def _tidy(self, world: World) -> None:
@@ -279,14 +288,9 @@ class SLAM:
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
         self.initializer = Initializer(self.camera, self.config)
         self.probation = Probation(self.config)
-        self.stillness.forget_last()
+        self.foreign.forget_last()
         self.lost_for = 0
         self.state = State.LOST if len(self.worlds) else State.INITIALIZING
-
-    def resume(self, world: World, track: Track, last_frame: tuple[int, float]) -> None:
-        """Go on in one of the worlds from where the camera was, as if nothing had happened in between."""
-        world.track = track
-        self.world, self.state, self.last_frame = world, State.TRACKING, last_frame
 
     def _find(self, view: View) -> StepResult:
         """Come back to a known place, or else begin a new world; the frame waits until there is a pose for it."""
@@ -302,9 +306,9 @@ class SLAM:
             return self._result(view, "lost")
         with self.clock("initialization"):
             start, reason = self.initializer.step(view)
-            self.stillness.add(self.initializer.still)
+            self.foreign.stillness.add(self.initializer.still)
             if start is not None:
-                reason = self._begin(start)
+                reason = self._begin(start, self.initializer.views)
         if reason:
             return self._result(view, reason)
         return self._result(view, STARTED, self.world, is_keyframe=True)
@@ -319,13 +323,15 @@ class SLAM:
 
     # --- a new world -----------------------------------------------------------------------------------------
 
-    def _begin(self, start: Start) -> str:
-        """Begin a world with two views; why it is not believed after all, or nothing."""
-        world, views = self.worlds.begin(), self.initializer.views
+    def _begin(self, start: Start, views: list[View]) -> str:
+        """Begin a world with two views, in the place of a young one; why it is not believed, or nothing."""
+        world = self.worlds.begin()
         reason = self.founder.found(world, start, views)
         if reason:
             self.worlds.forget(world)
             return reason
+        if self.youth is not None:
+            self._take_back(self.youth)
         for keyframe in range(world.map.num_keyframes):
             self.memory.add(world.map, keyframe)
         known = set(world.history.frames["frame_index"].tolist()) if len(world.history) else set()
@@ -341,6 +347,15 @@ class SLAM:
         self.worlds.forget(youth.world)
         self.youth = None
 
+    def _replace(self, youth: Youth) -> bool:
+        """Begin anew with the first and the last frame of a young world, if these contradict it."""
+        with self.clock("initialization"):
+            start = youth.rival(self.camera, self.config)
+            replaced = start is not None and not self._begin(start, youth.views)
+        if replaced:
+            self.foreign.forget_last()  # its pose was one of the map before
+        return replaced
+
     def settle(self) -> None:
         """A young world has proved itself: pose the frames from before its start."""
         if self.youth is None:
@@ -349,6 +364,13 @@ class SLAM:
         behind = world.aside()
         self.tracker.follow(behind, 0)
         self._pose_waiting(behind, before=int(world.map.keyframes["frame_index"][0]))
+
+    def conclude(self) -> None:
+        """The last frame has come: what is held back keeps its pose, uncertain as it is, and nothing is built on it."""
+        self.settle()
+        for held in self.probation.hand_over():
+            assert self.world is not None  # nothing is held back without one
+            self.world.history.add(*held)
 
     def _track_back(self, world: World, view: View, tracked: Tracked) -> None:
         """Pose the frames that were lost before a frame that was found again."""
@@ -363,6 +385,7 @@ class SLAM:
             posed = track_back(self.tracker, behind, reversed(earlier), self.config.judge, self._take)
         self.waiting.remove(posed)
 
+    @torch.inference_mode(False)  # poses that leave may become part of a graph
     def _result(
         self,
         view: View,
@@ -377,7 +400,7 @@ class SLAM:
             state=self.state,
             T_cw=None if world is None else world.T_cw,
             world=None if world is None else world.number,
-            covariance=None if tracked is None else tracked.covariance,
+            covariance=None if tracked is None else tracked.covariance.clone(),
             is_keyframe=is_keyframe,
             matches=tracked.matches if tracked else 0,
             inliers=tracked.inliers if tracked else 0,

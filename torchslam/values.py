@@ -22,6 +22,7 @@ class Frame:
     name:      what the image is called in messages (its path, or `video.mp4#17`)
     T_cw_groundtruth: (4, 4) float64 world to camera, where the sequence knows it. Read only by simulated features,
                by scale from ground truth and by evaluation.
+    mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
     """
 
     index: int
@@ -29,6 +30,7 @@ class Frame:
     image: Tensor
     name: str = ""
     T_cw_groundtruth: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)

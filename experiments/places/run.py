@@ -14,7 +14,7 @@ from experiments.places import alternatives
 from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
-from torchslam.loops import Places, relative_scores
+from torchslam.loops import Places
 from torchslam.loops.codes import rendered_words
 from torchslam.values import Features
 
@@ -25,6 +25,7 @@ QUERIES = 30
 COUNTS = (10, 12, 15, 20, 25, 30, 40, 60)
 BEST = 3
 WALK = 40  # images of one walk of lookalikes
+LEAST_EXPECTED = 0.02  # the median score with the previous image is 0.05 to 0.16, by sequence
 
 
 def main() -> None:
@@ -53,6 +54,17 @@ def relative_to_previous(scores: Tensor, collection: Collection) -> Tensor:
         for row in where[1:]:
             relative[row] = relative_scores(keys, scores[row], keys[row - 1 : row])
     return relative
+
+
+def relative_scores(keys: Tensor, scores: Tensor, reference: Tensor) -> Tensor:
+    """Scores (n,) of keyframes as a share of the best score among the reference keyframes (r,).
+
+    The reference are keyframes that show the same place for certain, such as the previous one: their score says what
+    to expect here, where an image is dark or its texture repeats (Galvez-Lopez and Tardos: DBoW2, 2012). Zero for all
+    where no reference has a score of 0.02, since a share of next to nothing says nothing.
+    """
+    expected = torch.where(torch.isin(keys, reference), scores, 0.0).amax() if len(keys) > 0 else scores.sum()
+    return torch.where(expected >= LEAST_EXPECTED, scores / expected.clamp(min=LEAST_EXPECTED), 0.0)
 
 
 def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:

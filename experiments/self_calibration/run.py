@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from experiments.common import DATA_DIR, table, write_between
-from torchslam.calibration import Calibrated, Round, calibrate, refine
+from torchslam.calibration import FoundCamera, Round, calibrate, refine
 from torchslam.calibration.words import contradiction
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
@@ -154,7 +154,7 @@ def tell(label: str, done: Round) -> None:
     print(f"{label}: {done.frames} frames with {float(done.camera.focal):.1f} px -> {asks}", flush=True)
 
 
-def describe(result: Calibrated) -> str:
+def describe(result: FoundCamera) -> str:
     """Focal length and the coefficients that were fitted, with their standard errors."""
     refined = result.refined
     if refined is None:

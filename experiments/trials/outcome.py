@@ -15,15 +15,15 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from experiments.trials.cut import after_the_cut
 from experiments.trials.edited import Edited
 from experiments.trials.judging import extent, wrong
 from experiments.trials.trials import Trial
 from torchslam.config import Config, load_config
 from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.front_end import Extractor
-from torchslam.geometry import Camera, se3_inverse, so3_log
+from torchslam.geometry import se3_inverse, so3_log
 from torchslam.loops.recognition import Recall
-from torchslam.run import Run
+from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import Frame, State, StepResult
 
@@ -43,7 +43,8 @@ class Outcome:
     misled:   frames called tracking whose pose in the main world is wrong, as it was given or in the end
     states:   one per frame; recalls: places recognised; apart: by the truth, how far away the furthest of them is:
               metres and degrees; None without truth
-    seconds:  of the processor, for the whole run with reading of images and the last adjustment
+    seconds:  of the processor, for the whole run, or the rest after a cut, with reading of images and the last
+              adjustment
     ms:       of the processor, for `SLAM.step`, median
     failure:  why there is no map
     """
@@ -63,53 +64,60 @@ class Outcome:
     failure: str
 
 
-class Timed(SLAM):
-    """Remembers for every frame how much of the processor it took, which other work on the machine does not change."""
+def timed(slam: SLAM) -> list[float]:
+    """How much of the processor each `step` from now on takes, in ms: other work on the machine does not change it."""
+    taken: list[float] = []
+    step = slam.step
 
-    def __init__(
-        self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
-    ) -> None:
-        super().__init__(camera, config, extractor)
-        self.ms: list[float] = []
-
-    def step(self, frame: Frame) -> StepResult:
+    def measured(frame: Frame) -> StepResult:
         before = time.process_time()
-        result = super().step(frame)
-        self.ms.append(1e3 * (time.process_time() - before))
+        result = step(frame)
+        taken.append(1e3 * (time.process_time() - before))
         return result
+
+    slam.step = measured  # type: ignore[method-assign]
+    return taken
 
 
 def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
     """Run a trial; `more` settings come after its own. Raises SequenceError where its frames are not at hand."""
     config = load_config(None, [*trial.settings, *more])
     sequence = trial.sequence()
-    slam = Timed(sequence.camera, config) if trial.map_of is None else _in_map(trial.map_of(), config)
+    slam, so_far = _begin(trial, sequence, config)
+    known = {result.index for result in so_far.results if result.state is State.TRACKING}
+    taken = timed(slam)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         start = time.process_time()
-        run = slam.run(sequence)
+        run = run_sequence(slam, sequence, None, so_far)
         seconds = time.process_time() - start
-    return _outcome(slam, run, sequence, seconds), run
+    assert known <= set(final_poses(run)), "what was tracked before the last checkpoint has no pose any more"
+    return _outcome(run, sequence, seconds, taken), run
 
 
-def _in_map(sequence: Edited, config: Config) -> Timed:
+def _begin(trial: Trial, sequence: Edited, config: Config) -> tuple[SLAM, Progressed]:
+    """The system before the first frame of the trial, or after the last one that was not lost with a cut."""
+    if trial.cut_at is not None:
+        return after_the_cut(trial.sequence, config, trial.cut_at)
+    if trial.map_of is None:
+        return SLAM(sequence.camera, config), Progressed()
+    return _in_map(trial.map_of(), config), Progressed()
+
+
+def _in_map(sequence: Edited, config: Config) -> SLAM:
     """A system that only localises, in the saved map of another run."""
     slam = SLAM(sequence.camera, config)
     slam.run(sequence)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.safetensors"
         slam.save(path)
-        loaded = Timed.load(path, config, mapping=False)
-        assert isinstance(loaded, Timed)
-        return loaded
+        return SLAM.load(path, config, mapping=False)
 
 
-def _outcome(slam: Timed, run: Run, sequence: Edited, seconds: float) -> Outcome:
-    final = final_poses(run)
-    truth = sequence.groundtruth
-    assert truth is not None
+def _outcome(run: Run, sequence: Edited, seconds: float, taken: list[float]) -> Outcome:
+    final, truth = final_poses(run), sequence.groundtruth
     ate = None
-    if sum(sequence.pose(index) is not None for index in final) >= MIN_POSES:
+    if truth is not None and sum(sequence.pose(index) is not None for index in final) >= MIN_POSES:
         ate = evaluate(run.trajectory, truth).ate_m
     posed = sum(bool(sequence.belongs[index]) for index in final)
     return Outcome(
@@ -118,13 +126,13 @@ def _outcome(slam: Timed, run: Run, sequence: Edited, seconds: float) -> Outcome
         strays=len(final) - posed,
         worlds=sorted((world.history.count(run.session) for world in run.worlds), reverse=True),
         ate=ate,
-        extent=extent(truth.positions_w),
+        extent=0.0 if truth is None else extent(truth.positions_w),
         misled=misled(run, sequence),
         states=[result.state for result in run.results],
-        recalls=slam.memory.recalls,
-        apart=furthest(slam.memory.recalls, sequence),
+        recalls=list(run.recalls),
+        apart=furthest(list(run.recalls), sequence),
         seconds=seconds,
-        ms=median(slam.ms),
+        ms=median(taken),
         failure=run.failure,
     )
 

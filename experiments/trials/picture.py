@@ -1,4 +1,4 @@
-"""What the faults do to an image, shown on a rendered room: writes faults.jpg."""
+"""What the faults do to an image, shown on a rendered room: writes faults.png."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ COLUMNS = 4
 SIZE = (240, 180)
 LEFT_OUT = ("kidnap", "drop3", "halfres")  # they leave images as they are, or only smaller
 BAR = 24  # pixels under an image, for its name
+GREYS = 16  # levels that are told apart: with all 256 the noise alone would fill the file
 
 
 def main() -> None:
@@ -31,7 +32,9 @@ def main() -> None:
         tiles.append(tile)
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
     rows = [np.hstack(tiles[start : start + COLUMNS]) for start in range(0, len(tiles), COLUMNS)]
-    cv2.imwrite(str(Path(__file__).parent / "faults.jpg"), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 70])
+    step = 255 / (GREYS - 1)
+    picture = np.rint(np.rint(np.vstack(rows) / step) * step).astype(np.uint8)
+    cv2.imwrite(str(Path(__file__).parent / "faults.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 if __name__ == "__main__":

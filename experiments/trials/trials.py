@@ -25,10 +25,19 @@ POSED = ("redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20")
 DRONE_CAMERA = "553,553,319.5,179.5"
 WAITING = 60  # frames before the camera goes
 TURN = math.radians(8.0)
-STARTS = {"shelf_bin": (0, 50), "machine_hall": (0, 320), "redkitchen": (0, 300)}
+STARTS = {
+    "shelf_bin": (0, 50),
+    "machine_hall": (0, 320),
+    "redkitchen": (0, 1000),
+    "kitti07": (0, 160),
+    "fr2_desk_20": (0, 20),
+}
+LOOKALIKE_CAMERA = "460.8,460.8,255.5,191.5"  # a guess: the focal length is 0.9 widths
 CUTS = {"redkitchen": (20, 190), "machine_hall": (0, 130), "shelf_bin": (0, 50)}
 LENDERS = {"redkitchen": "machine_hall", "machine_hall": "redkitchen", "shelf_bin": "machine_hall"}
 HARD_LOOP = "synthetic:loop?noise=12&blur=1.5"
+STOREY = "synthetic:storey?noise=6&blur=1"
+SEEDS = (1, 2, 3)  # of textures, furniture and noise of the hard loop, beside 0
 
 
 @dataclass(frozen=True)
@@ -37,6 +46,7 @@ class Trial:
 
     settings: of the configuration
     map_of:   makes another sequence, of which the map is made first, saved and loaded to localise in
+    cut_at:   share of the frames after which the run is killed and gone on with from its last checkpoint
     unit:     of the ATE; without one it is told as a share of the extent of the true path
     is_differentiated: whether the gradient of the run is checked afterwards
     """
@@ -44,6 +54,7 @@ class Trial:
     sequence: Callable[[], Edited]
     settings: tuple[str, ...] = ()
     map_of: Callable[[], Edited] | None = None
+    cut_at: float | None = None
     unit: str = "m"
     is_differentiated: bool = False
 
@@ -75,6 +86,12 @@ def drone() -> Edited:
         for index, (row, distance) in enumerate(zip(rows.tolist(), distances.tolist(), strict=True))
     ]
     return Edited("drone", video.camera, parts, video.frame_rate)
+
+
+def lookalike() -> Edited:
+    """Two walks through corridors that look alike, a picture every few steps; nobody knows where they were taken."""
+    whole = open_sequence(DATA_DIR / "lookalike" / "images", camera=LOOKALIKE_CAMERA)
+    return Edited("lookalike", whole.camera, shots(whole, range(len(whole))))
 
 
 def standing(name: str) -> Edited:
@@ -127,7 +144,15 @@ TRIALS: dict[str, Trial] = {
     "loss/two_parts": Trial(partial(frames, "redkitchen", (0, 250), (720, 1000))),
     "loop/closed": Trial(partial(frames, HARD_LOOP)),
     "loop/open": Trial(partial(frames, HARD_LOOP), ("loops.enabled=false",)),
+    **{f"loop/closed_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}")) for seed in SEEDS},
+    **{
+        f"loop/open_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}"), ("loops.enabled=false",))
+        for seed in SEEDS
+    },
+    "loop/storey": Trial(partial(frames, STOREY)),
+    "loop/storey_open": Trial(partial(frames, STOREY), ("loops.enabled=false",)),
     "loop/corridors": Trial(partial(frames, "synthetic:corridors")),
+    "loop/lookalike": Trial(lookalike),
     **{
         f"{fault}/{name}": Trial(partial(faulty, name, FAULTS[fault]))
         for name in CUTS
@@ -137,5 +162,6 @@ TRIALS: dict[str, Trial] = {
     "localise/redkitchen": Trial(
         partial(every_second, "redkitchen", 1), map_of=partial(every_second, "redkitchen", 0)
     ),
+    "resume/redkitchen": Trial(partial(frames, "redkitchen"), cut_at=0.6),
     "gradient/round": Trial(Round.shots, GRADIENT_SETTINGS, is_differentiated=True),
 }

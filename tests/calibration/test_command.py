@@ -11,7 +11,7 @@ import torch
 from tests.test_cli import FAST, write_tum_folder
 from torchslam.cli import main
 from torchslam.data import open_sequence
-from torchslam.data.calibration import read_calibration
+from torchslam.data.calibration_files import read_calibration
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.output.calibration_file import check_replaceable, write_calibration

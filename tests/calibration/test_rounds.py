@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from tests.walks import Walk, arc, turn
-from torchslam.calibration import Calibrated, Refinement, Round, calibrate
+from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
 from torchslam.calibration.words import contradiction, in_words
 from torchslam.config import Config, load_config
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.front_end import Extractor, simulated_extractor
 from torchslam.geometry import Camera
 from torchslam.run import true_poses
@@ -25,10 +25,8 @@ def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config, Ex
     config = load_config(None, ["features.kind=simulated", *settings])
     path = Walk(poses).with_camera(CAMERA)
     extractor = simulated_extractor(config, CAMERA, true_poses(path))
-    unknown = path.with_camera(
-        CAMERA.with_params(CAMERA.params * torch.tensor([share * 1.6] * 2 + [1.0] * 2))
-    )
-    unknown.calibrated = False
+    guess = CAMERA.with_params(CAMERA.params * torch.tensor([share * 1.6] * 2 + [1.0] * 2))
+    unknown = path.with_camera(guess, Calibrated.GUESSED)
     return unknown, config, extractor
 
 
@@ -44,7 +42,7 @@ def test_the_focal_length_is_found_from_nothing() -> None:
     assert abs(float(found.camera.focal) - 200.0) < 3 * found.refined.std * 200.0
     assert in_words(found).startswith("focal length ")
     assert len(unknown) == 22  # and the sequence is as it was
-    assert not unknown.calibrated
+    assert unknown.calibrated is Calibrated.GUESSED
 
 
 def test_a_given_camera_is_refined_without_guessing() -> None:
@@ -88,7 +86,7 @@ def test_a_contradicted_camera_is_named(focal: float, std: float, drop: float, s
 
 def test_words_for_what_is_not_determined() -> None:
     vague = refinement(200.0, 0.12)
-    found = Calibrated(vague.camera, vague, [])
+    found = FoundCamera(vague.camera, vague, [])
     assert not found.is_determined
     assert "may be wrong by 24 %" in in_words(found)
     assert "a factor of two" in in_words(replace(found, refined=refinement(200.0, 0.7)))
@@ -101,4 +99,4 @@ def test_words_for_what_is_not_determined() -> None:
         num_radial=1,
         k_std=(0.01,),
     )
-    assert in_words(Calibrated(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"
+    assert in_words(FoundCamera(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"

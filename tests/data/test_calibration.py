@@ -29,7 +29,7 @@ from torchslam.errors import CalibrationError
     ],
 )
 def test_parse_camera(text: str, model: str, params: list[float]) -> None:
-    camera = parse_camera(text).camera((640, 480))
+    camera = parse_camera(text, (640, 480))
     assert (camera.model, camera.size) == (model, (640, 480))
     assert camera.params.tolist() == params
 
@@ -51,7 +51,7 @@ def test_parse_camera(text: str, model: str, params: list[float]) -> None:
 )
 def test_bad_numbers(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(CalibrationError, match=f"--camera: .*{message}"):
-        parse_camera(text)
+        parse_camera(text, (640, 480))
     file = tmp_path / "calibration.txt"
     file.write_text(f"# fx fy cx cy\n{text}\n")
     where = r"calibration\.txt:2: .*" + message if text else r"calibration\.txt: no numbers"

@@ -176,7 +176,7 @@ def test_names_with_spaces_and_hashes(tum_folder: Folder, write_picture: Callabl
 def test_without_calibration_asks_for_the_camera(tum_folder: Folder) -> None:
     folder = tum_folder(calibration=None)
     with pytest.raises(CalibrationError, match="--camera fx,fy,cx,cy"):
-        open_sequence(folder)
+        _ = open_sequence(folder).camera
     assert open_sequence(folder, camera="70,70,32,24").camera.params.tolist() == [70.0, 70.0, 32.0, 24.0]
 
 

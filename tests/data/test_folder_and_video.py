@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchslam.data import open_sequence
-from torchslam.errors import CalibrationError, FrameError, MissingCalibrationError, SequenceError
+from torchslam.data import Calibrated, open_sequence
+from torchslam.errors import CalibrationError, FrameError, SequenceError
 
 CAMERA = "60,60,32,24"
 
@@ -29,8 +29,10 @@ def test_folder_in_natural_order(tmp_path: Path, write_picture: Callable) -> Non
 
 def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
     write_picture(tmp_path / "0.png")
+    uncalibrated = open_sequence(tmp_path)
+    assert (uncalibrated.calibrated, uncalibrated.size) == (Calibrated.MISSING, (64, 48))
     with pytest.raises(CalibrationError, match="--camera fx,fy,cx,cy"):
-        open_sequence(tmp_path)
+        _ = uncalibrated.camera
     (tmp_path / "calibration.txt").write_text("60 60 32 24")
     assert float(open_sequence(tmp_path).camera.fx) == 60.0
     assert float(open_sequence(tmp_path, CAMERA.replace("60", "61")).camera.fx) == 61.0
@@ -42,22 +44,18 @@ def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
 def test_unknown_camera_is_a_first_guess(tmp_path: Path, write_picture: Callable) -> None:
     for index in range(3):
         write_picture(tmp_path / f"{index}.png")
-    with pytest.raises(MissingCalibrationError):
-        open_sequence(tmp_path)
     (tmp_path / "calibration.txt").write_text("60 60 32 24")
     guessed = open_sequence(tmp_path, "auto", limit=2)
     width, height = guessed.size
-    assert not guessed.calibrated
-    assert guessed.describe()["camera"] == "unknown"
+    assert guessed.calibrated is Calibrated.GUESSED
     assert guessed.camera.params.tolist() == [0.85 * width, 0.85 * width, (width - 1) / 2, (height - 1) / 2]
     known = guessed.with_camera(open_sequence(tmp_path).camera)
-    assert known.calibrated
+    assert known.calibrated is Calibrated.GIVEN
     assert float(known.camera.fx) == 60.0
     assert float(guessed.camera.fx) != 60.0
     assert len(known) == 2
-    assert open_sequence(tmp_path).calibrated
     room = open_sequence("synthetic:room", "auto", limit=2)
-    assert not room.calibrated
+    assert room.calibrated is Calibrated.GUESSED
     assert float(room.camera.fx) == 0.85 * room.size[0]
 
 
@@ -77,7 +75,7 @@ def test_wrong_paths(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="does not exist"):
         open_sequence(tmp_path / "nothing")
     (tmp_path / "notes.txt").write_text("text")
-    with pytest.raises(SequenceError, match="neither a folder nor a video"):
+    with pytest.raises(SequenceError, match="neither a video nor a recording"):
         open_sequence(tmp_path / "notes.txt")
 
 
@@ -102,12 +100,12 @@ def test_video_in_order_and_back(video: Path) -> None:
         assert frame.name.endswith(f"clip.avi#{index}")
         assert float(frame.image.mean()) == pytest.approx(30 * index / 255, abs=0.01)
     assert torch.equal(open_sequence(video, CAMERA, stride=3)[1].image, sequence[3].image)
-    assert open_sequence(video, CAMERA, fps=50).frame_rate == pytest.approx(50.0)
+    assert open_sequence(video, CAMERA, fps=12.5).frame_rate == pytest.approx(12.5)
 
 
 def test_video_needs_a_fitting_camera(video: Path) -> None:
     with pytest.raises(CalibrationError, match="--camera"):
-        open_sequence(video)
+        _ = open_sequence(video).camera
     camera = open_sequence(video, CAMERA).camera
     other = type(camera).pinhole(60, 60, 32, 24, size=(640, 480))
     with pytest.raises(CalibrationError, match="640x480, these are 64x48"):
@@ -133,6 +131,6 @@ def test_damaged_end_of_a_video(tmp_path: Path, video: Path) -> None:
     damaged = tmp_path / "damaged.avi"
     damaged.write_bytes(data)
     sequence = open_sequence(damaged, CAMERA)
-    with pytest.raises(FrameError, match=r"damaged\.avi#7: cannot be decoded"):
-        sequence[7]
+    assert len(sequence) == 7
+    assert sequence.notes == ("7 frames can be decoded; the file speaks of 8",)
     assert float(sequence[6].image.mean()) == pytest.approx(180 / 255, abs=0.01)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from pathlib import Path
 
 import hypothesis.strategies as st
 from hypothesis import HealthCheck, given, settings
 
-from torchslam.data import parse_camera, read_trajectory
+from torchslam.data import parse_camera, read_calibration, read_trajectory
 from torchslam.data.eth3d_tum import read_image_list
 from torchslam.data.image_file import read_grey
 from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
@@ -45,7 +46,40 @@ def test_image_lists(tmp_path: Path, text: str) -> None:
 @given(LINES)
 def test_calibrations(text: str) -> None:
     with contextlib.suppress(CalibrationError):
-        camera = parse_camera(text).camera((64, 48))
+        camera = parse_camera(text, (64, 48))
+        assert camera.params.isfinite().all()
+        assert (camera.params[:2] > 0).all()
+
+
+KEYS = (
+    "camera_matrix",
+    "intrinsics",
+    "distortion_model",
+    "data",
+    "Camera.fx",
+    "Camera.fy",
+    "image_width",
+    "fl_x",
+    "w",
+    "D",
+)
+VALUES = st.one_of(LINES, LINES.map("[{}]".format), st.just("\n  data: [1, 0, 2, 0, 3, 4, 0, 0, 1]"))
+YAML = st.lists(st.tuples(st.sampled_from(KEYS), VALUES).map(": ".join), max_size=6).map("\n".join)
+JSON = st.dictionaries(
+    st.sampled_from(KEYS), st.one_of(st.floats(), st.integers(), st.text("ab1.", max_size=4), st.none())
+).map(json.dumps)
+COLMAP = LINES.map("1 OPENCV 64 48 {}".format)
+
+
+@given(
+    st.sampled_from(["a.yaml", "a.txt"]), st.one_of(YAML, JSON, COLMAP, FILES, FILES.map("<a>{}</a>".format))
+)
+@SAME_FOLDER
+def test_calibration_files(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with contextlib.suppress(CalibrationError):
+        calibration = read_calibration(tmp_path / name)
+        camera = calibration.camera(calibration.size or (64, 48))
         assert camera.params.isfinite().all()
         assert (camera.params[:2] > 0).all()
 

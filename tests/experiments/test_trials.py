@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from experiments.trials import edits, outcome
+from experiments.trials import edits, outcome, picture
 from experiments.trials.edited import Edited, Shot, fitted, shots, strangers
 from experiments.trials.faults import FAULTS, halved
-from experiments.trials.gradient import Round
+from experiments.trials.gradient import SETTINGS, Round
 from experiments.trials.judging import FAR, TURNED_DEG, extent, moves, robust_similarity, wrong
 from experiments.trials.outcome import HEADER, cells, furthest, misled, online_poses, states_in_short
 from experiments.trials.run import NOT_RUN, chosen, rows_in, write
-from experiments.trials.trials import TRIALS, drone, turning
+from experiments.trials.trials import TRIALS, Trial, drone, turning
 from tests.sample_run import *  # noqa: F403  fixtures of a run that tracked, lost itself and came back
 from tests.walks import Walk, arc
 from torchslam.data import open_sequence
@@ -352,3 +354,33 @@ def test_the_drone_has_the_poses_that_there_are(data_dir: Path) -> None:
     known = [index for index in range(len(made)) if made.pose(index) is not None]
     assert known == list(range(0, 567, 14))
     assert made.belongs.all()
+
+
+def short_round() -> Edited:
+    whole = Round(30)
+    return Edited("round", whole.camera, shots(whole, range(len(whole))))
+
+
+def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outcome, "after_the_cut", partial(outcome.after_the_cut, every=1))
+    few = (*SETTINGS, "features.num_keypoints=250", "simulated.points_per_view=150")
+    whole, undisturbed = outcome.perform(Trial(short_round, few))
+    cut, run = outcome.perform(Trial(short_round, few, cut_at=0.9))
+    assert torch.equal(run.trajectory.T_wc, undisturbed.trajectory.T_wc)
+    assert (cut.posed, cut.states, cut.ate) == (whole.posed, whole.states, whole.ate)
+    assert len(run.results) == 30
+
+
+def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Edited("round", Round(3).camera, [Shot(Round(3), index) for index in range(3)])
+    result, _ = outcome.perform(Trial(lambda: made))
+    assert (result.ate, result.misled, result.recalls, result.posed, result.possible) == (None, [], [], 0, 3)
+    assert "no map was initialised" in cells("x", result, "m")[3]
+
+
+def test_the_picture_of_the_faults_is_small() -> None:
+    path = Path(picture.__file__).with_name("faults.png")
+    drawn = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert drawn is not None
+    assert len(np.unique(drawn)) == picture.GREYS
+    assert path.stat().st_size < 300_000

@@ -105,6 +105,25 @@ def test_match_equals_brute_force(floats: int | None, mutual: bool, seed: int, r
     assert not matches.indices_2[~matches.mask].any()
 
 
+@pytest.mark.parametrize("floats", [None, 16])
+@given(seed=st.integers(0, 1000), ratio=st.sampled_from([0.9, math.inf]), limited=st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_pairs_that_are_not_allowed_count_as_infinitely_far(
+    floats: int | None, seed: int, ratio: float, limited: bool
+) -> None:
+    first = features(2, 30, seed, floats)
+    second = disturbed(first, seed + 1)
+    allowed = torch.rand(2, 30, 30, generator=torch.Generator().manual_seed(seed)) < 0.5
+    allowed[:, 3] = False  # one that may match nobody
+    limit = (40 if floats is None else 0.2) if limited else None
+    matches = match(first, second, None if ratio == math.inf else ratio, True, limit, allowed=allowed)
+    d = distances_between(first, second).masked_fill(~allowed, math.inf)
+    for row in range(2):
+        possible = first.mask[row] & (allowed[row] & second.mask[row]).any(1)
+        expected = reference(d[row], possible, second.mask[row], ratio, True, limit or 1e9)
+        assert pairs(matches, row) == expected
+
+
 def test_match_agrees_with_opencv() -> None:
     first = features(1, 500, 3)
     first = replace(first, mask=torch.ones_like(first.mask))
@@ -140,6 +159,10 @@ def test_many_columns_need_wider_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = torch.zeros_like(grown.mask)
     mask[:, -50:] = second.mask
     matches = match(first, replace(grown, mask=mask), max_distance=None)
+    assert {i: j - far + 50 for i, j in pairs(matches).items()} == pairs(expected)
+    # Who may match is said by a mask of pairs as well.
+    allowed = mask[:, None].expand(1, 40, far)
+    matches = match(first, replace(grown, mask=torch.ones_like(mask)), max_distance=None, allowed=allowed)
     assert {i: j - far + 50 for i, j in pairs(matches).items()} == pairs(expected)
 
 
@@ -185,6 +208,13 @@ def test_soft_weights_are_a_dual_softmax(floats: int | None) -> None:
         2, matches.indices_2[..., None]
     )
     torch.testing.assert_close(matches.weights, both[..., 0] * matches.mask)
+    allowed = torch.rand(2, 12, 12, generator=torch.Generator().manual_seed(7)) < 0.5
+    matches = match(first, second, None, True, None, temperature, allowed)
+    logits = logits.masked_fill(~allowed, -torch.inf)
+    both = logits.softmax(2).nan_to_num() * logits.softmax(1).nan_to_num()
+    assert matches.weights is not None
+    chosen = both.gather(2, matches.indices_2[..., None])[..., 0]
+    torch.testing.assert_close(matches.weights, chosen * matches.mask)
 
 
 def test_soft_weights_and_distances_have_right_gradients() -> None:
@@ -320,3 +350,12 @@ def test_numpy_reference_of_the_windows() -> None:
     assert set(zip(row.tolist(), column.tolist(), strict=True)) == set(
         zip((b * 60 + i).tolist(), (b * 70 + j).tolist(), strict=True)
     )
+
+
+def test_descriptors_of_another_length_are_an_error():
+    generator = torch.Generator().manual_seed(0)
+    descriptors = torch.nn.functional.normalize(torch.randn(1, 5, 8, generator=generator), dim=-1)
+    ones = torch.ones(1, 5)
+    features = Features(torch.zeros(1, 5, 2), ones, ones, 0 * ones, descriptors, ones > 0)
+    with pytest.raises(ValueError, match="unit length"):
+        match(features, replace(features, descriptors=1.1 * descriptors))

@@ -1,5 +1,7 @@
 """The minimal solvers: P3P, five-point, homography, and the decompositions."""
 
+import math
+
 import poselib
 import pytest
 import torch
@@ -99,6 +101,68 @@ def test_gradients_at_true_essential_matrices() -> None:
     assert gradcheck(g.sampson_errors, (E, x_1, x_2))
     H = (torch.eye(3) + 0.1 * normal(6, 3, 3, 3)).requires_grad_()
     assert gradcheck(g.transfer_errors, (H, x_1, x_2))
+
+
+CAMERA = g.Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240)).to(torch.float64)
+
+
+def test_offsets_from_epipolar_lines_are_sampson_errors_and_disparities() -> None:
+    points_1 = torch.tensor([[0.3, 0.2, 4.0], [-1.0, 0.5, 8.0], [0.1, 0.1, -5.0], [0.0, 0.0, 1e9]]).double()
+    sideways = torch.eye(4, dtype=torch.float64)
+    sideways[0, 3] = -0.5
+    pixels_1, pixels_2 = (
+        200 * points[:, :2] / points[:, 2:] + torch.tensor([159.5, 119.5])
+        for points in (points_1, g.transform(sideways, points_1))
+    )
+    across, along = g.epipolar_offsets(sideways, pixels_1, pixels_2, CAMERA, CAMERA)
+    torch.testing.assert_close(across, torch.zeros(4).double())
+    expected = 200 * 0.5 / points_1[:, 2]
+    torch.testing.assert_close(along, expected, atol=1e-6, rtol=1e-9)
+    off = pixels_2 + torch.tensor([0.0, 3.0])
+    across, along = g.epipolar_offsets(sideways, pixels_1, off, CAMERA, CAMERA)
+    torch.testing.assert_close(across.abs(), torch.full((4,), 3 / math.sqrt(2)).double())
+    torch.testing.assert_close(along, expected, atol=1e-6, rtol=1e-9)
+
+
+def test_the_disparity_tells_the_depth_under_any_motion() -> None:
+    T_21 = poses(20)
+    points_1 = scene(20, 6)
+    points_2 = g.transform(T_21, points_1)
+    pixels_1, pixels_2 = (
+        200 * image(points) + torch.tensor([159.5, 119.5]) for points in (points_1, points_2)
+    )
+    across, along = g.epipolar_offsets(T_21, pixels_1, pixels_2, CAMERA, CAMERA)
+    assert float(across.abs().max()) < 1e-9
+    far = points_1 @ T_21[:, :3, :3].mT
+    t = T_21[:, None, :3, 3]
+    way = t[..., :2] - t[..., 2:] * far[..., :2] / far[..., 2:]
+    expected = torch.where(far[..., 2] > 0, 200 * way.norm(dim=-1) / points_2[..., 2], 0.0)
+    torch.testing.assert_close(along, expected)
+    double = T_21.clone()
+    double[:, :3, 3] *= 2  # the unit of length does not matter
+    torch.testing.assert_close(g.epipolar_offsets(double, pixels_1, pixels_2, CAMERA, CAMERA)[1], along)
+
+
+def test_offsets_are_finite_and_differentiable() -> None:
+    pixels = normal(7, 1, 6, 2) * 50 + 120
+
+    def offsets(T_21: Tensor, pixels_1: Tensor, pixels_2: Tensor) -> tuple[Tensor, Tensor]:
+        return g.epipolar_offsets(T_21, pixels_1, pixels_2, CAMERA, CAMERA)
+
+    inputs = poses(1).requires_grad_(), pixels.requires_grad_(), (pixels + 3).detach().requires_grad_()
+    assert gradcheck(offsets, inputs)
+    back = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))  # a half turn
+    for T_21 in (
+        torch.eye(4, dtype=torch.float64),
+        back,
+        g.se3_exp(torch.tensor([0, 0, 1.0, 0, 0, 0]).double()),
+    ):
+        T_21 = T_21.clone().requires_grad_()
+        centre = torch.tensor([[159.5, 119.5]], dtype=torch.float64)
+        across, along = offsets(T_21, centre, centre)
+        assert float((across.abs() + along.abs()).detach()) == 0
+        (across.sum() + along.sum()).backward()
+        assert torch.isfinite(T_21.grad).all()
 
 
 def test_sampson_errors_are_finite_with_gradients_at_the_epipole() -> None:

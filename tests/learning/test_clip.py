@@ -10,9 +10,11 @@ from torch import Tensor, nn
 
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still
-from torchslam import ORB, Camera, ClipSLAM, Features, load_config, open_sequence
+from torchslam import ORB, Camera, ClipPoses, ClipSLAM, Features, clip_loss, load_config, open_sequence
+from torchslam.errors import ClipError
 from torchslam.evaluation import ate, rpe
 from torchslam.features import SimulatedFeatures
+from torchslam.geometry import se3_exp
 
 FRAMES = 10
 CONFIG = load_config(None, ["bundle.final_iterations=30"])
@@ -134,11 +136,41 @@ def test_a_clip_without_a_map_has_no_pose_and_a_gradient_of_zero() -> None:
     eyes = BentEyes(walk, bend=0.02)
     poses = ClipSLAM(eyes)(images, walk.camera)
     assert not poses.posed.any()
+    assert not poses.success
+    assert poses.reason == ("no map started",)
+    assert poses.failures == 1.0
     assert poses.graphs == poses.solutions == (None,)
     assert torch.equal(poses.T_cw, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
-    loss = ate(poses.T_cw, truth, poses.posed) + rpe(poses.T_cw, truth, mask=poses.posed)[1]
+    assert ate(poses.T_cw, truth, poses.posed).isnan()
+    for choice in ("raise", "skip"):
+        with pytest.raises(ClipError, match="1 of 1 clips failed; clip 0: no map started"):
+            clip_loss(poses, truth, on_failure=choice)
+    loss, failures = clip_loss(poses, truth, on_failure=2.5)
+    assert (float(loss.detach()), failures) == (2.5, 1.0)
     loss.backward()
     assert eyes.bend.grad == 0
+
+
+def test_a_failed_clip_is_no_clip_without_error() -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth = se3_exp(torch.randn(3, 5, 6, generator=generator, dtype=torch.float64))
+    T_cw = se3_exp(torch.randn(3, 5, 6, generator=generator, dtype=torch.float64)).requires_grad_()
+    posed = torch.ones(3, 5, dtype=torch.bool)
+    posed[1] = False
+    success, reason = torch.tensor([True, False, True]), ("", "no map started", "")
+    poses = ClipPoses(T_cw, posed, success, reason, (None,) * 3, (None,) * 3)
+    errors = ate(T_cw, truth, posed)[[0, 2]]
+    loss, failures = clip_loss(poses, truth, on_failure="skip")
+    torch.testing.assert_close(loss, errors.mean())
+    assert failures == pytest.approx(1 / 3)
+    torch.testing.assert_close(clip_loss(poses, truth, on_failure=3.0).loss, (errors.sum() + 3) / 3)
+    (gradient,) = torch.autograd.grad(loss, T_cw)
+    assert gradient.isfinite().all()
+    assert (gradient[1] == 0).all()
+    with pytest.raises(ClipError, match="1 of 3 clips failed; clip 1: no map started"):
+        clip_loss(poses, truth)
+    with pytest.raises(ValueError, match="'ignore'"):
+        clip_loss(poses, truth, on_failure="ignore")  # type: ignore[arg-type]
 
 
 def test_a_batch_is_its_clips() -> None:

@@ -11,10 +11,13 @@ from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, w
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, sim3_inverse
 from torchslam.geometry.alignment import umeyama
-from torchslam.loops.closing import close_loop, corrected, join, weld
+from torchslam.loops.closing import close_loop, corrected, join, other_visits, sew, sew_on, weld
+from torchslam.loops.memory import Memory
 from torchslam.loops.recognition import Recognition
 from torchslam.loops.relation import Relation, relate
+from torchslam.tracking.tracker import Tracker
 from torchslam.world.world import World
+from torchslam.world.worlds import Worlds
 
 CONFIG = Config()
 SCENE = Scene.of(300)
@@ -119,3 +122,105 @@ def test_welding_merges_around_both_places(S_21: Tensor) -> None:
     assert world.map.num_points < 0.6 * count
     looks = {tuple(row) for row in world.map.points["descriptors"][world.map.living_points()].tolist()}
     assert len(looks) == world.map.num_points
+
+
+# --- two visits -------------------------------------------------------------------------------------------------
+
+VISIT = 4  # keyframes
+
+
+def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> World:
+    """A place seen by four keyframes, then something else, then by four others: of its points `tied` are tied."""
+    world = world_in(SCENE, sideways(VISIT))
+    if between:
+        world.absorb(world_in(SCENE, sideways(2), S_ws=pose(50.0), first=50), pose(-50.0) @ pose(0, 0, 90.0))
+    first = world.map.num_keyframes
+    world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
+    looks = world.map.points["descriptors"].long() @ torch.arange(1, 33)
+    early, late = (world.map.points_seen_by(torch.arange(start, start + VISIT)) for start in (0, first))
+    same = torch.nonzero(looks[late][:, None] == looks[early])[:tied]
+    world.map.replace(late[same[:, 0]], early[same[:, 1]])
+    world.map.refresh(torch.arange(world.map.num_keyframes))
+    Tracker(CAMERA, CONFIG).follow(world, world.map.num_keyframes - 1)
+    return world
+
+
+def test_who_was_here_at_another_time(S_21: Tensor) -> None:
+    world = two_visits(S_21)
+    last = world.map.num_keyframes - 1
+    assert set(other_visits(world.map, last).tolist()) == {0, 1, 2, 3}
+    assert other_visits(world.map, 3).tolist() == []
+    assert other_visits(two_visits(S_21, tied=14).map, last).tolist() == []
+    assert other_visits(two_visits(S_21, between=False).map, last - 2).tolist() == []
+
+
+def test_time_is_that_of_the_frames(S_21: Tensor) -> None:
+    world = two_visits(S_21)
+    frames = world.map.keyframes["frame_index"]
+    frames[:] = frames.max() - frames  # the last keyframe came first
+    assert other_visits(world.map, world.map.num_keyframes - 1).tolist() == []
+    assert set(other_visits(world.map, 0).tolist()) == {6, 7, 8, 9}
+
+
+def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> None:
+    world = two_visits(S_21)
+    last = world.map.num_keyframes - 1
+    early = torch.arange(VISIT)
+    before = int(world.map.observers(world.map.points_seen_by(early))[last])
+    sew_on(world, last, CAMERA, CONFIG)
+    seen = world.map.points_seen_by(torch.tensor([last]))
+    visible = world.map.points_seen_by(early)
+    after = int(world.map.observers(visible)[last])
+    assert after > 2 * before
+    assert int(world.map.observers(seen)[early].min()) > 0.8 * after
+    # the track looks for what is alive
+    assert bool(world.map.points["alive"][world.track.local_points].all())
+    assert bool(world.map.points["alive"][world.track.seen_last].all())
+    assert bool(torch.isin(seen, world.track.local_points).all())
+
+
+def test_without_an_earlier_visit_nothing_is_tied(S_21: Tensor) -> None:
+    world = two_visits(S_21, tied=0)
+    table = world.map.keyframes["point_ids"].clone()
+    sew_on(world, world.map.num_keyframes - 1, CAMERA, CONFIG)
+    assert torch.equal(world.map.keyframes["point_ids"], table)
+
+
+def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
+    """What one side's keyframes see no point at is filled by the points of the other side, and the other way round."""
+    world = two_visits(S_21, tied=0, between=False)
+    here, there = torch.arange(VISIT, 2 * VISIT), torch.arange(VISIT)
+    for one in (1, VISIT + 2):
+        seen = world.map.keyframes["point_ids"][one]
+        keypoints = torch.nonzero(seen >= 0)[:, 0]
+        world.map.forget(torch.full_like(keypoints, one), keypoints)
+    sew(world.map, here, there, CAMERA, CONFIG)
+    assert int(world.map.observers(world.map.points_seen_by(here))[1]) > 100
+    assert int(world.map.observers(world.map.points_seen_by(there))[VISIT + 2]) > 100
+
+
+def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) -> None:
+    """The two sides lie 4 px apart: at first only coarse keypoints are near enough, adjusted all are."""
+    counts = []
+    for override in ("loops.adjust=false", "loops.adjust=true"):
+        world = world_in(SCENE, sideways(4))
+        world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
+        weld(world, 5, 1, CAMERA, load_config(None, [override]))
+        looks = {tuple(row) for row in world.map.points["descriptors"][world.map.living_points()].tolist()}
+        counts.append((world.map.num_points, len(looks)))
+    (loose, _), (tied, different) = counts
+    assert loose > 1.2 * different
+    assert tied == different
+
+
+def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
+    for enabled in (True, False):
+        world, worlds = two_visits(S_21), Worlds(CAMERA.params)
+        worlds._worlds = [world]
+        memory = Memory(CAMERA, load_config(None, [f"loops.enabled={str(enabled).lower()}"]), worlds)
+        for keyframe in range(world.map.num_keyframes):
+            memory.add(world.map, keyframe)
+        last = world.map.num_keyframes - 1
+        points = world.map.num_points
+        assert memory.recognize(world, last) is None
+        assert (world.map.num_points < points) is enabled

@@ -48,17 +48,32 @@ def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
     here = world()
     points, at = free(here.map, 2, 6)
     before = here.map.points["times_observed"].clone()
-    found, there = find_in(here.map, 2, points, CAMERA, Config())
+    found, there = find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert len(found) == len(there) == 0
     assert torch.equal(here.map.keyframes["point_ids"][2, at], points)
     assert torch.equal(here.map.points["times_observed"][points], before[points] + 1)
+
+
+def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
+    together, apart = world(4), world(4)
+    for here in (together, apart):
+        points, _ = free(here.map, 3, 6)
+        double(here.map, 2, 6)
+        free(here.map, 1, 9)
+    points = together.map.points_seen_by(torch.arange(4))
+    found = find_in(together.map, torch.tensor([3, 1, 2]), points, CAMERA, Config())
+    one_by_one = [find_in(apart.map, torch.tensor([k]), points, CAMERA, Config()) for k in (3, 1, 2)]
+    for pairs, wanted in zip(found, zip(*one_by_one, strict=True), strict=True):
+        assert torch.equal(pairs, torch.cat(wanted))
+    assert torch.equal(together.map.keyframes["point_ids"], apart.map.keyframes["point_ids"])
+    assert len(found[0]) >= 6
 
 
 def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
     here = world()
     seen = here.map.points_seen_by(torch.tensor([1]))
     before = here.map.keyframes["point_ids"].clone()
-    assert len(find_in(here.map, 1, seen, CAMERA, Config())[0]) == 0
+    assert len(find_in(here.map, torch.tensor([1]), seen, CAMERA, Config())[0]) == 0
     assert torch.equal(here.map.keyframes["point_ids"], before)
 
 
@@ -66,7 +81,7 @@ def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
     here = world()
     points, doubles = double(here.map, 2, 6)
     table = here.map.keyframes["point_ids"].clone()
-    found, there = find_in(here.map, 2, points, CAMERA, Config())
+    found, there = find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert dict(zip(found.tolist(), there.tolist(), strict=True)) == dict(
         zip(points.tolist(), doubles.tolist(), strict=True)
     )
@@ -82,12 +97,12 @@ def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, 
     scales = here.map.keyframes["scales"][2, at]
     points_c[:, 0] += offset * scales * points_c[:, 2] / 200.0
     here.map.points["positions_w"][points] = transform(se3_inverse(T_cw), points_c)
-    find_in(here.map, 2, points, CAMERA, Config())
+    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is agrees
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
     if not agrees:
         wide = load_config(None, ["measurement.chi_square=7.0"])
-        find_in(here.map, 2, points, CAMERA, wide)
+        find_in(here.map, torch.tensor([2]), points, CAMERA, wide)
         assert (here.map.keyframes["point_ids"][2, at] == points).all()
 
 
@@ -95,7 +110,7 @@ def test_another_look_is_another_point() -> None:
     here = world()
     points, at = free(here.map, 2, 6)
     here.map.points["descriptors"][points] ^= 255
-    find_in(here.map, 2, points, CAMERA, Config())
+    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert (here.map.keyframes["point_ids"][2, at] == NO_POINT).all()
 
 
@@ -107,7 +122,7 @@ def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) ->
     points, at = points[middle], at[middle]
     assert len(at) > 3
     here.map.points["reach"][points] *= factor
-    find_in(here.map, 2, points, CAMERA, Config())
+    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is found
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not found
 
@@ -147,7 +162,7 @@ def observed(*times: int) -> Map:
 
 def merged(times: tuple[int, ...], *pairs: tuple[int, int]) -> list[int]:
     slam_map = observed(*times)
-    merge(slam_map, [(torch.tensor([one]), torch.tensor([other])) for one, other in pairs])
+    merge(slam_map, *torch.tensor(pairs).T)
     return slam_map.resolve(torch.arange(len(times))).tolist()
 
 
@@ -167,7 +182,7 @@ def test_chains_end_in_one_point() -> None:
 
 def test_nothing_to_merge_changes_nothing() -> None:
     slam_map = observed(2, 3)
-    merge(slam_map, [])
-    merge(slam_map, [(torch.tensor([1]), torch.tensor([1]))])
+    merge(slam_map, torch.arange(0), torch.arange(0))
+    merge(slam_map, torch.tensor([1]), torch.tensor([1]))
     assert slam_map.points["alive"].all()
     assert math.isclose(float(slam_map.points["times_observed"].sum()), 5)

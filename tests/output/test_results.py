@@ -10,6 +10,7 @@ import torch
 from tests.walks import Walk, arc
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
+from torchslam.loops.recognition import Recall
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics
 from torchslam.output.results import read_results, results_in, write_results
@@ -55,6 +56,19 @@ def test_the_poses_as_they_were_given_have_a_file(tmp_path: Path, run: Run) -> N
     online = read_trajectory(tmp_path / "online.txt")
     assert len(online) == 23
     assert torch.equal(online.T_wc, torch.eye(4, dtype=torch.float64).expand(23, 4, 4))
+
+
+def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
+    """Frames 3 to 9 given in world 5, 10 to 17 in 4; those became world 0. World 7, of 22 to 24, is another one."""
+    worlds = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
+    results = [replace(one, world=worlds.get(one.index, one.world)) for one in run.results]
+    recalls = (Recall(30, 9, 5, 4), Recall(40, 30, 0, 0), Recall(41, 20, 4, 0), Recall(42, 2, 7, 6))
+    joined = replace(run, results=results, recalls=recalls)
+    assert len(joined.online) == 5
+    assert [len(part) for part in joined.online_parts] == [5, 8, 7]
+    assert joined.online_parts[2].timestamps[0] == run.results[3].timestamp
+    assert [len(part) for part in replace(joined, recalls=()).online_parts] == [5]
+    assert replace(joined, worlds=()).online_parts == []
 
 
 def test_worlds_beside_the_main_one_have_trajectories_of_their_own(

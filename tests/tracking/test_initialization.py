@@ -134,6 +134,33 @@ def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
     torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("T_cw", [pose(-0.5, 0.0, 0.0, 0.0, -0.03, 0.0), SIDE])
+def test_what_stays_on_epipolar_lines_but_behind_the_camera_is_left_out(T_cw: Tensor) -> None:
+    """Sideways, what stays in place is near its epipolar line; the turn says that it would be behind the camera."""
+    views = [SCENE.view(0, pose(), noise=0.2), SCENE.view(1, T_cw, noise=0.2)]
+    some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
+    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer.step(views[0])
+    start, reason = initializer.step(some)
+    assert start is not None, reason
+    assert len(initializer.still) > 80
+    wanted = T_cw[:3, 3] / T_cw[:3, 3].norm()
+    torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(("turn", "left_out"), [(-0.003, False), (-0.012, True)])
+def test_what_is_as_far_as_infinity_within_the_noise_belongs_to_the_scene(
+    turn: float, left_out: bool
+) -> None:
+    """A turn of 0.003 moves the image of infinity by 0.6 pixels, less than the threshold of 1.5."""
+    views = [SCENE.view(0, pose()), SCENE.view(1, pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0))]
+    some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
+    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer.step(views[0])
+    initializer.step(some)
+    assert (len(initializer.still) > 80) is left_out
+
+
 def test_a_thing_that_moves_before_a_camera_that_stands_is_no_scene() -> None:
     """A flat thing: one homography explains its motion."""
     views = [SCENE.view(0, pose()), SCENE.view(1, pose())]

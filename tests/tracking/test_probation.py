@@ -87,3 +87,15 @@ def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
     assert [one[1] for one in released] == [tracked for _, tracked, _ in frames]
     assert all(torch.equal(one[2], track.T_cr) for one, (_, _, track) in zip(released, frames, strict=True))
     assert [one[3] for one in released] == [100, 101, 102]
+
+
+def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
+    probation = Probation(Config())
+    probation.hold(*frame(0), "odd")
+    probation.hold(*frame(1), "")
+    assert [held[0].index for held in probation.hand_over()] == [0, 1]
+    assert probation.views() == []
+    assert probation.reason == "to be confirmed by 1 more frames"
+    probation.hold(*frame(2), "")
+    assert not probation
+    assert [held[0].index for held in probation.release()] == [2]

@@ -8,7 +8,6 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.tracking.correspondences import (
-    descriptor_distances,
     match_keyframe,
     match_points,
     max_distance,
@@ -109,12 +108,8 @@ def test_points_match_by_descriptor_wherever_they_are() -> None:
     assert len(match_points(right.map, ids[:0], view, relocalizer().matching)[0]) == 0
 
 
-def test_distances_of_bits_and_of_floats() -> None:
-    bits = torch.zeros(2, 32, dtype=torch.uint8)
-    bits[1, 3] = 7
-    assert descriptor_distances(bits, bits).tolist() == [[0, 3], [3, 0]]
-    floats = torch.tensor([[1.0, 0], [0.6, 0.8]])
-    torch.testing.assert_close(descriptor_distances(floats, floats), torch.tensor([[0.0, 0.4], [0.4, 0.0]]))
+def test_thresholds_of_bits_and_of_floats() -> None:
+    bits, floats = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 2)
     settings = load_config(None, ["matching.max_distance=50", "matching.max_cosine_distance=0.3"]).matching
     assert max_distance(bits, settings) == 50
     assert max_distance(floats, settings) == 0.3

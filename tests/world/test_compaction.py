@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.world.simulated import CAMERA, path, reprojection_errors, simulated_world, view_of
 from tests.world.test_observers import check
 from torchslam.world import compaction
-from torchslam.world.compaction import drop_dead_points
+from torchslam.world.compaction import compact, drop_dead_points, remove_keyframes
 from torchslam.world.history import RunGraph
 from torchslam.world.world import World
 
@@ -45,7 +45,7 @@ def by_frame(graph: RunGraph) -> Tensor:
 
 def test_no_frame_moves_when_keyframes_go(world: World) -> None:
     before = copy.deepcopy(world)
-    world.remove(GONE)
+    remove_keyframes(world, GONE)
     torch.testing.assert_close(world.history.T_cw(world.map), before.history.T_cw(before.map))
     torch.testing.assert_close(world.T_cw, before.T_cw)
     trajectory = world.trajectory()
@@ -55,7 +55,7 @@ def test_no_frame_moves_when_keyframes_go(world: World) -> None:
 
 def test_the_other_keyframes_see_what_they_saw(world: World) -> None:
     before = copy.deepcopy(world)
-    renumbering = world.remove(GONE)
+    renumbering = remove_keyframes(world, GONE)
     assert renumbering.keyframes.tolist() == [0, -1, 1, -1, 2, 3, 4]
     stays = renumbering.keyframes >= 0
     for name, column in world.map.keyframes.columns().items():
@@ -69,7 +69,7 @@ def test_the_other_keyframes_see_what_they_saw(world: World) -> None:
 
 
 def test_the_heir_of_a_keyframe_is_near_it_and_stays(world: World) -> None:
-    heirs = world.remove(GONE).heirs
+    heirs = remove_keyframes(world, GONE).heirs
     assert heirs.tolist()[::2] == [0, 1, 2, 4]
     assert heirs[1] in (0, 1)  # old rows 0 and 2, its neighbours on the way
     assert heirs[3] in (1, 2)
@@ -78,7 +78,7 @@ def test_the_heir_of_a_keyframe_is_near_it_and_stays(world: World) -> None:
 def test_points_are_left_to_a_keyframe_that_sees_them(world: World) -> None:
     made_by_gone = torch.isin(world.map.points["born"], GONE)
     assert int(made_by_gone.sum()) > 0
-    world.remove(GONE)
+    remove_keyframes(world, GONE)
     points = world.map.points
     table = world.map.keyframes["point_ids"]
     for point in torch.nonzero(points["alive"] & made_by_gone)[:, 0].tolist():
@@ -95,7 +95,7 @@ def test_the_graph_keeps_what_removed_keyframes_saw_last(world: World) -> None:
     free, others = torch.nonzero(first < 0)[1:2, 0], world.map.points_seen_by(torch.tensor([2]))
     world.map.observe(keyframe, free, others[~torch.isin(others, first)][:1])
     before = copy.deepcopy(world)
-    world.remove(GONE)
+    remove_keyframes(world, GONE)
     old, new = before.history.graph(before.map, CAMERA), world.history.graph(world.map, CAMERA)
     assert int(new.is_keyframe.sum()) == int(old.is_keyframe.sum()) - 2
     assert sorted(new.frame_ids.tolist()) == sorted(old.frame_ids.tolist())
@@ -116,7 +116,7 @@ def test_the_history_of_the_other_frames_is_untouched(world: World, forgotten: i
     world.map.forget(torch.full_like(keypoints, 3), keypoints)
     before = copy.deepcopy(world.history)
     own = torch.isin(before.observations["row"], 3 * GONE)  # every third frame is a keyframe
-    world.remove(GONE)
+    remove_keyframes(world, GONE)
     kept = ~torch.isin(world.history.observations["row"], 3 * GONE)
     for name, column in world.history.observations.columns().items():
         assert torch.equal(column[kept], before.observations[name][~own]), name
@@ -131,7 +131,7 @@ def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(world: World) ->
     ids = world.map.living_points()[:10]
     world.map.observe(keyframe, torch.arange(10), ids)
     count = len(world.history)
-    world.remove(torch.tensor([keyframe]))
+    remove_keyframes(world, torch.tensor([keyframe]))
     assert len(world.history) == count + 1
     torch.testing.assert_close(world.history.T_cw(world.map)[-1], T_cw)
     assert int((world.history.observations["row"] == count).sum()) == 10
@@ -140,11 +140,11 @@ def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(world: World) ->
 def test_what_holds_the_world_cannot_go(world: World) -> None:
     for keyframe in (0, world.track.reference):
         with pytest.raises(ValueError, match="cannot be removed"):
-            world.remove(torch.tensor([keyframe]))
+            remove_keyframes(world, torch.tensor([keyframe]))
 
 
 def test_the_track_forgets_what_is_gone(world: World) -> None:
-    renumbering = world.remove(GONE)
+    renumbering = remove_keyframes(world, GONE)
     assert world.track.reference == renumbering.keyframes[6] == 4
     assert world.track.local_keyframes.tolist() == [4, 3, 2, 1, 0]
     assert bool(world.map.points["alive"][world.track.local_points].all())
@@ -187,7 +187,7 @@ def test_a_merged_point_is_seen_as_its_heir_afterwards(world: World) -> None:
 
 def test_a_compacted_world_goes_on(world: World) -> None:
     drop_dead_points(thinned(world))
-    world.remove(GONE)
+    remove_keyframes(world, GONE)
     ids = world.map.add_points(
         torch.zeros(2, 3, dtype=torch.float64), torch.zeros(2, 32, dtype=torch.uint8), 0
     )
@@ -202,11 +202,11 @@ def test_rows_are_dropped_when_most_of_them_are_dead(world: World, monkeypatch: 
     count = len(world.map.points)
     half = count // 2
     world.map.kill(torch.arange(half))
-    assert world.compact() is None  # not more than half
+    assert compact(world) is None  # not more than half
     world.map.kill(torch.tensor([half]))
     monkeypatch.setattr(compaction, "_PRICE", len(world.history.observations) / (half + 1))
-    assert world.compact() is None  # the history is too long for so few
+    assert compact(world) is None  # the history is too long for so few
     monkeypatch.setattr(compaction, "_PRICE", 1 + len(world.history.observations) / (half + 1))
-    renumbering = world.compact()
+    renumbering = compact(world)
     assert renumbering is not None
     assert len(world.map.points) == count - half - 1

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -77,6 +78,18 @@ def test_a_loaded_map_can_grow(path: Path) -> None:
     assert loaded.num_points == before + 2
 
 
+def test_a_file_from_before_there_were_colours_is_read(path: Path, worlds: list[World]) -> None:
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        about = json.loads(file.metadata()["torchslam"])
+    del tensors["worlds.0.points.colors"]
+    save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 3})})
+    loaded, _ = read_map(path)
+    assert torch.equal(loaded.positions_w, worlds[0].map.positions_w)
+    assert loaded.points["colors"].shape == (len(loaded.points), 3)
+    assert not loaded.points["colors"].any()
+
+
 def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[World], camera: Camera) -> None:
     write_worlds(path.with_name("two"), worlds, camera, sessions=2)
     assert path.with_name("two").read_bytes() == path.read_bytes()
@@ -133,12 +146,12 @@ def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
     [
         (None, "not a torchslam map"),
         ({"author": "somebody"}, "not a torchslam map"),
-        ({"torchslam": '{"format": 3}', "author": "somebody"}, "not a torchslam map"),
-        ({"torchslam": "format 3"}, "not a torchslam map"),
+        ({"torchslam": '{"format": 4}', "author": "somebody"}, "not a torchslam map"),
+        ({"torchslam": "format 4"}, "not a torchslam map"),
         ({"torchslam": "[3]"}, "not a torchslam map"),
         ({"torchslam": '{"size": 3}'}, "not a torchslam map"),
-        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 3"),
-        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 3"),
+        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 4"),
+        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 4"),
     ],
 )
 def test_other_programs_and_formats_are_refused(

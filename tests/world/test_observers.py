@@ -206,3 +206,12 @@ def test_the_most_are_those_of_a_full_sort(counts: list[int], limit: int, least:
 def test_the_first_of_each(values: list[int]) -> None:
     expected = [value not in values[:place] for place, value in enumerate(values)]
     assert first_of_each(torch.tensor(values, dtype=torch.int64)).tolist() == expected
+
+
+def test_an_index_that_grew_in_inference_mode_may_be_changed_outside() -> None:
+    with torch.inference_mode():
+        index = Observers(torch.full((1, 4), -1))
+        index.add(torch.arange(200), torch.arange(200))
+    index.remove(torch.tensor([7]), torch.tensor([7]))
+    index.clear(torch.tensor([8]))
+    assert index.of(torch.tensor([6, 7, 8]))[1].tolist() == [6]

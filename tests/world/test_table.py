@@ -77,3 +77,16 @@ def test_memory_is_given_back_where_most_is_empty(kept: int, moves: bool) -> Non
     assert (table["number"].data_ptr() != place) is moves
     table.append(number=torch.ones(1))
     assert table["number"].tolist()[-2:] == [64.0 - kept, 1.0]
+
+
+def test_what_inference_mode_filled_may_be_read_by_autograd_and_written_by_anybody() -> None:
+    table = Table(NUMBER)
+    with torch.inference_mode():
+        table.append(number=torch.ones(3))
+        table.keep(torch.tensor([0]))  # gives back memory
+        table.append(number=torch.ones(2))
+    table["number"][0] = 4.0
+    weight = torch.ones(3, requires_grad=True)
+    (weight * table["number"]).sum().backward()
+    assert weight.grad is not None
+    assert weight.grad.tolist() == [4.0, 1.0, 1.0]

@@ -60,7 +60,7 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class FoundCamera:
     """What the rounds came to.
 
     camera:  the best that is known
@@ -99,7 +99,7 @@ def calibrate(
     device: torch.device | str = "cpu",
     extractor: Extractor | None = None,
     told: Callable[[Round], None] | None = None,
-) -> Calibrated:
+) -> FoundCamera:
     """Find the camera of a sequence, started at the one it has.
 
     radial: how many coefficients of the distortion may be fitted, where the residuals ask for them
@@ -146,7 +146,7 @@ def calibrate(
                 break
             frames = min(2 * frames, most)
         last = one(camera, frames)
-    return Calibrated(start if last.refined is None else last.refined.camera, last.refined, rounds)
+    return FoundCamera(start if last.refined is None else last.refined.camera, last.refined, rounds)
 
 
 def _scaled(camera: Camera, factor: float) -> Camera:

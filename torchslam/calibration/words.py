@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from torchslam.calibration.refinement import Refinement
-from torchslam.calibration.rounds import Calibrated
+from torchslam.calibration.rounds import FoundCamera
 from torchslam.geometry import Camera
 
 # When the images contradict a given focal length: by so many standard errors and this share, or by a larger share
@@ -15,7 +15,7 @@ LARGE, LOWER = 0.03, 0.02
 OPEN = "pure rotation, a straight way and a plane leave it open"
 
 
-def in_words(calibrated: Calibrated) -> str:
+def in_words(calibrated: FoundCamera) -> str:
     """The camera that was found and its standard errors, or that it is not determined and how wrong it may be."""
     camera, refined = calibrated.camera, calibrated.refined
     if refined is None:

@@ -3,29 +3,72 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import torch
 
 from torchslam.config import CHOICES, Config, load_config
-from torchslam.data import Sequence, open_sequence
+from torchslam.data import Calibrated, Sequence, open_sequence
+from torchslam.data.presets import PRESETS
 
-SEQUENCE_HELP = "ETH3D, TUM, KITTI or EuRoC folder, folder of images, video file, or synthetic:room"
+SEQUENCE_HELP = (
+    "folder (ETH3D, TUM, KITTI, KITTI raw, EuRoC, 7-Scenes, TartanAir, ICL-NUIM, or images), pattern of images, "
+    "video, zip, ROS bag (.bag, .mcap, folder), camera number, rtsp:// address, or synthetic:room"
+)
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", help=SEQUENCE_HELP)
     parser.add_argument(
         "--camera",
-        metavar="FX,FY,CX,CY[,K1,K2,P1,P2,K3]|FILE",
-        help="calibration in pixels; needed for image folders and videos, replaces the one found elsewhere",
+        metavar="CAMERA",
+        help="FX,FY,CX,CY[,K1,K2,P1,P2,K3] in pixels; a calibration file (OpenCV, ROS, Kalibr, ORB-SLAM3, COLMAP, "
+        f"nerfstudio); a preset ({', '.join(PRESETS)}); or a guess: fov=65 (degrees), f=0.8w (image widths), exif. "
+        "Replaces the calibration found with the images",
     )
-    parser.add_argument("--limit", type=_positive, metavar="N", help="read only the first N frames")
+    reading = parser.add_argument_group("which frames, and how")
+    reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
+    reading.add_argument("--stop", metavar="N|TIME", help="end before this frame: 240, 20s or 2:00")
+    reading.add_argument("--stride", type=_positive, default=1, metavar="N", help="take every N-th frame")
+    reading.add_argument(
+        "--fps",
+        type=float,
+        metavar="RATE",
+        help="take at most RATE frames per second; images without times are taken to be RATE a second (else 30)",
+    )
+    reading.add_argument("--limit", type=_positive, metavar="N", help="take only the first N of these frames")
+    reading.add_argument(
+        "--resize", metavar="WxH|W|FACTOR", help="640x480, 640 or 0.5: the images, and the camera with them"
+    )
+    reading.add_argument(
+        "--mask",
+        metavar="FILE|DIR",
+        help="image of the size of the frames, black where no features are wanted; or a folder with one per frame",
+    )
 
 
-def sequence(options: argparse.Namespace) -> Sequence:
-    """The sequence that the arguments of `add_sequence` name."""
-    return open_sequence(options.path, options.camera, limit=options.limit)
+def sequence(options: argparse.Namespace, needs_camera: bool = True) -> Sequence:
+    """The sequence that the arguments of `add_sequence` name; what is to know about it goes to stderr.
+
+    Raises CalibrationError where a camera is needed and missing.
+    """
+    found = open_sequence(
+        options.path,
+        options.camera,
+        fps=options.fps,
+        limit=options.limit,
+        stride=options.stride,
+        start=options.start,
+        stop=options.stop,
+        resize_to=options.resize,
+        mask=options.mask,
+    )
+    for note in found.notes:
+        print(f"torchslam: {found.name}: {note}", file=sys.stderr)
+    if needs_camera and found.camera and found.calibrated is Calibrated.GUESSED:
+        print(f"torchslam: {found.name}: its camera is only a guess", file=sys.stderr)
+    return found
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:

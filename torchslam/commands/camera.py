@@ -12,7 +12,8 @@ from torchslam.calibration import Round, calibrate, refine
 from torchslam.calibration.words import contradiction, in_words
 from torchslam.config import Config
 from torchslam.data import Sequence
-from torchslam.data.calibration import read_calibration
+from torchslam.data.camera_argument import parse_camera
+from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError
 from torchslam.output.calibration_file import check_replaceable, write_calibration
 from torchslam.output.results import CALIBRATION
@@ -32,11 +33,13 @@ def find_camera(
     path = output / CALIBRATION
     check_replaceable(path)
     if resume and path.exists():
-        found = read_calibration(path).camera(sequence.size)
+        found = parse_camera(str(path), sequence.size)
         return sequence.with_camera(found), f"as {path} says"
     with warnings.catch_warnings():  # the run itself will say which frames cannot be read
         warnings.simplefilter("ignore", UserWarning)
-        calibrated = calibrate(sequence, config, radial, not sequence.calibrated, device, told=_tell)
+        calibrated = calibrate(
+            sequence, config, radial, sequence.calibrated is Calibrated.GUESSED, device, told=_tell
+        )
     said = in_words(calibrated)
     frames = calibrated.rounds[-1].frames
     remarks = [said, f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames"]

@@ -21,5 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    plan = Plan(options.output, options.device, overwrite=True)  # the same room again: nobody's work is lost
+    plan = Plan(
+        SEQUENCE, options.output, options.device, overwrite=True
+    )  # the same room again: nobody's work is lost
     return run(open_sequence(SEQUENCE), arguments.config(options), plan)

@@ -13,5 +13,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    print(table(arguments.sequence(options).describe()))
+    print(table(arguments.sequence(options, needs_camera=False).describe()))
     return 0

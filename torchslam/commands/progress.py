@@ -19,11 +19,12 @@ class ProgressBar:
 
     A signal takes effect after the frame, or the iteration, at hand, when the map is whole.
 
-    done: frames that were processed before, by a run that this one goes on with
+    frames: how many there are, None where nobody knows
+    done:   frames that were processed before, by a run that this one goes on with
     """
 
     def __init__(
-        self, frames: int, count_points: Callable[[], int], stopping: Stopping, done: int = 0
+        self, frames: int | None, count_points: Callable[[], int], stopping: Stopping, done: int = 0
     ) -> None:
         self._count_points = count_points
         self._stopping = stopping
@@ -33,7 +34,9 @@ class ProgressBar:
             unit=" frames",
             file=sys.stderr,
             dynamic_ncols=True,
-            bar_format="{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
+            bar_format="{n_fmt} frames, {rate_noinv_fmt}{postfix}"
+            if frames is None
+            else "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
         )
         self._adjusting: tqdm | None = None
         self._warnings = warnings.catch_warnings()

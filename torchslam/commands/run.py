@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -23,9 +25,12 @@ from torchslam.commands.progress import ProgressBar
 from torchslam.commands.stopping import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
-from torchslam.data.calibration import AUTO
-from torchslam.errors import ConfigError, MissingCalibrationError, ResultsError, TrajectoryError
-from torchslam.evaluation import Evaluation, evaluate
+from torchslam.data.camera_argument import unknown_camera
+from torchslam.data.opening import full_name
+from torchslam.data.sequence import Calibrated
+from torchslam.errors import ConfigError, ResultsError, TrajectoryError
+from torchslam.evaluation import ate_apart, evaluate
+from torchslam.export.colours import paint
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
@@ -38,18 +43,21 @@ DONE = 0
 NO_MAP = 3
 RADIAL = 2  # coefficients of the distortion that may be found
 CHECKPOINT_EVERY = 20  # keyframes
+Errors = TypeVar("Errors")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a run reads and writes, beside its sequence.
+    """Where a run reads and writes.
 
+    source:     what the sequence was opened from, for those that need its images again
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     refine:     improve the given camera by the images first; distortion: its distortion, too
     """
 
+    source: str
     output: Path
     device: torch.device
     overwrite: bool = False
@@ -108,6 +116,7 @@ def execute(options: argparse.Namespace) -> int:
         options.config = options.config or (beside if beside.is_file() else None)
         saved = saved / MAP
     plan = Plan(
+        source=options.path,
         output=options.output,
         device=options.device,
         overwrite=options.overwrite,
@@ -123,12 +132,11 @@ def execute(options: argparse.Namespace) -> int:
 
 def _sequence(options: argparse.Namespace) -> Sequence:
     """The sequence; without a calibration, as with `--camera auto`."""
-    try:
-        return arguments.sequence(options)
-    except MissingCalibrationError:
-        options.camera = AUTO
-        print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)
-        return arguments.sequence(options)
+    found = arguments.sequence(options, needs_camera=False)
+    if found.calibrated is not Calibrated.MISSING or found.known_length is None:
+        return found
+    print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)
+    return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
 
 
 def run(sequence: Sequence, config: Config, plan: Plan) -> int:
@@ -138,7 +146,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     with Stopping() as stopping:
-        bar = ProgressBar(len(sequence), lambda: slam.map.num_points, stopping, so_far.next)
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
@@ -147,7 +155,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan.output, found)
+        figures = _write(finished, sequence, plan, found)
     print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
@@ -161,11 +169,12 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
 def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:
     """The sequence with the camera of the run, and what there is to say of it where the images found it."""
-    if plan.map is not None or not (plan.refine or not sequence.calibrated):
+    is_guess = sequence.calibrated is Calibrated.GUESSED and sequence.known_length is not None
+    if plan.map is not None or not (plan.refine or is_guess):
         if not plan.resume and is_found(plan.output / CALIBRATION):
             (plan.output / CALIBRATION).unlink()
         return sequence, ""
-    radial = RADIAL if plan.distortion or not sequence.calibrated else 0
+    radial = RADIAL if plan.distortion or is_guess else 0
     goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
     return find_camera(sequence, config, plan.output, plan.device, radial, goes_on)
 
@@ -175,7 +184,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
         slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
-        print(f"torchslam: going on at frame {so_far.next} of {len(sequence)}", file=sys.stderr)
+        print(f"torchslam: going on at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
         return slam, so_far
     if plan.resume:
         print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
@@ -184,7 +193,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
     known, mine = slam.camera, sequence.camera.to(torch.float64)
     if known.size != mine.size or (
-        sequence.calibrated  # else the map's is the camera
+        sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
         and (known.model != mine.model or not torch.equal(known.params.cpu(), mine.params))
     ):
         raise ResultsError(
@@ -199,25 +208,28 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
 
 
-def _write(finished: Run, sequence: Sequence, output: Path, camera: str) -> dict[str, object]:
-    """Evaluate, write, draw; returns the figures. camera: what there is to say of it before the run."""
+def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[str, object]:
+    """Evaluate, colour the map, write, draw; returns the figures. camera: what there is to say of it before the run."""
     figures = metrics(
         finished,
-        _evaluate(finished, finished.trajectory, sequence),
-        _evaluate(finished, finished.online, sequence),
+        _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
+        _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
     figures["camera"] = "; but over all frames ".join(filter(None, (camera, judged(finished))))
-    write_results(finished, sequence, figures, output)
-    draw(read_results(output), output)
+    figures["dropped"] = sequence.dropped
+    figures["source"] = full_name(plan.source)
+    paint([world.map for world in finished.worlds], sequence, finished.session)
+    write_results(finished, sequence, figures, plan.output)
+    draw(read_results(plan.output), plan.output)
     return figures
 
 
-def _evaluate(finished: Run, trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
-    """The errors against ground truth, where there is one and the run has poses to compare."""
+def _measured(finished: Run, sequence: Sequence, measure: Callable[[Trajectory], Errors]) -> Errors | None:
+    """Errors against ground truth, where there is one and the run has poses to compare."""
     if sequence.groundtruth is None or finished.failure:
         return None
     try:
-        return evaluate(trajectory, sequence.groundtruth)
+        return measure(sequence.groundtruth)
     except TrajectoryError as error:
         print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
         return None

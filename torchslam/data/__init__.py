@@ -1,12 +1,16 @@
-"""Sequences in: ETH3D, TUM, KITTI and EuRoC folders, plain folders, videos, rendered scenes."""
+"""Sequences in: folders of datasets and of images, videos, recordings, live cameras, rendered scenes."""
 
-from torchslam.data.calibration import Calibration, parse_camera, read_calibration
+from torchslam.data.calibration import Calibration
+from torchslam.data.calibration_files import read_calibration
+from torchslam.data.camera_argument import parse_camera
 from torchslam.data.opening import open_sequence
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Calibrated, EndOfSequence, Sequence
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 
 __all__ = [
+    "Calibrated",
     "Calibration",
+    "EndOfSequence",
     "Sequence",
     "open_sequence",
     "parse_camera",

@@ -1,7 +1,8 @@
-"""Camera calibrations from text: a file of numbers or a command-line argument, checked before use."""
+"""Cameras whose image size is not known yet: numbers that are checked, focal lengths that are guessed, presets."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,35 +13,39 @@ from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
-AUTO = "auto"
-"""What is given as a camera where nothing is known about it."""
+NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
-USUAL_FOCAL = 0.85  # widths of the image: of most phones and webcams it is 0.7 to 1
-EXPECTED = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera whose image size is not known yet.
+    """A camera whose image size may not be known yet.
 
-    model:  "pinhole", "radial_tangential" or "fisheye"
-    params: fx fy cx cy, pixels, and all of the model's distortion coefficients
-    source: where the numbers come from, for messages
+    model:   "pinhole", "radial_tangential" or "fisheye"
+    params:  fx fy cx cy, pixels, and all of the model's distortion coefficients
+    source:  where the numbers come from, for messages
+    size:    (width, height) of the images it is for, where the source says
+    guessed: whether it is only near the truth
     """
 
     model: str
     params: tuple[float, ...]
     source: str
+    size: Size | None = None
+    guessed: bool = False
 
     @staticmethod
-    def from_numbers(numbers: list[float], source: str, model: str | None = None) -> Calibration:
+    def from_numbers(
+        numbers: list[float], source: str, model: str | None = None, size: Size | None = None
+    ) -> Calibration:
         """Checked numbers; the model follows from how many there are unless it is named.
 
         Raises CalibrationError for a wrong count or a focal length that is not positive.
         """
         counts = COUNTS[model] if model else (4, 8, 9)
         if len(numbers) not in counts:
-            raise CalibrationError(f"{source}: expected {EXPECTED}, got {len(numbers)} numbers")
+            raise CalibrationError(f"{source}: expected {NUMBERS}, got {len(numbers)} numbers")
         if numbers[0] <= 0 or numbers[1] <= 0:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
@@ -51,47 +56,85 @@ class Calibration:
             model, numbers = "pinhole", numbers[:4]
         if model == "radial_tangential":
             numbers = [*numbers, 0.0][:9]
-        return Calibration(model, tuple(numbers), source)
+        return Calibration(model, tuple(numbers), source, size)
 
-    def camera(self, size: tuple[int, int]) -> Camera:
-        """The camera for images of `size` (width, height)."""
+    def camera(self, size: Size) -> Camera:
+        """The camera for images of `size`. Raises CalibrationError where it is for another one."""
+        if self.size not in (None, size):
+            raise CalibrationError(
+                f"{self.source}: the camera is for images of {size_text(self.size or size)}, "
+                f"these are {size_text(size)}"
+            )
         return Camera(self.model, torch.tensor(self.params, dtype=torch.float64), size)
 
 
-class UnknownCamera(Calibration):
-    """Nothing is known: the usual focal length for the size, the centre as principal point, no distortion."""
+@dataclass(frozen=True)
+class FocalGuess:
+    """A focal length alone: square pixels, no distortion, the principal point in the middle.
 
-    def __init__(self) -> None:
-        super().__init__("pinhole", (), AUTO)
+    focal:  in units of `unit`: "px" pixels, "w" widths of the image, "diagonal" diagonals of it
+    source: what it comes from, for messages
+    """
 
-    def camera(self, size: tuple[int, int]) -> Camera:
-        """A first guess for images of `size` (width, height)."""
-        width, height = size
-        focal = USUAL_FOCAL * width
-        return Camera.pinhole(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), size=size)
+    focal: float
+    unit: str
+    source: str
+    guessed: bool = True
+
+    def camera(self, size: Size) -> Camera:
+        """The camera for images of `size`."""
+        unit = {"px": 1.0, "w": float(size[0]), "diagonal": math.hypot(*size)}[self.unit]
+        focal = self.focal * unit
+        return Camera.pinhole(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, size=size)
 
 
-def parse_camera(text: str, source: str = "--camera") -> Calibration:
+@dataclass(frozen=True)
+class Preset:
+    """The published cameras of a dataset, told apart by the size of their images."""
+
+    name: str
+    cameras: tuple[Calibration, ...]
+
+    @property
+    def guessed(self) -> bool:
+        return any(camera.guessed for camera in self.cameras)
+
+    def camera(self, size: Size) -> Camera:
+        """The one for images of `size`. Raises CalibrationError where there is none."""
+        for calibration in self.cameras:
+            if calibration.size == size:
+                return calibration.camera(size)
+        sizes = " or ".join(size_text(each.size) for each in self.cameras if each.size)
+        raise CalibrationError(
+            f"camera `{self.name}`: it is for images of {sizes}, these are {size_text(size)}"
+        )
+
+
+def parse_numbers(text: str, source: str) -> Calibration:
     """A calibration from `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
 
     Raises CalibrationError naming `source`.
     """
     words = text.replace(",", " ").split(maxsplit=1)
     if not words:
-        raise CalibrationError(f"{source}: expected {EXPECTED}, got nothing")
+        raise CalibrationError(f"{source}: expected {NUMBERS}, got nothing")
     model = words[0] if words[0] in COUNTS else None
     numbers = parse_floats(" ".join(words[1:]) if model else text, source, CalibrationError)
     return Calibration.from_numbers(numbers, source, model)
 
 
-def read_calibration(path: str | Path) -> Calibration:
+def size_text(size: Size) -> str:
+    """`640x480`."""
+    return f"{size[0]}x{size[1]}"
+
+
+def read_numbers(path: Path) -> Calibration:
     """A calibration from the first line of a file; the distortion may stand in a `distortion.txt` beside it.
 
     Raises CalibrationError naming file and line.
     """
-    path = Path(path)
     number, line = _first_line(path)
-    calibration = parse_camera(line, f"{path}:{number}")
+    calibration = parse_numbers(line, f"{path}:{number}")
     distortion = path.with_name("distortion.txt")
     if len(calibration.params) > 4 or path == distortion or not distortion.is_file():
         return calibration
@@ -103,23 +146,7 @@ def read_calibration(path: str | Path) -> Calibration:
     return Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
 
 
-def fit_camera(camera: Camera | Calibration, size: tuple[int, int], where: str) -> Camera:
-    """The camera for images of `size`. Raises CalibrationError at `where` for one that is for another size."""
-    if isinstance(camera, Calibration):
-        return camera.camera(size)
-    if camera.size != size:
-        raise CalibrationError(
-            f"{where}: the camera is for images of {size_text(camera.size)}, these are {size_text(size)}"
-        )
-    return camera
-
-
-def size_text(size: tuple[int, int]) -> str:
-    """`640x480`."""
-    return f"{size[0]}x{size[1]}"
-
-
 def _first_line(path: Path) -> tuple[int, str]:
     for number, line in numbered_lines(path, CalibrationError):
         return number, line
-    raise CalibrationError(f"{path}: no numbers; expected {EXPECTED}")
+    raise CalibrationError(f"{path}: no numbers; expected {NUMBERS}")

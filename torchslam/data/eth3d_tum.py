@@ -6,38 +6,45 @@ Sources: https://www.eth3d.net/slam_documentation and https://cvg.cit.tum.de/dat
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
-from torchslam.data.calibration import Calibration, read_calibration
+from torchslam.data.calibration import Calibration
+from torchslam.data.calibration_files import read_calibration
+from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.presets import PRESETS
 from torchslam.data.text_file import numbered_lines
 from torchslam.data.trajectory_file import read_trajectory
-from torchslam.errors import MissingCalibrationError, SequenceError
-from torchslam.geometry.camera import Camera
+from torchslam.errors import SequenceError
 
 CALIBRATION_FILES = ("calibration.txt", "calib.txt")
 
 
-def is_eth3d_tum(path: Path) -> bool:
+LOOKS_FOR = "rgb.txt (ETH3D, TUM)"
+FREIBURG = re.compile(r"freiburg([123])(?!\d)")
+
+
+def matches(path: str) -> bool:
     """Whether the folder has a list of images in this layout."""
-    return (path / "rgb.txt").is_file()
+    return (Path(path) / "rgb.txt").is_file()
 
 
-def open_eth3d_tum(path: Path, camera: Camera | Calibration | None = None) -> ImageSequence:
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
 
+    TUM's archives carry none, but their name says which of its published cameras took them.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
-    entries = read_image_list(path / "rgb.txt")
-    camera = camera if camera is not None else find_calibration(path)
-    if camera is None:
-        raise MissingCalibrationError(
-            f"{path}: no {' or '.join(CALIBRATION_FILES)} (TUM RGB-D archives carry none); "
-            "give the camera with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or as a calibration file"
-        )
-    truth = path / "groundtruth.txt"
+    folder = Path(path)
+    entries = read_image_list(folder / "rgb.txt")
+    camera = camera if camera is not None else find_calibration(folder)
+    robot = FREIBURG.search(folder.resolve().name)
+    if camera is None and robot is not None:
+        camera = PRESETS[f"tum-fr{robot[1]}"]
+    truth = folder / "groundtruth.txt"
     groundtruth = read_trajectory(truth) if truth.is_file() else None
-    return ImageSequence(path.name, "ETH3D or TUM folder", entries, camera, groundtruth)
+    return ImageSequence(folder.name, "ETH3D or TUM folder", entries, camera, groundtruth)
 
 
 def read_image_list(path: Path) -> list[ImageEntry]:

@@ -12,34 +12,36 @@ import torch
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
+from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import check_later, numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
-from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.values import Trajectory
 
 NANOSECONDS = 1_000_000_000
+LOOKS_FOR = "mav0/cam0/data.csv (EuRoC)"
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
-def is_euroc(path: Path) -> bool:
+def matches(path: str) -> bool:
     """Whether the folder, or its `mav0`, has a camera in this layout."""
-    return (_root(path) / "cam0" / "data.csv").is_file()
+    return (_root(Path(path)) / "cam0" / "data.csv").is_file()
 
 
-def open_euroc(path: Path, camera: Camera | Calibration | None = None) -> ImageSequence:
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a EuRoC recording; `camera` overrides `sensor.yaml`.
 
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
-    root = _root(path)
+    folder = Path(path)
+    root = _root(folder)
     sensor = root / "cam0" / "sensor.yaml"
     camera = camera if camera is not None else _read_intrinsics(sensor)
     groundtruth = None
     if (root / TRUTH).is_file():
         groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor))
-    name = path.parent.name if path.name == "mav0" else path.name
+    name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
     return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth)
 
 

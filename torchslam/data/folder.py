@@ -1,49 +1,57 @@
-"""A plain folder of images, in natural order of their names (`9.png` before `10.png`), at a constant rate."""
+"""A folder of images, or the images a pattern names, in natural order (`9.png` before `10.png`), at a constant rate."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from torchslam.data.calibration import Calibration
+from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.eth3d_tum import find_calibration
-from torchslam.data.image_file import SUFFIXES
+from torchslam.data.frame_names import (
+    FOLDERS,
+    Found,
+    find_frames,
+    folder_kind,
+    is_pattern,
+    match_pattern,
+    subfolder,
+)
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
-from torchslam.errors import MissingCalibrationError, SequenceError
-from torchslam.geometry.camera import Camera
 
+LOOKS_FOR = f"images, or a folder {'/, '.join(FOLDERS)}/ with images"
 DEFAULT_RATE = 30.0
 """Frames per second where the images do not say."""
 
 
-def list_images(path: Path) -> list[Path]:
-    """The images of a folder in natural order."""
-    images = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
-    return sorted(images, key=lambda file: _natural(file.name))
+def matches(path: str) -> bool:
+    """Whether there are frames, in a folder or one of `FOLDERS` in it, or for a pattern such as `left-*.png`."""
+    if is_pattern(path):
+        return bool(match_pattern(path).frames)
+    folder = Path(path)
+    if not folder.is_dir() or folder_kind(folder):
+        return False
+    return bool(subfolder(folder) or find_frames(folder).frames)
 
 
-def open_folder(
-    path: Path, camera: Camera | Calibration | None = None, rate: float | None = None
-) -> ImageSequence:
-    """A folder of images at `rate` frames per second; `camera` overrides the folder's calibration.txt.
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """Images at `rate` frames per second; `camera` overrides a calibration.txt with them or above them.
 
     Raises SequenceError or CalibrationError.
     """
-    images = list_images(path)
-    if not images:
-        raise SequenceError(f"{path}: no images ({', '.join(sorted(SUFFIXES))})")
-    camera = camera if camera is not None else find_calibration(path)
-    if camera is None:
-        raise MissingCalibrationError(
-            f"{path}: a plain image folder says nothing about its camera; "
-            "give it with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or put a calibration.txt into the folder"
-        )
-    rate = DEFAULT_RATE if rate is None else rate
-    entries = [ImageEntry(index / rate, image, str(image)) for index, image in enumerate(images)]
-    return ImageSequence(path.name, "image folder", entries, camera)
+    base = Path(path).parent if is_pattern(path) else Path(path)
+    found, folder = _find(path, base)
+    camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, found.notes)
 
 
-def _natural(name: str) -> list[tuple[bool, int, str]]:
-    """A sort key under which runs of digits compare as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
+def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
+    """Frames without times of their own, `rate` of them per second."""
+    return [ImageEntry(index / rate, image, str(image)) for index, image in enumerate(frames)]
+
+
+def _find(path: str, base: Path) -> tuple[Found, Path]:
+    if is_pattern(path):
+        return match_pattern(path), base
+    found = find_frames(base)
+    inner = None if found.frames else subfolder(base)
+    return (found, base) if inner is None else (find_frames(inner), inner)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from torchslam.errors import FrameError
@@ -14,36 +17,91 @@ from torchslam.errors import FrameError
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
 
-def read_grey(path: str | Path, where: str) -> Tensor:
+AS_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+MAX_BYTES = 1 << 29
+"""An image file above this size is not read."""
+MAX_PIXELS = 1 << 26
+"""Pixels of the largest image that is decoded: a small file may promise any number of them."""
+
+
+def read_grey(path: str | Path, where: str, bits: int = 8) -> Tensor:
     """An image file as (1, 1, H, W) float32 grey in [0, 1].
 
-    Raises FrameError at `where` for a file that is missing, truncated or not an image.
+    bits: how many carry something in files of 16 bits (`bit_depth`)
+
+    Raises FrameError at `where` for a file that is missing, truncated, too large or not an image.
     """
+    return grey_to_tensor(read_pixels(path, where), bits)
+
+
+def read_colour(path: str | Path, where: str) -> Tensor:
+    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_grey` does."""
+    return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
+
+
+def read_pixels(path: str | Path, where: str) -> np.ndarray:
+    """An image file as (H, W) grey, uint8 or uint16. Raises FrameError as `read_grey`."""
+    return _read(path, where, AS_GREY)
+
+
+def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     try:
-        data = Path(path).read_bytes()
+        size = Path(path).stat().st_size
+        data = Path(path).read_bytes() if size <= MAX_BYTES else b""
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
+    if size > MAX_BYTES:
+        raise FrameError(
+            f"{where}: {path} has {size} bytes, more than the {MAX_BYTES} of an image that is read"
+        )
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
-    grey = _decode(data)
-    if grey is None:
+    image = decode_pixels(data, flags)
+    if image is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
-    return grey_to_tensor(grey)
+    return image
 
 
-def grey_to_tensor(grey: np.ndarray) -> Tensor:
-    """(H, W) uint8 -> (1, 1, H, W) float32 in [0, 1]."""
+def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
+    """An image file's bytes as (H, W) grey, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
+    whole image."""
+    if not data or _promised_pixels(data) > MAX_PIXELS:
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # a header that promises more pixels than OpenCV takes
+        return None
+    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
+
+
+def bit_depth(images: Iterable[np.ndarray]) -> int:
+    """How many bits carry something: 8, or what the brightest pixel of some images of 16 bits needs, 10 to 16."""
+    brightest = max((int(image.max()) for image in images if image.dtype == np.uint16), default=0)
+    return 8 if brightest == 0 else next(bits for bits in (10, 12, 14, 16) if brightest < 1 << bits)
+
+
+def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
+    """(H, W) uint8, or uint16 of which `bits` carry something -> (1, 1, H, W) float32 in [0, 1]."""
+    if grey.dtype == np.uint16:
+        white = (1 << bits) - 1 if bits > 8 else 65535
+        return torch.from_numpy(grey.astype(np.float32) / white).clamp_(max=1.0)[None, None]
     return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
 
 
-def _decode(data: bytes) -> np.ndarray | None:
-    """(H, W) uint8 grey; None for anything that is not a whole image."""
-    if not data:
-        return None
+def bgr_to_tensor(image: np.ndarray) -> Tensor:
+    """(H, W, 3) uint8 blue, green, red, as OpenCV has it -> red, green, blue."""
+    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def _promised_pixels(data: bytes) -> int:
+    """How many pixels a header promises; 0 where that is left to the decoder's own limit."""
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # a header that promises more pixels than OpenCV takes
-        return None
+        with Image.open(io.BytesIO(data)) as image:
+            return image.width * image.height
+    except Image.DecompressionBombError:
+        return MAX_PIXELS + 1
+    except Exception:  # a damaged header fails in any way, and a format may be one that only OpenCV knows
+        return 0
 
 
 def _is_truncated(data: bytes) -> bool:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections import Counter
+from collections.abc import Iterable
 from collections.abc import Sequence as Listed
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration, fit_camera, size_text
-from torchslam.data.image_file import read_grey
+from torchslam.data.calibration import size_text
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.image_file import bit_depth, read_colour, read_grey, read_pixels
 from torchslam.data.sequence import Sequence
 from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
-from torchslam.geometry.camera import Camera
 from torchslam.values import Trajectory
 
+SAMPLES = 20
+"""Images in which the brightest pixel of a sequence of 16 bits is looked for."""
 ATTEMPTS = 20
 """Unreadable images after which a sequence is given up."""
 
@@ -45,30 +50,47 @@ class ImageSequence(Sequence):
         name: str,
         kind: str,
         entries: Listed[ImageEntry],
-        camera: Camera | Calibration,
+        camera: GivenCamera | None,
         groundtruth: Trajectory | None = None,
+        notes: Iterable[str] = (),
     ) -> None:
         """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
         first images can be read; CalibrationError for a camera of another image size."""
         _check_order(name, entries)
-        size = _find_size(entries)
-        camera = fit_camera(camera, size, name)
-        timestamps = torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64)
-        super().__init__(name, kind, camera, timestamps, groundtruth)
+        size, self._bits = _examine(entries)
+        notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
+        super().__init__(
+            name,
+            kind,
+            None if camera is None else fit_camera(camera, size, name, entries[0].path),
+            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64),
+            groundtruth,
+            size=size,
+            guessed=is_guessed(camera),
+            notes=notes,
+        )
         self._entries = entries
 
     def image(self, index: int) -> Tensor:
         entry = self._entries[index]
-        image = read_grey(entry.path, entry.where)
-        size = (image.shape[-1], image.shape[-2])
-        if size != self.size:
-            raise FrameError(
-                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
-            )
+        image = read_grey(entry.path, entry.where, self._bits)
+        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        return image
+
+    def colour(self, index: int) -> Tensor:
+        entry = self._entries[index]
+        image = read_colour(entry.path, entry.where)
+        self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 
     def image_name(self, index: int) -> str:
         return str(self._entries[index].path)
+
+    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
+        if size != self.size:
+            raise FrameError(
+                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
+            )
 
 
 def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
@@ -78,19 +100,23 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
         check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
 
 
-def _find_size(entries: Listed[ImageEntry]) -> tuple[int, int]:
-    """(width, height) that most of the first three readable images have: the first may be the odd one."""
-    sizes: list[tuple[int, int]] = []
+def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
+    """(width, height) that most of the first three readable images have, since the first may be the odd one, and how
+    many of their bits are used: of 16, what the brightest pixel of some images all along needs."""
+    images: list[np.ndarray] = []
     failures: list[FrameError] = []
     for entry in entries:
         try:
-            image = read_grey(entry.path, entry.where)
+            images.append(read_pixels(entry.path, entry.where))
         except FrameError as failure:
             failures.append(failure)
-        else:
-            sizes.append((image.shape[-1], image.shape[-2]))
-        if len(sizes) == 3 or len(failures) == ATTEMPTS:
+        if len(images) == 3 or len(failures) == ATTEMPTS:
             break
-    if not sizes:
+    if not images:
         raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
-    return Counter(sizes).most_common(1)[0][0]
+    size = Counter((image.shape[1], image.shape[0]) for image in images).most_common(1)[0][0]
+    if any(image.dtype == np.uint16 for image in images):
+        for entry in entries[:: max(1, len(entries) // SAMPLES)]:
+            with contextlib.suppress(FrameError):  # said when the frame is read
+                images.append(read_pixels(entry.path, entry.where))
+    return size, bit_depth(images)

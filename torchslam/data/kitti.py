@@ -11,44 +11,48 @@ import torch
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
-from torchslam.data.folder import list_images
+from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.frame_names import find_frames
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
-from torchslam.geometry.camera import Camera
 from torchslam.values import Trajectory
 
+LOOKS_FOR = "image_0/ or image_2/ with times.txt (KITTI odometry)"
 CAMERAS = ("image_0", "image_2")
 """The left cameras, grey and colour."""
 
 
-def is_kitti(path: Path) -> bool:
+def matches(path: str) -> bool:
     """Whether the folder is a sequence of the odometry benchmark."""
-    return (path / "times.txt").is_file() and any((path / name).is_dir() for name in CAMERAS)
+    return (Path(path) / "times.txt").is_file() and any((Path(path) / name).is_dir() for name in CAMERAS)
 
 
-def open_kitti(path: Path, camera: Camera | Calibration | None = None) -> ImageSequence:
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A KITTI odometry sequence, left grey images before left colour ones; `camera` overrides `calib.txt`.
 
     Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` beside `sequences/NN`.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
-    folder = next(path / name for name in CAMERAS if (path / name).is_dir())
-    times = _read_rows(path / "times.txt", 1, SequenceError)[:, 0]
-    images = list_images(folder)
+    base = Path(path)
+    folder = next(base / name for name in CAMERAS if (base / name).is_dir())
+    times = _read_rows(base / "times.txt", 1, SequenceError)[:, 0]
+    found = find_frames(folder)
+    images = found.frames
     if len(images) != len(times):
         raise SequenceError(
             f"{path}: times.txt has {len(times)} lines, {folder.name}/ has {len(images)} images"
         )
     entries = [
-        ImageEntry(time, image, f"{path / 'times.txt'}:{line}")
+        ImageEntry(time, image, f"{base / 'times.txt'}:{line}")
         for line, (time, image) in enumerate(zip(times.tolist(), images, strict=True), start=1)
     ]
     offset_x = 0.0
     if camera is None:
-        camera, offset_x = _read_projection(path / "calib.txt", f"P{folder.name[-1]}")
-    groundtruth = _read_poses(path, times, offset_x)
-    return ImageSequence(path.name, f"KITTI odometry, {folder.name}", entries, camera, groundtruth)
+        camera, offset_x = _read_projection(base / "calib.txt", f"P{folder.name[-1]}")
+    groundtruth = _read_poses(base, times, offset_x)
+    kind = f"KITTI odometry, {folder.name}"
+    return ImageSequence(base.name, kind, entries, camera, groundtruth, found.notes)
 
 
 def _read_projection(path: Path, label: str) -> tuple[Calibration, float]:

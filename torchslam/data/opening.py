@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from torchslam.data.calibration import AUTO, Calibration, UnknownCamera, parse_camera, read_calibration
-from torchslam.data.eth3d_tum import is_eth3d_tum, open_eth3d_tum
-from torchslam.data.euroc import is_euroc, open_euroc
-from torchslam.data.folder import open_folder
-from torchslam.data.kitti import is_kitti, open_kitti
+from torchslam.data import archive, live
+from torchslam.data.calibration import Calibration
+from torchslam.data.camera_argument import GivenCamera, parse_calibration
+from torchslam.data.masks import Masked
+from torchslam.data.readers import find_reader
 from torchslam.data.sequence import Sequence
-from torchslam.data.synthetic import open_synthetic
-from torchslam.data.video import SUFFIXES as VIDEO_SUFFIXES
-from torchslam.data.video import VideoSequence
-from torchslam.errors import CalibrationError, SequenceError
+from torchslam.data.suggestions import why_nothing
+from torchslam.data.synthetic import sequence as synthetic
+from torchslam.data.transforms import cut, resize, thin
+from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 
 
@@ -24,55 +24,51 @@ def open_sequence(
     fps: float | None = None,
     limit: int | None = None,
     stride: int = 1,
+    start: str | int = 0,
+    stop: str | int | None = None,
+    resize_to: str | None = None,
+    mask: str | Path | None = None,
 ) -> Sequence:
     """A sequence of whatever kind lies at `path`.
 
-    path:   an ETH3D, TUM, KITTI or EuRoC folder, a plain folder of images, a video file, or `synthetic:room`
-    camera: a Camera, `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or a calibration file; overrides the calibration found
-            at `path`, needed where there is none: plain folders, videos, TUM folders. "auto" for a first guess,
-            for `torchslam.calibration.calibrate` to start at
-    fps:    frames per second, for plain folders (default 30) and videos (default their own)
-    limit, stride: at most `limit` frames, every `stride`-th one
+    path:   a folder of ETH3D, TUM, KITTI (odometry, raw), EuRoC, 7-Scenes, TartanAir or ICL-NUIM, a folder of images or
+            one with them in `images/` or `rgb/`, a pattern of files, a video, a zip of any of these, a ROS bag, the
+            number of a camera, the address of a stream, or `synthetic:room`
+    camera: a Camera, or what `parse_camera` takes; overrides the calibration found at `path`. Where there is none
+            either, the sequence has no camera (`Sequence.calibrated`)
+    fps:    frames per second: at most so many are taken; images without times are taken to be so many a second
+            (otherwise 30)
+    start, stop: from this frame, to before that one; numbers, or times after the first frame as `12.5s` and `1:30`
+    stride, limit: of these every `stride`-th one, and at most `limit`
+    resize_to: `640x480`, `640` (width) or `0.5`: the images, and the camera with them
+    mask:   an image, black where no features are wanted, or a folder of them (`Masked`); of the size before resizing
 
     Raises SequenceError, CalibrationError or TrajectoryError that name file and line.
     """
     if fps is not None and not 0 < fps < math.inf:
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
-    if isinstance(camera, str | Path):
-        camera = _calibration(camera)
-    sequence = _open(path, camera, fps)
-    sequence.calibrated = not isinstance(camera, UnknownCamera)
-    if limit is None and stride == 1:
-        return sequence
-    return sequence.part(stop=None if limit is None else limit * stride, stride=stride)
+    given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
+    sequence = _open(str(path), given, fps)
+    if mask is not None:
+        sequence = Masked(sequence, mask)
+    sequence = cut(sequence, start, stop)
+    if fps is not None:
+        sequence = thin(sequence, fps)
+    if limit is not None or stride != 1:
+        sequence = sequence.part(stop=None if limit is None else limit * stride, stride=stride)
+    return sequence if resize_to is None else resize(sequence, resize_to)
 
 
-def _open(path: str | Path, camera: Camera | Calibration | None, fps: float | None) -> Sequence:
-    if str(path).startswith("synthetic:"):
-        if isinstance(camera, UnknownCamera):
-            rendered = open_synthetic(str(path))
-            return rendered.with_camera(camera.camera(rendered.size))
-        if camera is not None:
-            raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
-        return open_synthetic(str(path))
-    path = Path(path)
-    if path.is_dir():
-        if is_eth3d_tum(path):
-            return open_eth3d_tum(path, camera)
-        if is_kitti(path):
-            return open_kitti(path, camera)
-        if is_euroc(path):
-            return open_euroc(path, camera)
-        return open_folder(path, camera, fps)
-    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-        return VideoSequence(path, camera, fps)
-    if path.exists():
-        raise SequenceError(f"{path}: neither a folder nor a video ({', '.join(sorted(VIDEO_SUFFIXES))})")
-    raise SequenceError(f"{path}: does not exist")
+def full_name(path: str | Path) -> str:
+    """What opens the same sequence from another folder too."""
+    path = str(path)
+    return path if synthetic.matches(path) or live.matches(path) else str(Path(path).absolute())
 
 
-def _calibration(camera: str | Path) -> Calibration:
-    """A camera given as text: "auto", the name of a file, or the numbers themselves."""
-    if camera == AUTO:
-        return UnknownCamera()
-    return read_calibration(camera) if Path(camera).is_file() else parse_camera(str(camera))
+def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
+    if archive.matches(path):
+        return archive.open(path, lambda folder: _open(folder, camera, rate))
+    reader = find_reader(path)
+    if reader is None:
+        raise SequenceError(why_nothing(path))
+    return reader.open(path, camera, rate)

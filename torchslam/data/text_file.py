@@ -9,17 +9,27 @@ from pathlib import Path
 
 from torchslam.errors import TorchslamError
 
+MAX_BYTES = 1 << 28
+"""A text file above this size is not read: lists and poses of a million frames are smaller."""
+
+
+def read_text(path: str | Path, error: type[TorchslamError]) -> str:
+    """The text of a file. Raises `error` where it does not exist, is not text or is too large."""
+    try:
+        size = Path(path).stat().st_size
+        if size > MAX_BYTES:
+            raise error(f"{path}: has {size} bytes, more than the {MAX_BYTES} of a text that is read")
+        return Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as cause:
+        raise error(f"{path}: cannot be read: {cause}") from cause
+
 
 def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
     """The lines of a file that say something, with their numbers from 1; `#` after a space starts a comment.
 
-    Raises `error` where the file does not exist or is not text.
+    Raises `error` where the file does not exist, is not text or is too large.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as cause:
-        raise error(f"{path}: cannot be read: {cause}") from cause
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path, error).splitlines(), start=1):
         content = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
         if content:
             yield number, content

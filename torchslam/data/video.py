@@ -9,57 +9,115 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration, fit_camera
-from torchslam.data.folder import DEFAULT_RATE
-from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.image_file import bgr_to_tensor, grey_to_tensor
 from torchslam.data.sequence import Sequence
-from torchslam.errors import FrameError, MissingCalibrationError, SequenceError
-from torchslam.geometry.camera import Camera
+from torchslam.errors import FrameError, SequenceError
 
-SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
+SUFFIXES = frozenset(
+    {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
+)
+LOOKS_FOR = f"a video ({', '.join(sorted(SUFFIXES))})"
+MAX_FRAMES = 2_000_000
+"""Frames of a video that are counted: 18 hours at 30 a second."""
 
 
 class VideoSequence(Sequence):
-    """Frames of a video at its nominal rate (or `rate`); their number is what the container says."""
+    """Frames of a video at their presentation times, in seconds from the beginning of its stream.
 
-    def __init__(self, path: Path, camera: Camera | Calibration | None, rate: float | None = None) -> None:
-        """Raises SequenceError for a file that holds no video, CalibrationError without a fitting camera."""
-        if camera is None:
-            raise MissingCalibrationError(
-                f"{path}: a video says nothing about its camera; "
-                "give it with --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3] or as a calibration file"
-            )
+    All frames are decoded once to learn how many there are and when: what a container says of them in advance is an
+    estimate, and wrong where the rate varies. Frames are turned as the file says that they are to be shown.
+    """
+
+    def __init__(self, path: Path, camera: GivenCamera | None) -> None:
+        """Raises SequenceError for a file that holds no video, CalibrationError for a camera that does not fit."""
         self._path = path
         self._capture = cv2.VideoCapture(str(path))
-        self._position = 0
-        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        first = self._read(0) if self._capture.isOpened() and count > 0 else None
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        self._position = 0  # of the decoder, among all frames that can be decoded
+        promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        times, notes = self._read_times(), []
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        if len(times) > 1 and max(times) == min(times) and rate > 0:
+            times = [index / rate for index in range(len(times))]
+            notes.append(f"the file has no times; {rate:g} frames per second are taken")
+        self._frames = _rising(times)
+        first = self._read(0) if self._frames else None
         if first is None:
             raise SequenceError(f"{path}: cannot be read as a video")
+        if len(self._frames) < len(times):
+            notes.append(
+                f"left out {len(times) - len(self._frames)} frames whose time is not after the one before"
+            )
+        # Some containers do not know; a stream that breaks off has fewer than promised.
+        if len(times) < promised and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".avi"):
+            notes.append(f"{len(times)} frames can be decoded; the file speaks of {promised}")
         size = (first.shape[1], first.shape[0])
-        camera = fit_camera(camera, size, str(path))
-        rate = rate or self._capture.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE
-        super().__init__(path.stem, "video", camera, torch.arange(count, dtype=torch.float64) / rate)
+        super().__init__(
+            path.stem,
+            "video",
+            None if camera is None else fit_camera(camera, size, str(path)),
+            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64),
+            size=size,
+            guessed=is_guessed(camera),
+            notes=notes,
+        )
 
     def image(self, index: int) -> Tensor:
-        grey = self._read(index)
-        if grey is None:
-            raise FrameError(f"{self.image_name(index)}: cannot be decoded, or the video ends before it")
-        return grey_to_tensor(grey)
+        return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
+
+    def colour(self, index: int) -> Tensor:
+        return bgr_to_tensor(self._frame(index))
 
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
 
-    def _read(self, index: int) -> np.ndarray | None:
-        """The (H, W) uint8 grey frame `index`; frames in between are skipped without conversion."""
-        if index < self._position:
+    def _read_times(self) -> list[float]:
+        """Seconds of every frame that can be decoded, as the container has them."""
+        times: list[float] = []
+        while len(times) < MAX_FRAMES and self._capture.grab():
+            times.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+            self._position += 1
+        return times
+
+    def _frame(self, index: int) -> np.ndarray:
+        frame = self._read(self._frames[index])
+        if frame is None:
+            raise FrameError(f"{self.image_name(index)}: cannot be decoded")
+        if (frame.shape[1], frame.shape[0]) != self.size:
+            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        return frame
+
+    def _read(self, frame: int) -> np.ndarray | None:
+        """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion."""
+        if frame < self._position:
             self._capture.release()
             self._capture.open(str(self._path))
+            self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
             self._position = 0
-        while self._position < index:
+        while self._position < frame:
             if not self._capture.grab():
                 return None
             self._position += 1
         self._position += 1
-        decoded, frame = self._capture.read()
-        return cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if decoded else None
+        decoded, image = self._capture.read()
+        return image if decoded else None
+
+
+def matches(path: str) -> bool:
+    """Whether the file has a video's suffix."""
+    return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
+
+
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequence:
+    """A video file; its times are its own. Raises SequenceError or CalibrationError."""
+    return VideoSequence(Path(path), camera)
+
+
+def _rising(times: list[float]) -> list[int]:
+    """Which times are later than all before them."""
+    chosen: list[int] = []
+    for index, time in enumerate(times):
+        if np.isfinite(time) and (not chosen or time > times[chosen[-1]]):
+            chosen.append(index)
+    return chosen

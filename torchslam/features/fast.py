@@ -14,7 +14,7 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
-PIECE = 1 << 17  # pixels worked on at once: their intermediate results stay in the cache
+PIECE = 1 << 16  # pixels worked on at once: their intermediate results stay in the cache
 
 Extremum = Callable[[Tensor, Tensor], Tensor]
 
@@ -65,14 +65,15 @@ def _scores(ring: list[Tensor], centre: Tensor) -> Tensor:
 def _best_arc(ring: list[Tensor], inner: Extremum, outer: Extremum) -> Tensor:
     """`outer` over the sixteen arcs of nine of `inner` within the arc.
 
-    Arcs come in pairs that share eight pixels: min(eight, a) and min(eight, b) have the maximum min(eight, max(a, b)).
+    Four arcs in a row share six pixels: min(six, a) and min(six, b) have the maximum min(six, max(a, b)).
     """
     pairs = [inner(ring[k], ring[k + 1 - 16]) for k in range(1, 16, 2)]
-    fours = [inner(pairs[k], pairs[k + 1 - 8]) for k in range(8)]
     best: Tensor | None = None
-    for k in range(8):
-        eight = inner(fours[k], fours[k + 2 - 8])  # ring positions 2k+1 ... 2k+8
-        arcs = inner(eight, outer(ring[2 * k], ring[2 * k + 9 - 16]))
+    for k in range(0, 16, 4):  # the arcs from k, k + 1, k + 2 and k + 3 on; pair i holds 2 i + 1 and 2 i + 2
+        before, first, second, third, after = (pairs[k // 2 + i - 8] for i in range(5))
+        earlier = inner(before, outer(ring[k], ring[k + 9 - 16]))
+        later = inner(after, outer(ring[k + 2], ring[k + 11 - 16]))
+        arcs = inner(inner(first, second), inner(third, outer(earlier, later)))
         best = arcs if best is None else outer(best, arcs)
     assert best is not None
     return best

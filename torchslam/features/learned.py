@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.features.corners import soft_peak
+from torchslam.features.masking import only_where
 from torchslam.features.orb import check_images
 from torchslam.values import Features
 
@@ -44,12 +45,14 @@ class XFeat(nn.Module):
         _load(model, _read(weights), weights, optional="net.fine_matcher.")
         self.network = model.net.eval()
 
-    def forward(self, images: Tensor) -> Features:
+    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
 
         Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
         """
-        check_images(images)
+        check_images(images, wanted)
         height, width = images.shape[-2:]
         # The network halves its input five times.
         inner = (max(32, height // 32 * 32), max(32, width // 32 * 32))
@@ -59,6 +62,8 @@ class XFeat(nn.Module):
         heat = F.pixel_shuffle(logits.softmax(1)[:, :64], 8)
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
         peaks = kornia.geometry.subpix.nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
+        if wanted is not None:
+            peaks &= F.interpolate(wanted.float(), inner, mode="nearest-exact") > 0
         ranked = torch.where(peaks, scores, 0).flatten(1)
         best = ranked.detach().topk(min(self.num_keypoints, ranked.shape[1]))
         mask = best.values > 0
@@ -104,12 +109,15 @@ class ALIKED(nn.Module):
         _load(self.network, state, weights, optional="dkd.")  # the detector's grid of pixels is no weight
         self.network.eval()
 
-    def forward(self, images: Tensor) -> Features:
+    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere. The network's own detector knows no mask,
+                so that its other keypoints are lost rather than replaced
 
         Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
         """
-        check_images(images)
+        check_images(images, wanted)
         found = self.network(images.float())
         rows = [
             _features(
@@ -121,7 +129,8 @@ class ALIKED(nn.Module):
             )
             for one in found
         ]
-        return Features(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(Features)))
+        features = Features(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(Features)))
+        return features if wanted is None else only_where(features, wanted)
 
 
 def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int) -> Features:

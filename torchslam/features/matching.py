@@ -13,12 +13,15 @@ import torch
 from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
 
 # Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
 _AMPLITUDE = 64
 _INDEX_BITS = 13
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
+
+_LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
@@ -34,6 +37,7 @@ class _Nearest(NamedTuple):
     mutual: Tensor
 
 
+@full_precision
 def match(
     features_1: Features,
     features_2: Features,
@@ -41,6 +45,7 @@ def match(
     mutual: bool = True,
     max_distance: float | None = 64,
     temperature: float | None = None,
+    allowed: Tensor | None = None,
 ) -> Matches:
     """Nearest neighbours between two sets of features, all against all.
 
@@ -50,6 +55,7 @@ def match(
     max_distance: Hamming bits, or 1 - cosine for floats; None: no limit
     temperature:  where given, `weights` are the dual softmax of -distance / temperature at the matches, with gradients
                   to float descriptors (Sun et al.: LoFTR, 2021, eq. 2)
+    allowed:      (B, N1, N2) bool, pairs that may match at all; None: all
 
     Returns Matches with M = N1 rows, row i being keypoint i of the first set. Each keypoint of the second set is used
     at most once: the lowest distance wins, then the lowest index. Distances of float descriptors carry gradients.
@@ -62,13 +68,15 @@ def match(
         return _no_matches(batch, rows, descriptors_1.device)
     similarity = None
     if descriptors_1.dtype == torch.uint8:
-        nearest = _nearest_bits(descriptors_1, descriptors_2, features_1.mask, features_2.mask)
+        nearest = _nearest_bits(descriptors_1, descriptors_2, features_1.mask, features_2.mask, allowed)
         if temperature is not None:
             similarity = -hamming(descriptors_1, descriptors_2).float()
     else:
         similarity = descriptors_1 @ descriptors_2.mT
-        nearest = _nearest_floats(similarity, features_1.mask, features_2.mask)
+        nearest = _nearest_floats(similarity, features_1.mask, features_2.mask, allowed)
     mask = features_1.mask & features_2.mask.any(1, keepdim=True)
+    if allowed is not None:
+        mask = mask & (allowed & features_2.mask[:, None, :]).any(2)
     if max_distance is not None:
         mask = mask & (nearest.distance <= max_distance)
     if ratio is not None:
@@ -78,12 +86,12 @@ def match(
     mask = _one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
     weights = None
     if temperature is not None and similarity is not None:
-        weights = (
-            _dual_softmax(similarity / temperature, nearest.column, features_1.mask, features_2.mask) * mask
-        )
+        logits = similarity / temperature
+        weights = _dual_softmax(logits, nearest.column, features_1.mask, features_2.mask, allowed) * mask
     return _matches(nearest.column, nearest.distance, mask, weights)
 
 
+@full_precision
 def match_projected(
     descriptors: Tensor,
     pixels: Tensor,
@@ -140,7 +148,15 @@ def match_projected(
     return _matches(local, distance, _one_to_one(local, distance.detach(), accepted, columns))
 
 
-def _nearest_bits(descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, mask_2: Tensor) -> _Nearest:
+def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
+    """(B, N1, N2) bool, the pairs that may match."""
+    possible = mask_1[:, :, None] & mask_2[:, None, :]
+    return possible if allowed is None else possible & allowed
+
+
+def _nearest_bits(
+    descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
+) -> _Nearest:
     """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
     keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
     bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
@@ -150,6 +166,8 @@ def _nearest_bits(descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, 
         keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
     highest = (1 << index_bits) - 1
     masked = _MASKED << (index_bits - _INDEX_BITS)
+    if allowed is not None:
+        keys.masked_fill_(~allowed, masked)
     numbers = highest - torch.arange(columns, device=keys.device) + masked * ~mask_2
     keys += numbers.to(keys.dtype)[:, None, :]
     keys += (masked * ~mask_1).to(keys.dtype)[:, :, None]
@@ -166,19 +184,21 @@ def _nearest_bits(descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, 
     return _Nearest(column, nearest, second, nearest <= distance(column_best).gather(1, column))
 
 
-def _nearest_floats(similarity: Tensor, mask_1: Tensor, mask_2: Tensor) -> _Nearest:
+def _nearest_floats(similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> _Nearest:
     """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
-    values = similarity.detach().masked_fill(~(mask_1[:, :, None] & mask_2[:, None, :]), -torch.inf)
+    values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
     best, column = values.max(2)
     mutual = best >= values.amax(1).gather(1, column)
     second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2)
     return _Nearest(column, 1 - similarity.gather(2, column[..., None])[..., 0], second, mutual)
 
 
-def _dual_softmax(logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor) -> Tensor:
+def _dual_softmax(
+    logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
+) -> Tensor:
     """Product of the softmax over columns and over rows at (row, column[row]): (B, N1, N2), (B, N1) -> (B, N1)."""
     low = torch.finfo(logits.dtype).min / 2
-    logits = logits.masked_fill(~(mask_1[:, :, None] & mask_2[:, None, :]), low)
+    logits = logits.masked_fill(~_possible(mask_1, mask_2, allowed), low)
     both = logits.softmax(2) * logits.softmax(1)
     return both.gather(2, column[..., None])[..., 0]
 
@@ -318,3 +338,7 @@ def _check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
             f"descriptors must be two (B, N, D) of one type, got {tuple(descriptors_1.shape)} {descriptors_1.dtype} "
             f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"
         )
+    for descriptors in (descriptors_1, descriptors_2) if descriptors_1.is_floating_point() else ():
+        lengths = torch.linalg.vector_norm(descriptors.detach(), dim=-1)
+        if bool(((lengths - 1).abs() > _LENGTH_TOLERANCE)[lengths > 0].any()):
+            raise ValueError("descriptors must have unit length, or be zero where there is no keypoint")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -29,32 +30,35 @@ class OpenCVORB(nn.Module):
             nfeatures=num_keypoints, scaleFactor=scale_factor, nlevels=num_levels, fastThreshold=threshold
         )
 
-    def forward(self, images: Tensor) -> Features:
+    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
 
         Raises ValueError for another shape or type.
         """
-        check_images(images)
+        check_images(images, wanted)
+        masks = [None] * len(images) if wanted is None else list(wanted[:, 0].to(torch.uint8).cpu().numpy())
         arrays = images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
-        batch = [self._extract(array, images.dtype) for array in arrays]
+        batch = [self._extract(*each, images.dtype) for each in zip(arrays, masks, strict=True)]
         fields = (torch.stack(column) for column in zip(*batch, strict=True))
         return Features(*fields).to(images.device)
 
-    def _extract(self, image: Tensor, dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """The fields of `Features` of one (H, W) uint8 image."""
+    def _extract(self, image: Tensor, mask: np.ndarray | None, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """The fields of `Features` of one (H, W) uint8 image, where `mask` is not 0."""
         # cv2 fails on images that leave no room for a keypoint instead of finding none.
         roomy = min(image.shape) > 2 * self._orb.getEdgeThreshold()
-        found, described = self._orb.detectAndCompute(image.numpy(), None) if roomy else ((), None)
+        found, described = self._orb.detectAndCompute(image.numpy(), mask) if roomy else ((), None)
         # cv2 may return a few more than asked for when responses tie.
         rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
         values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype).repeat(self.num_keypoints, 1)
         descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8)
-        mask = torch.arange(self.num_keypoints) < len(rows)
+        found_mask = torch.arange(self.num_keypoints) < len(rows)
         if described is not None:
             points = [found[row] for row in rows]
             values[: len(rows)] = torch.tensor([self._row(point) for point in points], dtype=dtype)
             descriptors[: len(rows)] = torch.from_numpy(described[rows])
-        return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, mask
+        return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, found_mask
 
     def _row(self, point: cv2.KeyPoint) -> tuple[float, float, float, float, float]:
         """x, y, score, scale, angle of a keypoint.

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
@@ -21,6 +22,7 @@ BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one
 HARRIS_RADIUS = 4  # of the patch that a Harris response needs
 FAST_RADIUS = 3  # of the circle
 SOFT_RADIUS = 1  # of the soft arg-max
+NEVER = 255  # a score that no corner exceeds
 PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 
@@ -91,12 +93,14 @@ class ORB(nn.Module):
         self.differentiable = differentiable
         self._fast_scores = torch.compile(fast_scores, dynamic=False) if compile else fast_scores
 
-    def forward(self, images: Tensor) -> Features:
+    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+
+        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
 
         Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
         """
-        corners = self.detect(images)
+        corners = self.detect(images, wanted)
         stride, dtype = corners.atlas.stride, images.dtype
         angles = orientations(corners.pixels, corners.positions, stride)
         descriptors = describe(blur(corners.pixels, stride), corners.positions, angles, stride)
@@ -118,9 +122,12 @@ class ORB(nn.Module):
             table(torch.ones_like(corners.slots, dtype=torch.bool)),
         )
 
-    def detect(self, images: Tensor) -> Corners:
-        """Choose the corners of a batch of images (B, 1, H, W), without sub-pixel positions and descriptors."""
-        check_images(images)
+    def detect(self, images: Tensor, wanted: Tensor | None = None) -> Corners:
+        """Choose the corners of a batch of images (B, 1, H, W), without sub-pixel positions and descriptors.
+
+        wanted: (B, 1, H, W) bool, where they may lie: the budget goes there alone
+        """
+        check_images(images, wanted)
         atlas = plan_atlas(*images.shape[-2:], self.scale_factor, self.num_levels)
         grid = plan_grid(atlas, self.num_keypoints, PER_CELL, BORDER, self.low_threshold, images.device)
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
@@ -129,6 +136,8 @@ class ORB(nn.Module):
             pixels = fill_atlas(levels, atlas).flatten()
             scores = self._fast_scores(pixels, atlas.stride)
             floor = grid.floor.expand(len(images), -1).reshape(-1)
+            if wanted is not None:
+                floor = torch.where(_on_atlas(wanted, atlas), floor, NEVER)
             positions = true_indices(find_peaks(scores, floor, atlas.stride))
             positions, slots, strengths = self._choose(pixels, scores, positions, grid, atlas.stride)
             fast = gather_patches(scores, positions, atlas.stride, 1)
@@ -184,8 +193,18 @@ def _stand_out(fast: Tensor) -> Tensor:
     return fast[:, 1, 1] + (fast[:, 1, 1] - fast.flatten(1).mean(1)) / 256
 
 
-def check_images(images: Tensor) -> None:
-    """Raise ValueError unless the images are (B, 1, H, W) floats."""
+def _on_atlas(wanted: Tensor, atlas: Atlas) -> Tensor:
+    """(B * rows * stride,) bool: whether the nearest pixel of a mask (B, 1, H, W) to each place on the atlas is set."""
+    levels = [F.interpolate(wanted.float(), size=size, mode="nearest-exact") for size in atlas.sizes]
+    return fill_atlas(levels, atlas).flatten() > 0
+
+
+def check_images(images: Tensor, wanted: Tensor | None = None) -> None:
+    """Raise ValueError unless the images are (B, 1, H, W) floats, and where keypoints are wanted, (B, 1, H, W) bool."""
+    if wanted is not None and (wanted.shape != images.shape or wanted.dtype != torch.bool):
+        raise ValueError(
+            f"a mask must be bool {tuple(images.shape)}, got {wanted.dtype} {tuple(wanted.shape)}"
+        )
     if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
     if not images.is_floating_point():

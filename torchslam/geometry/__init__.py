@@ -5,6 +5,7 @@ from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import (
     decompose_essential,
+    epipolar_offsets,
     essential_from_pose,
     five_point,
     sampson_errors,
@@ -68,6 +69,7 @@ __all__ = [
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
+    "epipolar_offsets",
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",

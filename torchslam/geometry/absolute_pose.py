@@ -14,6 +14,7 @@ from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.least_squares import State, minimize, retract_pose
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import (
     fit_projections,
     pose_tangent,
@@ -53,6 +54,7 @@ class AbsolutePose:
     score: Tensor
 
 
+@full_precision
 def estimate_absolute_pose(
     points_w: Tensor,
     pixels: Tensor,

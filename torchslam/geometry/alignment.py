@@ -5,9 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchslam.geometry.implicit import first_order, needs_gradient
 from torchslam.geometry.lie import so3_exp, vee
+from torchslam.geometry.precision import full_precision
 
 
+@full_precision
 def umeyama(
     source: Tensor,
     target: Tensor,
@@ -19,9 +22,9 @@ def umeyama(
     source, target: (..., N, 3); weights: (..., N) non-negative weights or a boolean mask; rows of weight zero
     may hold anything. Returns scale (...), R (..., 3, 3), t (..., 3).
 
-    Differentiable (first order) in points and weights, on exact data and at repeated singular values too:
-    the rotation's gradient comes from the optimality condition, not from the singular vectors. With fewer
-    than three points, or collinear ones, the result is finite and one of many minimisers, and its gradient
+    Differentiable (once; a second time raises RuntimeError) in points and weights, on exact data and at repeated
+    singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
+    With fewer than three points, or collinear ones, the result is finite and one of many minimisers, and its gradient
     leaves out the free direction.
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
@@ -55,7 +58,7 @@ def _nearest_rotation(M: Tensor) -> Tensor:
     sign = torch.ones_like(singular)
     sign[..., 2] = torch.where(torch.linalg.det(U @ Vh) < 0, -1.0, 1.0)
     R = (U * sign[..., None, :]) @ Vh
-    if not M.requires_grad:
+    if not needs_gradient(M):
         return R
     # In the basis U, S is diag(singular * sign) and the system is diagonal.
     s = singular * sign
@@ -65,4 +68,4 @@ def _nearest_rotation(M: Tensor) -> Tensor:
     in_basis = (U.mT @ residual[..., None]).squeeze(-1)
     omega = torch.where(free, 0.0, in_basis / torch.where(free, 1.0, stiffness))
     omega = (U @ omega[..., None]).squeeze(-1)
-    return so3_exp(omega - omega.detach()) @ R
+    return so3_exp(first_order(omega - omega.detach())) @ R

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchslam.geometry.implicit import first_order, needs_gradient
+
 _NEWTON_STEPS = 12
 
 
@@ -46,9 +48,9 @@ def first_positive_root(coefficients: Tensor) -> Tensor:
     monic whichever coefficients vanish.
     """
     degree = coefficients.shape[-1]
-    companion = torch.zeros(*coefficients.shape, degree, dtype=coefficients.dtype, device=coefficients.device)
-    companion[..., 0, :] = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)
-    companion[..., 1:, :-1] = torch.eye(degree - 1, dtype=companion.dtype, device=companion.device)
+    first = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)[..., None, :]
+    shift = torch.eye(degree, dtype=first.dtype, device=first.device)[:-1]
+    companion = torch.cat((first, shift.expand(*first.shape[:-2], degree - 1, degree)), dim=-2)
     inverse = torch.linalg.eigvals(companion)
     real = inverse.imag.abs() <= 1e-6 * inverse.abs()
     largest = torch.where(real, inverse.real, 0.0).amax(-1)
@@ -144,12 +146,12 @@ def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) ->
             xy = xy * (edge / radius.clamp_min(1e-12)).clamp_max(1.0)
             if _converged(step):
                 break
-    if not torch.is_grad_enabled() or not (distorted.requires_grad or k.requires_grad):
+    if not needs_gradient(distorted, k):
         return xy
     slope = _radial_tangential_slope(xy, k.detach())
     step = _implicit_step(slope, _radial_tangential(xy, k) - distorted)
     clamped = xy.norm(dim=-1, keepdim=True) >= edge * (1 - 1e-9)
-    return xy + torch.where(clamped, 0.0, step - step.detach())
+    return xy + torch.where(clamped, 0.0, first_order(step - step.detach()))
 
 
 def _radial_tangential_limit(k: Tensor) -> Tensor:
@@ -219,7 +221,7 @@ def _fisheye_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
         slope = _bent_slope(angle, k).clamp_min(1e-3)
         clamped = angle >= edge
     step = -(_bent(angle, k) - bent) / slope
-    angle = angle + torch.where(clamped, 0.0, step - step.detach())
+    angle = angle + torch.where(clamped, 0.0, first_order(step - step.detach()))
     factor = torch.tan(angle) / bent
     return distorted * torch.where(zero, 1.0, factor)[..., None]
 

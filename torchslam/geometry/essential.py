@@ -12,7 +12,9 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import skew
+from torchslam.geometry.precision import full_precision
 
 # The unknowns are x, y, z in E = x E_0 + y E_1 + z E_2 + E_3. The monomials by their powers of x, y, z: first those
 # that are eliminated, then x, y and 1 times powers of z (Nister, 2004, table 1).
@@ -24,6 +26,7 @@ _GRID = 256  # intervals in which to look for sign changes
 _NEWTON_STEPS = 5
 
 
+@full_precision
 def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     """Essential matrices of samples of five matches, with the sample that each belongs to.
 
@@ -196,11 +199,13 @@ def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(inverse, 1 / z, z), row
 
 
+@full_precision
 def essential_from_pose(R_21: Tensor, t_21: Tensor) -> Tensor:
     """E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
     return skew(t_21) @ R_21
 
 
+@full_precision
 def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
     """The two rotations and the direction, up to sign, of essential matrices of any scale.
 
@@ -222,6 +227,7 @@ def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
     return R / size[..., None, None, None], t * size[..., None].rsqrt()
 
 
+@full_precision
 def sampson_errors(
     E: Tensor,
     x_1: Tensor,
@@ -241,3 +247,26 @@ def sampson_errors(
     squared = line_2[..., :2].square().sum(-1) * variance_2 + line_1[..., :2].square().sum(-1) * variance_1
     regular = squared > torch.finfo(squared.dtype).tiny
     return torch.where(regular, (x_2 * line_2).sum(-1) * torch.where(regular, squared, 1.0).rsqrt(), 0.0)
+
+
+def epipolar_offsets(
+    T_21: Tensor, pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera
+) -> tuple[Tensor, Tensor]:
+    """Where matches lie under a motion: beside their epipolar lines, and how far along them from infinity.
+
+    T_21: (..., 4, 4); pixels_1, pixels_2: (..., N, 2). Returns two times (..., N), in pixels at the middle of camera 2:
+    the signed Sampson distance; and the disparity to a point at infinity, which is |e| / z for a point on its line at
+    depth z in camera 2, e being the way along the line by one unit of the translation: negative behind that camera.
+    Both are zero at the epipole, and without a translation; the disparity also where infinity is behind camera 2.
+    """
+    x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
+    R, t = T_21[..., :3, :3], T_21[..., None, :3, 3]
+    across = sampson_errors(essential_from_pose(R, T_21[..., :3, 3]), x_1, x_2)
+    far = torch.cat((x_1, torch.ones_like(x_1[..., :1])), dim=-1) @ R.mT
+    ahead = far[..., 2:] > torch.finfo(far.dtype).eps
+    x_far = far[..., :2] / torch.where(ahead, far[..., 2:], 1.0)
+    towards = t[..., :2] - t[..., 2:] * x_far
+    squared = towards.square().sum(-1)
+    regular = ahead[..., 0] & (squared > torch.finfo(squared.dtype).tiny)
+    along = ((x_2 - x_far) * towards).sum(-1) * torch.where(regular, squared, 1.0).rsqrt()
+    return camera_2.focal * across, camera_2.focal * torch.where(regular, along, 0.0)

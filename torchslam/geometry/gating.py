@@ -10,22 +10,26 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.precision import full_precision
 
 CHI_SQUARE_95 = 5.991
 """95 % of a chi-square distribution of two degrees of freedom."""
 
 
+@full_precision
 def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
     """(...) px^2 between projections of points (..., 3) in the camera frame and pixels (..., 2); infinite behind it."""
     projected, valid = camera.project(points_c)
     return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
 
 
+@full_precision
 def fits(squared_errors: Tensor, sigmas: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
     """(...) bool: squared errors (...), px^2, that keypoints of standard deviation sigmas (...), px, may well have."""
     return squared_errors < chi_square * sigmas**2
 
 
+@full_precision
 def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Tensor:
     """S = sigma^2 I + J Sigma J^T: of pixels measured minus pixels predicted. (..., 2, 2).
 
@@ -36,6 +40,7 @@ def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Te
     return sigmas[..., None, None] ** 2 * eye + J @ covariances @ J.mT
 
 
+@full_precision
 def mahalanobis_squared(errors: Tensor, covariances: Tensor) -> Tensor:
     """e^T S^-1 e of errors (..., D) with covariances (..., D, D), positive definite. (...)."""
     return (errors * torch.linalg.solve(covariances, errors)).sum(-1)

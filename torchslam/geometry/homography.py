@@ -9,7 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchslam.geometry.precision import full_precision
 
+
+@full_precision
 def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
     """Homographies with H_33 = 1 of samples of four or more matches, in the algebraic least-squares sense.
 
@@ -28,6 +31,7 @@ def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
     return torch.cat((h, torch.ones_like(h[..., :1])), dim=-1).unflatten(-1, (3, 3))
 
 
+@full_precision
 def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
     """Rotations that take two rays to two rays, exact for the first. (..., 2, 3) twice -> (..., 3, 3)."""
 
@@ -40,6 +44,7 @@ def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
     return frame(rays_2) @ frame(rays_1).mT
 
 
+@full_precision
 def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
     """Differences H(x_1) - x_2, very large where H takes a point behind the camera.
 
@@ -51,6 +56,7 @@ def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
     return torch.where(front, mapped[..., :2] / torch.where(front, depth, 1.0) - x_2, 1e6)
 
 
+@full_precision
 def decompose_homography(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The motions and planes that explain a homography: four, of which two have the scene in front.
 

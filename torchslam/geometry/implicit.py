@@ -3,14 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
+from torch.autograd import forward_ad
 
 
 def needs_gradient(*tensors: Tensor) -> bool:
-    """Whether a graph is being recorded for any of the tensors."""
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    """Whether a graph is being recorded for any of the tensors, or may be by forward mode."""
+    recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
+
+
+def first_order(tensor: Tensor) -> Tensor:
+    """The tensor, whose first derivatives are right while the second are not: to take these raises RuntimeError."""
+    result: Tensor = _FirstOrder.apply(tensor)
+    return result
+
+
+class _FirstOrder(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(tensor: Tensor) -> Tensor:
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        # The input makes the gradient depend on what it depends on, also where the loss is linear.
+        return _Last.apply(gradient, *ctx.saved_tensors) if torch.is_grad_enabled() else gradient
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor) -> Tensor:
+        return change.view_as(change)
+
+
+class _Last(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(gradient: Tensor, _: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        raise RuntimeError(
+            "the second derivative of an estimate by RANSAC, of an alignment or of an undistorted pixel is not known"
+        )
 
 
 def implicit_step(objective: Callable[[Tensor], Tensor], template: Tensor) -> Tensor:
@@ -19,7 +68,7 @@ def implicit_step(objective: Callable[[Tensor], Tensor], template: Tensor) -> Te
     objective: (B, D) -> (B,), a function of the local parameters, zero at the minimiser, that is also a function
     of data with a graph; the problems of the batch must be independent. template: (B, D), for shape and dtype.
     Returns (B, D): -H^-1 (gradient - its value) with the exact Hessian. Where the Hessian is not positive
-    definite, the gradient is zero.
+    definite, the gradient is zero. It has no second derivative, see `first_order`.
     """
     at = torch.zeros_like(template).requires_grad_()
     with torch.enable_grad():
@@ -32,4 +81,4 @@ def implicit_step(objective: Callable[[Tensor], Tensor], template: Tensor) -> Te
     definite = (info == 0)[:, None]
     factor = torch.where(definite[..., None], factor, torch.eye(H.shape[-1], dtype=H.dtype, device=H.device))
     change = torch.where(definite, gradient - gradient.detach(), 0.0)
-    return -torch.cholesky_solve(change[..., None], factor).squeeze(-1)
+    return first_order(-torch.cholesky_solve(change[..., None], factor).squeeze(-1))

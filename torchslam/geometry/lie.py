@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchslam.geometry.precision import full_precision
+
 # Below this squared angle the coefficients come from their series, (-1)^k / (2k + n)! for n = 1, 2, 3, 4.
 _SERIES_LIMIT = 0.25
 _SERIES = tuple(tuple((-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3, 4)) for k in range(7))
@@ -36,6 +38,7 @@ def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return a, b, c, d
 
 
+@full_precision
 def skew(v: Tensor) -> Tensor:
     """The matrix of the cross product: skew(v) @ u = v x u. (..., 3) -> (..., 3, 3)."""
     shape = (*v.shape, 3)
@@ -44,6 +47,7 @@ def skew(v: Tensor) -> Tensor:
     )
 
 
+@full_precision
 def vee(W: Tensor) -> Tensor:
     """The vector of the antisymmetric part of a matrix, the inverse of `skew`. (..., 3, 3) -> (..., 3)."""
     return 0.5 * torch.stack(
@@ -51,6 +55,7 @@ def vee(W: Tensor) -> Tensor:
     )
 
 
+@full_precision
 def rigid(R: Tensor, t: Tensor) -> Tensor:
     """Homogeneous matrix [R t; 0 1]. (..., 3, 3), (..., 3) -> (..., 4, 4)."""
     if R.shape[:-2] != t.shape[:-1]:
@@ -60,11 +65,13 @@ def rigid(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat((torch.cat((R, t[..., None]), dim=-1), bottom), dim=-2)
 
 
+@full_precision
 def transform(T: Tensor, points: Tensor) -> Tensor:
     """Points under homogeneous transforms. (..., 4, 4), (..., N, 3) -> (..., N, 3)."""
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
+@full_precision
 def so3_exp(omega: Tensor) -> Tensor:
     """Rotation matrices of rotation vectors. (..., 3) radians -> (..., 3, 3)."""
     a, b, _, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
@@ -72,6 +79,7 @@ def so3_exp(omega: Tensor) -> Tensor:
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + a * W + b * (W @ W)
 
 
+@full_precision
 def so3_left_jacobian(omega: Tensor) -> Tensor:
     """J with exp(omega + d) = exp(J d) exp(omega) to first order. (..., 3) -> (..., 3, 3)."""
     _, b, c, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
@@ -87,6 +95,7 @@ def _so3_left_jacobian_inverse(omega: Tensor) -> Tensor:
     return torch.eye(3, dtype=omega.dtype, device=omega.device) - 0.5 * W + factor * (W @ W)
 
 
+@full_precision
 def quaternion_from_matrix(R: Tensor) -> Tensor:
     """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices. (..., 3, 3) -> (..., 4).
 
@@ -106,6 +115,7 @@ def quaternion_from_matrix(R: Tensor) -> Tensor:
     return torch.where(q[..., 3:] < 0, -q, q)
 
 
+@full_precision
 def matrix_from_quaternion(q_xyzw: Tensor) -> Tensor:
     """Rotation matrices of quaternions (x, y, z, w) of any non-zero length. (..., 4) -> (..., 3, 3)."""
     v, w = q_xyzw[..., :3], q_xyzw[..., 3:, None]
@@ -114,6 +124,7 @@ def matrix_from_quaternion(q_xyzw: Tensor) -> Tensor:
     return torch.eye(3, dtype=v.dtype, device=v.device) + twice * (w * V + V @ V)
 
 
+@full_precision
 def so3_log(R: Tensor) -> Tensor:
     """Rotation vectors, of length at most pi, of rotation matrices. (..., 3, 3) -> (..., 3) radians."""
     v, w = quaternion_from_matrix(R).split((3, 1), dim=-1)
@@ -130,6 +141,7 @@ def so3_log(R: Tensor) -> Tensor:
     return torch.where(small, near, far) * v
 
 
+@full_precision
 def se3_exp(xi: Tensor) -> Tensor:
     """Rigid transforms of tangent vectors [rho, omega]. (..., 6) -> (..., 4, 4)."""
     rho, omega = xi.split(3, dim=-1)
@@ -141,6 +153,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     return rigid(eye + a * W + b * W2, (V @ rho[..., None]).squeeze(-1))
 
 
+@full_precision
 def se3_log(T: Tensor) -> Tensor:
     """Tangent vectors [rho, omega] of rigid transforms. (..., 4, 4) -> (..., 6)."""
     omega = so3_log(T[..., :3, :3])
@@ -148,12 +161,14 @@ def se3_log(T: Tensor) -> Tensor:
     return torch.cat((rho, omega), dim=-1)
 
 
+@full_precision
 def se3_inverse(T: Tensor) -> Tensor:
     """Inverse of rigid transforms. (..., 4, 4) -> (..., 4, 4)."""
     R = T[..., :3, :3].mT
     return rigid(R, -(R @ T[..., :3, 3:]).squeeze(-1))
 
 
+@full_precision
 def se3_adjoint(T: Tensor) -> Tensor:
     """Ad with T exp(xi) = exp(Ad xi) T. (..., 4, 4) -> (..., 6, 6)."""
     R, t = T[..., :3, :3], T[..., :3, 3]
@@ -161,6 +176,7 @@ def se3_adjoint(T: Tensor) -> Tensor:
     return torch.cat((top, torch.cat((torch.zeros_like(R), R), dim=-1)), dim=-2)
 
 
+@full_precision
 def se3_interpolate(T_0: Tensor, T_1: Tensor, fraction: Tensor | float) -> Tensor:
     """The screw motion from T_0 (fraction 0) to T_1 (fraction 1). (..., 4, 4) twice, (...) -> (..., 4, 4).
 
@@ -200,6 +216,7 @@ def _sim3_translation_matrix(omega: Tensor, sigma: Tensor) -> Tensor:
     )
 
 
+@full_precision
 def sim3_exp(xi: Tensor) -> Tensor:
     """Similarities [sR t; 0 1] of tangent vectors [rho, omega, sigma], s = exp(sigma).
 
@@ -210,11 +227,13 @@ def sim3_exp(xi: Tensor) -> Tensor:
     return rigid(sigma.exp()[..., None, None] * so3_exp(omega), t)
 
 
+@full_precision
 def sim3_scale(T: Tensor) -> Tensor:
     """The scale s of similarities [sR t; 0 1]. (..., 4, 4) -> (...)."""
     return T[..., 0, :3].norm(dim=-1)
 
 
+@full_precision
 def sim3_log(T: Tensor) -> Tensor:
     """Tangent vectors [rho, omega, sigma] of similarities. (..., 4, 4) -> (..., 7)."""
     scale = sim3_scale(T)
@@ -224,12 +243,14 @@ def sim3_log(T: Tensor) -> Tensor:
     return torch.cat((rho, omega, sigma[..., None]), dim=-1)
 
 
+@full_precision
 def sim3_inverse(T: Tensor) -> Tensor:
     """Inverse of similarities. (..., 4, 4) -> (..., 4, 4)."""
     inverse = T[..., :3, :3].mT / sim3_scale(T).square()[..., None, None]
     return rigid(inverse, -(inverse @ T[..., :3, 3:]).squeeze(-1))
 
 
+@full_precision
 def sim3_adjoint(T: Tensor) -> Tensor:
     """Ad with T exp(xi) = exp(Ad xi) T for similarities. (..., 4, 4) -> (..., 7, 7)."""
     sR, t = T[..., :3, :3], T[..., :3, 3:]
@@ -242,12 +263,14 @@ def sim3_adjoint(T: Tensor) -> Tensor:
     return torch.cat((top, middle, bottom), dim=-2)
 
 
+@full_precision
 def sim3_left_jacobian(xi: Tensor) -> Tensor:
     """J with exp(xi + d) = exp(J d) exp(xi) to first order. (..., 7) -> (..., 7, 7)."""
     (W, Q, q), rotation = _sim3_left_jacobian_blocks(xi)
     return _sim3_jacobian_from_blocks(W, Q, -q, rotation)
 
 
+@full_precision
 def sim3_left_jacobian_inverse(xi: Tensor) -> Tensor:
     """Inverse of the left Jacobian, for angles below 2 pi. (..., 7) -> (..., 7, 7)."""
     (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)

@@ -7,7 +7,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchslam.geometry.precision import full_precision
 
+
+@full_precision
 def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """All poses R, t with ray_i parallel to R point_i + t, of three rays and points: up to four.
 

@@ -13,6 +13,7 @@ from torchslam.geometry.essential import essential_from_pose, sampson_errors
 from torchslam.geometry.homography import decompose_homography, transfer_errors
 from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, so3_exp
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, search
 from torchslam.geometry.two_view import (
     TwoViews,
@@ -65,6 +66,7 @@ class RelativePose:
     score_rotation: Tensor
 
 
+@full_precision
 def estimate_relative_pose(
     pixels_1: Tensor,
     pixels_2: Tensor,

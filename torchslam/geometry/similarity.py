@@ -13,6 +13,7 @@ from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.least_squares import State, minimize, small_rotation
 from torchslam.geometry.lie import rigid, transform
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
@@ -51,6 +52,7 @@ class Similarity:
     score: Tensor
 
 
+@full_precision
 def estimate_similarity(
     points_1: Tensor,
     points_2: Tensor,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse, skew, transform
+from torchslam.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class MultiViewTriangulation:
     mask: Tensor
 
 
+@full_precision
 def triangulate(
     T_1w: Tensor,
     T_2w: Tensor,
@@ -96,6 +98,7 @@ def triangulate(
     return Triangulation(points_w, angles, depth_1, depth_2, errors_1, errors_2, mask)
 
 
+@full_precision
 def triangulation_covariance(
     T_1w: Tensor,
     T_2w: Tensor,
@@ -123,6 +126,7 @@ def triangulation_covariance(
     return torch.where(determined[..., None, None], covariances, 0.0)
 
 
+@full_precision
 def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     """Moves matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
 
@@ -147,6 +151,7 @@ def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor
     return x_1 - step * moved_1, x_2 - step * moved_2
 
 
+@full_precision
 def triangulate_many(
     T_cw: Tensor,
     pixels: Tensor,

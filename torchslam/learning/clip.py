@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchslam.config import Config
+from torchslam.errors import ClipError
+from torchslam.evaluation import MIN_POSES, ate
 from torchslam.geometry import Camera
 from torchslam.run import finish
 from torchslam.slam import SLAM
@@ -29,14 +32,55 @@ class ClipPoses:
     T_cw:      (T, 4, 4) or (B, T, 4, 4) world to camera, float64, the identity where there is no pose. The world is
                the camera of the clip's first keyframe, its unit of length the median depth of the first map.
     posed:     (T,) or (B, T) bool; where a clip falls apart into several worlds, the frames of the main one alone
+    success:   () or (B,) bool: a map started, and enough frames are posed for an error to mean something
+    reason:    one per clip: why there is no success, empty where there is
     graphs:    one per clip: what the system saw, with differentiable pixels and weights; None where no map started
     solutions: one per clip: the minimiser of the graph, with points and covariances; None where no map started
     """
 
     T_cw: Tensor
     posed: Tensor
+    success: Tensor
+    reason: tuple[str, ...]
     graphs: tuple[RunGraph | None, ...]
     solutions: tuple[GraphSolution | None, ...]
+
+    @property
+    def failures(self) -> float:
+        """The share of the clips that failed."""
+        return float((~self.success).double().mean())
+
+
+class ClipLoss(NamedTuple):
+    """The loss () over the clips, differentiable, and the share of the clips that failed."""
+
+    loss: Tensor
+    failures: float
+
+
+def clip_loss(
+    poses: ClipPoses,
+    T_cw_groundtruth: Tensor,
+    error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
+    on_failure: Literal["raise", "skip"] | float = "raise",
+) -> ClipLoss:
+    """The mean over the clips of an error, and what became of the clips that have none.
+
+    T_cw_groundtruth: as `poses.T_cw`
+    error:      function of poses, true poses and mask, each with the dimensions of `poses`, to () or (B,)
+    on_failure: "raise" raises ClipError with the reasons; "skip" leaves failed clips out, and raises ClipError if none
+                is left; with a number each of them costs that much, without gradient. A failed clip never counts as one
+                without error: a front end could learn to fail.
+    """
+    if isinstance(on_failure, str) and on_failure not in ("raise", "skip"):
+        raise ValueError(f"on_failure must be 'raise', 'skip' or a number, not {on_failure!r}")
+    reasons = [f"clip {index}: {reason}" for index, reason in enumerate(poses.reason) if reason]
+    if reasons and (on_failure == "raise" or (on_failure == "skip" and len(reasons) == len(poses.reason))):
+        raise ClipError(f"{len(reasons)} of {len(poses.reason)} clips failed; {'; '.join(reasons)}")
+    price = 0.0 if isinstance(on_failure, str) else float(on_failure)
+    errors = torch.where(poses.success, error(poses.T_cw, T_cw_groundtruth, poses.posed), price)
+    counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success
+    return ClipLoss(errors.sum() / counted.sum(), poses.failures)
 
 
 class ClipSLAM(nn.Module):
@@ -47,7 +91,7 @@ class ClipSLAM(nn.Module):
         for images, T_cw_groundtruth in clips:
             optimizer.zero_grad()
             poses = clip_slam(images, camera)
-            ate(poses.T_cw, T_cw_groundtruth, poses.posed).backward()
+            clip_loss(poses, T_cw_groundtruth, on_failure=1.0).loss.backward()
             optimizer.step()
 
     extractor: module from images (B, 1, H, W) to Features with differentiable keypoints, such as
@@ -73,15 +117,17 @@ class ClipSLAM(nn.Module):
         """Run the system on a clip (T, 1, H, W) or on each of several clips (B, T, 1, H, W), floats in [0, 1].
 
         The front end works where the images are, everything behind it where the camera is. World and unit are
-        arbitrary, and without gradient: take a loss that does not depend on them, as `evaluation.ate` and `rpe`. A
-        clip in which no map starts has no posed frame and a gradient of zero. Raises ValueError for another shape,
-        FrameError for images that have not the size that the camera has.
+        arbitrary, and without gradient: take a loss that does not depend on them, as `clip_loss`. A clip in which no
+        map starts has no posed frame and a gradient of zero; `success` and `reason` tell. Raises ValueError for another
+        shape, FrameError for images that have not the size that the camera has.
         """
         if images.ndim == 5:
             clips = [self._clip(clip, camera) for clip in images]
             return ClipPoses(
                 torch.stack([clip.T_cw for clip in clips]),
                 torch.stack([clip.posed for clip in clips]),
+                torch.stack([clip.success for clip in clips]),
+                tuple(reason for clip in clips for reason in clip.reason),
                 tuple(graph for clip in clips for graph in clip.graphs),
                 tuple(solution for clip in clips for solution in clip.solutions),
             )
@@ -100,14 +146,16 @@ class ClipSLAM(nn.Module):
         posed = torch.zeros(len(images), dtype=torch.bool, device=nothing.device)
         seen = self._look(images, features, camera)
         if seen is None:
-            return ClipPoses(T_cw, posed, (None,), (None,))
+            return ClipPoses(T_cw, posed, posed.any(), ("no map started",), (None,), (None,))
         keypoints = (seen.frame_ids[seen.frame_index], seen.keypoint_index)
         pixels, weights = features.keypoints[keypoints].double(), seen.weights * worth[keypoints]
         graph = replace(seen, pixels=pixels, weights=weights, camera=camera)
         solution = solve(graph)
         T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
         posed = posed.index_copy(0, graph.frame_ids, solution.success)
-        return ClipPoses(T_cw, posed, (graph,), (solution,))
+        success = posed.sum() >= MIN_POSES
+        reason = "" if success else _reason(solution, posed)
+        return ClipPoses(T_cw, posed, success, (reason,), (graph,), (solution,))
 
     @torch.no_grad()
     def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
@@ -116,3 +164,10 @@ class ClipSLAM(nn.Module):
         frames = [Frame(index, float(index), image[None]) for index, image in enumerate(images)]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
         return None if run.main is None else run.main.history.graph(run.map, run.camera)
+
+
+def _reason(solution: GraphSolution, posed: Tensor) -> str:
+    """Why a clip with a map failed."""
+    if not any(bundle.success for bundle in solution.keyframes):
+        return "its keyframes and points are not determined"
+    return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"

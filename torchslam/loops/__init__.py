@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from torchslam.loops.places import Places, relative_scores
+from torchslam.loops.places import Places
 
-__all__ = ["Places", "relative_scores"]
+__all__ = ["Places"]

@@ -15,13 +15,16 @@ from torchslam.geometry import Camera, se3_inverse, sim3_inverse
 from torchslam.loops.essential_graph import essential_edges
 from torchslam.loops.recognition import Recognition
 from torchslam.loops.relation import neighbourhood
-from torchslam.mapping.fusion import fuse
+from torchslam.mapping.fusion import find_in, merge
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.solvers import PoseGraph, pose_graph_optimize
+from torchslam.world.map import Map
 from torchslam.world.world import World
 
 _ITERATIONS = 20
-_FUSED = 8  # keyframes on either side whose points are merged
+_SIDE = (
+    20  # keyframes on either side of a seam that are searched for the other side's points: what a visit has
+)
 
 
 def close_loop(found: Recognition, camera: Camera, config: Config) -> None:
@@ -63,11 +66,48 @@ def join(found: Recognition, camera: Camera, config: Config) -> tuple[World, int
 
 
 def weld(world: World, keyframe: int, place: int, camera: Camera, config: Config) -> None:
-    """Merge the points that the surroundings of a keyframe and of a place both see, and adjust the whole map."""
-    here = neighbourhood(world.map, keyframe, _FUSED)
-    there = neighbourhood(world.map, place, _FUSED)
-    for one in here.tolist():
-        fuse(world.map, one, there[there != one], camera, config)
-    world.map.refresh(torch.unique(torch.cat([here, there])))
+    """Merge the points that the surroundings of a keyframe and of a place both see, and adjust the whole map.
+
+    Then once more: where the map was bent, points lie too far from their keypoints to be found, and adjusted they do
+    not.
+    """
+    here = neighbourhood(world.map, keyframe, _SIDE)
+    there = neighbourhood(world.map, place, _SIDE)
+    sew(world.map, here, there, camera, config)
     if config.loops.adjust and config.bundle.enabled:
         adjust_all(world.map, camera, config.bundle)
+        sew(world.map, here, there, camera, config)
+        adjust_all(world.map, camera, config.bundle)
+
+
+def sew_on(world: World, keyframe: int, camera: Camera, config: Config) -> None:
+    """Merge what a keyframe sees with what is seen by those that were here at another time.
+
+    For after a loop was closed: the way goes on over the seam, and what tracking and mapping find by the keyframes that
+    share most with the new one are mostly those of the same visit.
+    """
+    earlier = other_visits(world.map, keyframe)
+    if len(earlier):
+        sew(world.map, world.map.ids(keyframe), earlier, camera, config)
+        track = world.track  # looks for the heirs of merged points
+        track.local_points = torch.unique(world.map.resolve(track.local_points))
+        track.seen_last = world.map.resolve(track.seen_last)
+
+
+def other_visits(slam_map: Map, keyframe: int) -> Tensor:
+    """(<= 20,) keyframes that share many points with this one, but not by way of those before it in time."""
+    order = torch.argsort(slam_map.keys)
+    rank = torch.argsort(order)
+    shares = slam_map.observers(slam_map.points_seen_by(slam_map.ids(keyframe)))[order] > 0
+    missing = torch.nonzero(~shares[: int(rank[keyframe])])[:, 0]
+    began = int(missing[-1]) + 1 if len(missing) else 0
+    near = slam_map.covisible(keyframe, slam_map.num_keyframes)
+    return near[rank[near] < began][:_SIDE]
+
+
+def sew(slam_map: Map, here: Tensor, there: Tensor, camera: Camera, config: Config) -> None:
+    """Find what keyframes (k,) see in others (l,), and the other way round; merge what turns out to be one point."""
+    for keyframes, others in ((here, there), (there, here)):
+        points = slam_map.points_seen_by(others)
+        merge(slam_map, *find_in(slam_map, keyframes, points, camera, config))
+    slam_map.refresh(torch.unique(torch.cat([here, there])))

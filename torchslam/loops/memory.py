@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera
-from torchslam.loops.closing import close_loop, join
+from torchslam.loops.closing import close_loop, join, sew_on
 from torchslam.loops.places import Places
 from torchslam.loops.recognition import Recall, Recognition, Recognizer
 from torchslam.tracking.relocalization import Candidate
@@ -26,6 +26,9 @@ class Memory:
         self.places = Places()
         self.recognizer = Recognizer(camera, config, worlds, self.places)
         self.recalls: list[Recall] = []  # what was recognised so far, for the record
+        for world in worlds:
+            for keyframe in range(world.map.num_keyframes):
+                self.add(world.map, keyframe)
 
     def add(self, slam_map: Map, keyframe: int) -> None:
         """The place of a keyframe can be recognised from now on."""
@@ -43,10 +46,16 @@ class Memory:
         return [candidate for candidate in found if candidate is not None]
 
     def recognize(self, world: World, keyframe: int) -> Recognition | None:
-        """The place that a keyframe shows, if it was seen before and that is certain."""
+        """The place that a keyframe shows, if it was seen before and that is certain.
+
+        What the map knows already of earlier visits is tied to the keyframe.
+        """
         if not self.config.loops.enabled:
             return None
-        return self.recognizer.recognize(world, keyframe)
+        found = self.recognizer.recognize(world, keyframe)
+        if found is None:
+            sew_on(world, keyframe, self.camera, self.config)
+        return found
 
     def take_up(self, found: Recognition) -> tuple[World, int]:
         """Close the loop, or make one world of two; returns the world and the row in it of the keyframe that asked."""

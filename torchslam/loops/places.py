@@ -20,7 +20,6 @@ STRONGEST = (
 NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
-_LEAST_EXPECTED = 0.02  # the median score with the previous image is 0.05 to 0.16, by sequence
 _FIRST_CAPACITY = 64
 _MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
 
@@ -84,24 +83,6 @@ class Places:
         for key in keys:
             self._slots.pop(key, None)
 
-    def rename(self, old: Tensor | Iterable[int], new: Tensor | Iterable[int]) -> None:
-        """Give keyframes of keys `old` (n,) the keys `new` (n,), all at once: they may swap. Others keep theirs.
-
-        For a map whose keyframes were renumbered, or that became part of another. Raises KeyError where an old key is
-        not there, ValueError where two keyframes would have the same key; then nothing has changed.
-        """
-        old, new = _as_list(old), _as_list(new)
-        if len(old) != len(new) or len(set(old)) != len(old):
-            raise ValueError("each old key needs one new key")
-        slots = {key: slot for key, slot in self._slots.items() if key not in set(old)}
-        slots |= {new_key: self._slots[old_key] for old_key, new_key in zip(old, new, strict=True)}
-        if len(slots) != len(self._slots) or min(slots, default=0) < 0:
-            raise ValueError(
-                "new keys must be at least 0 and differ from each other and from the keys that stay"
-            )
-        self._slots = slots
-        self._keys[list(slots.values())] = self._keys.new_tensor(list(slots))
-
     # --- asking ----------------------------------------------------------------------------------------------
 
     def query(self, descriptors: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,36 +114,6 @@ class Places:
 
     # --- storage ---------------------------------------------------------------------------------------------
 
-    def state(self) -> dict[str, Tensor]:
-        """All that `from_state` needs, as tensors: keys (n,), words (W, 32), used (W, n) bool, codes (W, n) int64.
-
-        There are no words before the first keyframe. The same keyframes give the same state, whatever was removed or
-        renamed before.
-        """
-        keys = self.keys
-        if self._words is None:
-            return {"keys": keys}
-        slots = torch.tensor(
-            [self._slots[key] for key in keys.tolist()], dtype=torch.int64, device=keys.device
-        )
-        used = self._used[:, slots] > 0
-        codes = self._codes[:, slots].masked_fill(~used, 0)
-        return {"keys": keys, "words": self._words, "used": used, "codes": codes}
-
-    @classmethod
-    def from_state(cls, state: dict[str, Tensor]) -> Places:
-        """The memory of places that `state` describes."""
-        places, keys = cls(), state["keys"]
-        places._reserve(len(keys), keys.device)
-        if "words" in state:
-            places._take_words(state["words"])
-        places._keys[: len(keys)] = keys
-        places._slots = {key: slot for slot, key in enumerate(keys.tolist())}
-        if "words" in state:
-            places._used[:, : len(keys)] = state["used"].float()
-            places._codes[:, : len(keys)] = state["codes"]
-        return places
-
     def _take_words(self, words: Tensor) -> None:
         """Describe the keyframes from now on by these words (W, 32); those there are, empty ones, have none."""
         self._words = words
@@ -181,17 +132,6 @@ class Places:
         self._keys = _widened(self._keys, capacity, NO_KEY, device)
         self._codes = _widened(self._codes, capacity, 0, device)
         self._used = _widened(self._used, capacity, 0, device)
-
-
-def relative_scores(keys: Tensor, scores: Tensor, reference: Tensor) -> Tensor:
-    """Scores (n,) of keyframes as a share of the best score among the reference keyframes (r,).
-
-    The reference are keyframes that show the same place for certain, such as the previous one: their score says what
-    to expect here, where an image is dark or its texture repeats (Galvez-Lopez and Tardos: DBoW2, 2012). Zero for all
-    where no reference has a score of 0.02, since a share of next to nothing says nothing.
-    """
-    expected = torch.where(torch.isin(keys, reference), scores, 0.0).amax() if len(keys) > 0 else scores.sum()
-    return torch.where(expected >= _LEAST_EXPECTED, scores / expected.clamp(min=_LEAST_EXPECTED), 0.0)
 
 
 def _strongest(descriptors: Tensor, mask: Tensor) -> Tensor:

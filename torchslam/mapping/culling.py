@@ -15,7 +15,7 @@ from torch import Tensor
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import transform
 from torchslam.mapping.keyframes import apart
-from torchslam.world.compaction import Renumbering
+from torchslam.world.compaction import Renumbering, remove_keyframes
 from torchslam.world.map import Map
 from torchslam.world.world import World
 
@@ -37,7 +37,7 @@ def cull_keyframes(world: World, settings: KeyframesConfig) -> Renumbering | Non
     if count - world.asked < max(_LEAST_BATCH, count // _BATCH_SHARE):
         return None
     goes = redundant(world, around_new_ones(world), settings)
-    renumbering = world.remove(torch.nonzero(goes)[:, 0]) if bool(goes.any()) else None
+    renumbering = remove_keyframes(world, torch.nonzero(goes)[:, 0]) if bool(goes.any()) else None
     world.asked = world.map.num_keyframes
     return renumbering
 

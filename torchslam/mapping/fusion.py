@@ -6,44 +6,62 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, fits, squared_reprojection_errors, transform
-from torchslam.tracking.correspondences import match_near, project_points
+from torchslam.features import match_projected
+from torchslam.geometry import Camera, fits
+from torchslam.tracking.correspondences import look_at, max_distance
 from torchslam.world.map import Map
+
+RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
 
 
 def fuse(slam_map: Map, keyframe: int, neighbours: Tensor, camera: Camera, config: Config) -> None:
     """Find the points of this keyframe in its neighbours and theirs in it; merge what turns out to be one point."""
-    own = slam_map.points_seen_by(slam_map.ids(keyframe))
-    merge(slam_map, [find_in(slam_map, neighbour, own, camera, config) for neighbour in neighbours.tolist()])
-    merge(slam_map, [find_in(slam_map, keyframe, slam_map.points_seen_by(neighbours), camera, config)])
+    here = slam_map.ids(keyframe)
+    own = slam_map.points_seen_by(here)
+    merge(slam_map, *find_in(slam_map, neighbours, own, camera, config))
+    merge(slam_map, *find_in(slam_map, here, slam_map.points_seen_by(neighbours), camera, config))
 
 
 def find_in(
-    slam_map: Map, keyframe: int, point_ids: Tensor, camera: Camera, config: Config
+    slam_map: Map, keyframes: Tensor, point_ids: Tensor, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
-    """Match points (n,) that a keyframe does not see yet to its keypoints.
+    """Match points (n,) to the keypoints of those keyframes (k,) that do not see them yet.
 
     Free keypoints see them from now on. Returns pairs (m,), (m,) of points that are one: found at a keypoint that
     sees another point already.
     """
-    seen = slam_map.keyframes["point_ids"][keyframe]
-    new = point_ids[~torch.isin(point_ids, seen)]
-    view, T_cw = slam_map.view(keyframe), slam_map.T_cw[keyframe]
-    projected = project_points(
-        slam_map, new, T_cw, camera, config.tracking.max_view_angle_deg, view.scale_range
+    if len(keyframes) == 0 or len(point_ids) == 0:
+        return point_ids[:0], point_ids[:0]
+    table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
+    features = slam_map.features(keyframes)
+    finest = features.scales.masked_fill(~features.mask, torch.inf).amin(1, keepdim=True)
+    coarsest = features.scales.masked_fill(~features.mask, 0.0).amax(1, keepdim=True)
+    T_cw, sizes = slam_map.T_cw[keyframes], (finest, coarsest)
+    pixels, scales, visible = look_at(slam_map, point_ids, T_cw, camera, angle, sizes)
+    observers, _ = slam_map.scales_of(point_ids)
+    visible &= (observers != keyframes[:, None, None]).all(-1)
+    matches = match_projected(
+        points["descriptors"][point_ids].expand(len(keyframes), -1, -1),
+        pixels,
+        RADIUS_PX * scales,
+        features,
+        mask=visible,
+        scales=scales,
+        max_distance=max_distance(features.descriptors, config.matching),
+        ratio=None,
     )
-    ids, keypoints = match_near(slam_map, projected, view, 3.0, config.matching, ratio=None)
-    points_c = transform(T_cw, slam_map.positions_w[ids])
-    errors = squared_reprojection_errors(points_c, view.keypoints[keypoints], camera)
-    agrees = fits(errors, view.scales[keypoints], config.measurement.chi_square)
-    ids, keypoints = ids[agrees], keypoints[agrees]
-    taken = seen[keypoints]
+    which, row = torch.nonzero(matches.mask, as_tuple=True)
+    ids, keyframe, keypoint = point_ids[row], keyframes[which], matches.indices_2[which, row]
+    errors = (pixels[which, row] - table["keypoints"][keyframe, keypoint]).square().sum(-1)
+    agrees = fits(errors, table["scales"][keyframe, keypoint], config.measurement.chi_square)
+    ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
+    taken = table["point_ids"][keyframe, keypoint]
     is_free = taken < 0
-    slam_map.observe(keyframe, keypoints[is_free], ids[is_free])
+    slam_map.observe(keyframe[is_free], keypoint[is_free], ids[is_free])
     return ids[~is_free], taken[~is_free]
 
 
-def merge(slam_map: Map, pairs: list[tuple[Tensor, Tensor]]) -> None:
+def merge(slam_map: Map, found: Tensor, there: Tensor) -> None:
     """Merge pairs of points (m,), (m,): of those that are one, the one with most observations stays."""
     observed = slam_map.points["times_observed"]
     heir: dict[int, int] = {}
@@ -53,12 +71,11 @@ def merge(slam_map: Map, pairs: list[tuple[Tensor, Tensor]]) -> None:
             point = heir[point]
         return point
 
-    for found, there in pairs:
-        for pair in zip(found.tolist(), there.tolist(), strict=True):
-            one, other = (last_heir(point) for point in pair)
-            if one != other:
-                old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
-                heir[old] = kept
+    for pair in zip(found.tolist(), there.tolist(), strict=True):
+        one, other = (last_heir(point) for point in pair)
+        if one != other:
+            old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
+            heir[old] = kept
     if heir:
         last = [last_heir(point) for point in heir.values()]
         slam_map.replace(observed.new_tensor(list(heir)), observed.new_tensor(last))

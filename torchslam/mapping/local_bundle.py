@@ -13,6 +13,7 @@ from torchslam.values import Observations
 from torchslam.world.map import Map
 from torchslam.world.observers import most
 
+NEGLIGIBLE = 1e-4  # share of the cost that a step must promise: the next keyframe moves the map by more
 HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
 
 
@@ -30,7 +31,7 @@ def adjust(
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
     fixed = most(shared, settings.max_fixed, least=1)
-    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances)
+    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances, tolerance=NEGLIGIBLE)
 
 
 def adjust_all(
@@ -60,6 +61,7 @@ def adjust_keyframes(
     iterations: int,
     covariances: bool,
     progress: Progress | None = None,
+    tolerance: float = 1e-8,
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
@@ -81,7 +83,13 @@ def adjust_keyframes(
         fixed_frames=torch.isin(keyframes, fixed),
     )
     solution = bundle_adjust(
-        problem, kernel="huber", scale=HUBER, iterations=iterations, backward="detached", progress=progress
+        problem,
+        kernel="huber",
+        scale=HUBER,
+        backward="detached",
+        iterations=iterations,
+        tolerance=tolerance,
+        progress=progress,
     )
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w

@@ -13,7 +13,7 @@ from torchslam.mapping.local_bundle import adjust
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Start, Tracked, View
-from torchslam.world.compaction import Renumbering
+from torchslam.world.compaction import Renumbering, compact
 from torchslam.world.map import Map
 from torchslam.world.world import World
 
@@ -76,7 +76,7 @@ class Mapper:
         """
         with self.clock("mapping"):
             culled = cull_keyframes(world, self.config.keyframes) if self.config.mapping.cull else None
-            compacted = world.compact()
+            compacted = compact(world)
         if culled is None or compacted is None:
             return culled or compacted
         return culled.then(compacted)

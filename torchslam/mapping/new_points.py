@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config, MatchingConfig
+from torchslam.features import match
 from torchslam.geometry import (
     Camera,
     fits,
@@ -17,8 +18,8 @@ from torchslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from torchslam.tracking.correspondences import descriptor_distances, max_distance
-from torchslam.values import View
+from torchslam.tracking.correspondences import max_distance
+from torchslam.values import Features, View
 from torchslam.world.map import NO_POINT, Map
 
 
@@ -82,14 +83,21 @@ def match_along_epipolar_lines(
     rays_2 = camera.unproject(view_2.keypoints[rows_2])
     sine = (planes.float() @ rays_2.float().mT).abs()
     allowed = sine < (epipolar_px / camera.focal * view_2.scales[rows_2]).float()
-    distances = descriptor_distances(view_1.descriptors[rows_1], view_2.descriptors[rows_2])
-    distances = distances.masked_fill(~allowed, torch.inf)
-    nearest_2 = distances.min(1)
-    nearest_1 = distances.argmin(0)
-    is_mutual = nearest_1[nearest_2.indices] == torch.arange(len(rows_1), device=rows_1.device)
-    limit = 0.8 * max_distance(view_1.descriptors, settings)
-    found = torch.nonzero(is_mutual & (nearest_2.values <= limit))[:, 0]
-    return rows_1[found], rows_2[nearest_2.indices[found]]
+    matches = match(
+        features_of(view_1, rows_1),
+        features_of(view_2, rows_2),
+        ratio=None,
+        max_distance=0.8 * max_distance(view_1.descriptors, settings),
+        allowed=allowed[None],
+    )
+    found = matches.mask[0]
+    return rows_1[matches.indices_1[0][found]], rows_2[matches.indices_2[0][found]]
+
+
+def features_of(view: View, rows: Tensor) -> Features:
+    """Some keypoints (n,) of a view as a batch of one, for matching."""
+    features = view.features
+    return Features(*(getattr(features, name)[:, rows] for name in Features.__dataclass_fields__))
 
 
 def has_consistent_scale(

@@ -15,7 +15,7 @@ from torchslam.values import State, StepResult
 
 
 def metrics(
-    run: Run, evaluation: Evaluation | None = None, online: Evaluation | None = None
+    run: Run, evaluation: Evaluation | None = None, online_ate_m: float | None = None
 ) -> dict[str, Any]:
     """The figures of a run.
 
@@ -24,7 +24,8 @@ def metrics(
     that started the map, or None. posed, keyframes and points are of the main world, whose number is world, as far as
     this run saw it; worlds has the counts of each world: see `world_counts`. session says which run over the map it is.
     Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
-    truth, the figures of the evaluation are added, and as online_ate_m that of the poses as they were given.
+    truth, the figures of the evaluation are added, and as online_ate_m that of the poses as they
+    were given, see `evaluation.ate_apart`.
     """
     totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
     start = None if run.failure else _start(run.results)
@@ -50,8 +51,8 @@ def metrics(
     }
     if evaluation is not None:
         figures |= evaluation.as_dict()
-    if online is not None:
-        figures["online_ate_m"] = online.ate_m
+    if online_ate_m is not None:
+        figures["online_ate_m"] = online_ate_m
     return figures
 
 
@@ -101,6 +102,8 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     """The metrics of a run in words, label by label, for `table`."""
     frames, skipped = figures["frames"], len(figures["skipped"])
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
+    if figures.get("dropped"):
+        rows["dropped"] = f"{figures['dropped']} frames that came while there was no time for them"
     if figures["initialised_at"] is None:
         return rows | {"map": "none"}
     rows |= {

@@ -16,8 +16,8 @@ from torchslam.data.image_file import read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
+from torchslam.export.ply import write_map_cloud
 from torchslam.output.frames_file import read_frames, write_frames
-from torchslam.output.ply import write_ply
 from torchslam.run import Run, keyframe_rows
 from torchslam.values import StepResult, Trajectory
 from torchslam.world.map import Map
@@ -84,7 +84,7 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
     write_worlds(directory / MAP, run.worlds, run.camera, run.sessions)
-    _write_point_cloud(directory / POINT_CLOUD, run)
+    write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     write_frames(directory / FRAMES, run.results)
@@ -95,7 +95,7 @@ def read_results(directory: Path) -> Results:
     """The results in a folder. Raises ResultsError, TrajectoryError or FrameError for what is missing or damaged."""
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
-    saved, figures = read_worlds(directory / MAP), _read_metrics(directory / METRICS)
+    saved, figures = read_worlds(directory / MAP), read_metrics(directory)
     main = [world.map for world in saved.worlds if world.number == figures["world"]]
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
@@ -107,6 +107,21 @@ def read_results(directory: Path) -> Results:
         metrics=figures,
         example_image=read_grey(example, str(example))[0, 0] if example.exists() else None,
     )
+
+
+def read_metrics(directory: Path) -> dict[str, Any]:
+    """The content of metrics.json. Raises ResultsError where it is missing or something else."""
+    path = directory / METRICS
+    try:
+        figures = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ResultsError(f"{path}: not valid JSON: {error}") from None
+    missing = [name for name in NEEDED if not isinstance(figures, dict) or name not in figures]
+    if missing:
+        raise ResultsError(f"{path}: not the figures of a run: {', '.join(missing)} missing")
+    return figures
 
 
 def results_in(directory: Path) -> list[Path]:
@@ -132,17 +147,6 @@ def example_keyframe(slam_map: Map, session: int) -> int | None:
     return int(rows[len(rows) // 2]) if len(rows) else None
 
 
-def _write_point_cloud(path: Path, run: Run) -> None:
-    if run.map.num_keyframes == 0:
-        nothing = torch.zeros(0, 3)
-        write_ply(path, nothing, nothing, torch.zeros(0), nothing)
-        return
-    alive = run.map.living_points()
-    normals_w = -run.map.points["normals_w"][alive]
-    counts = run.map.points["times_observed"][alive]
-    write_ply(path, run.map.positions_w[alive], normals_w, counts, run.keyframes.positions_w)
-
-
 def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
     keyframe = example_keyframe(run.map, run.session)
     if keyframe is None:
@@ -153,16 +157,3 @@ def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
     except FrameError:  # simulated features need no image; then there is nothing to draw
         return
     cv2.imwrite(str(path), (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy())
-
-
-def _read_metrics(path: Path) -> dict[str, Any]:
-    try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    missing = [name for name in NEEDED if not isinstance(figures, dict) or name not in figures]
-    if missing:
-        raise ResultsError(f"{path}: not the figures of a run: {', '.join(missing)} missing")
-    return figures

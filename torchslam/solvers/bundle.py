@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.solvers.bundle_model import Bundle, Estimate, Inputs, build_layout
-from torchslam.solvers.implicit import Backward, attach, check_backward
-from torchslam.solvers.levenberg import Convergence, Progress, minimize
+from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.solvers.bundle_minimization import BundleMinimization, Found, Given
+from torchslam.solvers.bundle_model import Inputs
+from torchslam.solvers.implicit import Backward, check_backward, minimum
+from torchslam.solvers.levenberg import Convergence, Progress
 from torchslam.solvers.residuals import usable
 from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
@@ -51,8 +53,8 @@ class BundleSolution:
 
     T_cw:       (F, 4, 4); points_w: (P, 3); camera
     cost:       () half the sum of robustified squared whitened residuals, detached
-    success:    () bool, all that moves is determined, up to the gauge. If not, the estimate is still the best that was
-                found, but it has no gradient.
+    success:    () bool, all frames start finite, and all that moves is determined, up to the gauge. If not, the
+                estimate is still the best that was found, but it has no gradient.
     moved_frames, moved_points: (F,), (P,) bool. What is fixed, or seen too little (points by two frames, frames with
                 three points at least), stayed at its start; in the latter case its observations did not count.
     convergence: of the one element
@@ -89,6 +91,7 @@ class BundleSolution:
         return Marginals(marginals.frames[rows[0]], marginals.points[rows[1]], marginals.camera)
 
 
+@full_precision
 def bundle_adjust(
     problem: BundleProblem,
     kernel: Kernel = "huber",
@@ -115,48 +118,36 @@ def bundle_adjust(
     Raises ValueError for shapes and indices that do not fit and for unknown names.
     """
     check_backward(backward)
-    counted, inputs = _sanitized(problem, scale)
+    counted, finite_frames, inputs = _sanitized(problem, scale)
     free_frames = ~_as_mask(problem.fixed_frames, len(problem.T_cw), problem.T_cw.device)
     free_points = ~_as_mask(problem.fixed_points, len(problem.points_w), problem.T_cw.device)
-    layout = build_layout(problem.frame_index, problem.point_index, counted, free_frames, free_points)
-
-    def build(tensors: Sequence[Tensor]) -> Bundle:
-        return Bundle(layout, Inputs(*tensors), problem.camera, kernel, free_camera)
-
-    with torch.set_grad_enabled(torch.is_grad_enabled() and backward == "unroll"):
-        bundle = build(inputs)
-        model, convergence = minimize(bundle, bundle.start, iterations, tolerance, progress)
-    with torch.no_grad():
-        success = bundle.solvable[0] & bundle.factorized(model).reduced.definite
-    minimum = Estimate(*(tensor.detach() for tensor in model.estimate))
-    solution = model.estimate
-
-    if backward == "implicit" and torch.is_grad_enabled():
-
-        def adjoint(gradient: Sequence[Tensor], tensors: Sequence[Tensor]) -> Tensor:
-            return build(tensors).adjoint(minimum, Estimate(*gradient))
-
-        solution = build(inputs).at_minimum(Estimate(*attach(minimum, inputs, adjoint)))
-    elif backward == "truncated":
-        bundle = build(inputs)
-        model = bundle.evaluate(bundle.at_minimum(minimum), ~bundle.solvable)
-        solution, _ = bundle.step(model, torch.zeros_like(model.cost))
-
+    minimization = BundleMinimization(problem.camera, kernel, free_camera, iterations, tolerance, progress)
+    indices = problem.frame_index, problem.point_index
+    tensors = Given(*inputs, counted, finite_frames, *indices, free_frames, free_points)
+    if backward == "unroll":
+        found = Found(*minimization.minimize(tensors))
+    else:
+        attached = backward == "implicit"
+        found = Found(*minimum(minimization, tensors if attached else [x.detach() for x in tensors]))
+    detached = [x.detach() for x in tensors]
+    solution = minimization.at_minimum(found, tensors) if backward == "implicit" else found.estimate
+    if backward == "truncated":
+        solution = minimization.last_step(found, tensors)
     return BundleSolution(
         solution.T_cw,
-        solution.points_w[layout.point_rank],
+        solution.points_w,
         problem.camera.with_params(solution.params),
-        convergence.cost[0],
-        success,
-        _as_mask(layout.free_frames, len(problem.T_cw), problem.T_cw.device),
-        layout.free_points[layout.point_rank],
-        convergence,
-        lambda: bundle.marginals(minimum),
+        found.cost,
+        found.success,
+        found.moved_frames,
+        found.moved_points,
+        Convergence(found.iterations, found.converged, found.initial_cost, found.cost[None]),
+        lambda: minimization.marginals(found, detached),
     )
 
 
-def _sanitized(problem: BundleProblem, scale: Tensor | float) -> tuple[Tensor, Inputs]:
-    """Which observations count, and the problem's tensors with zero, or the identity, for what is not finite."""
+def _sanitized(problem: BundleProblem, scale: Tensor | float) -> tuple[Tensor, Tensor, Inputs]:
+    """Which observations count, which frames are finite, and the tensors with zero or the identity for what is not."""
     T_cw, points_w, pixels, like = problem.T_cw, problem.points_w, problem.pixels, problem.T_cw
     if T_cw.shape[1:] != (4, 4) or points_w.shape[1:] != (3,) or pixels.shape[1:] != (2,):
         raise ValueError(
@@ -174,16 +165,25 @@ def _sanitized(problem: BundleProblem, scale: Tensor | float) -> tuple[Tensor, I
         if len(index) and not 0 <= int(index.min()) <= int(index.max()) < size:
             raise ValueError(f"{name} must lie in 0 ... {size - 1}")
     weights = torch.ones_like(pixels[:, 0]) if problem.weights is None else problem.weights
+    if weights.shape != pixels.shape[:1]:
+        raise ValueError(f"weights must be (O,) = ({len(pixels)},), not {tuple(weights.shape)}")
+    check_dtypes(
+        T_cw=T_cw, points_w=points_w, pixels=pixels, weights=weights, camera_params=problem.camera.params
+    )
     finite_frames = torch.isfinite(T_cw).flatten(1).all(-1)
     counted = usable(pixels, points_w[problem.point_index], weights) & finite_frames[problem.frame_index]
     eye = torch.eye(4, dtype=like.dtype, device=like.device)
-    return counted, Inputs(
-        torch.where(finite_frames[:, None, None], T_cw, eye),
-        torch.where(torch.isfinite(points_w), points_w, 0.0),
-        torch.where(counted[:, None], pixels, 0.0),
-        torch.where(counted, weights, 0.0),
-        problem.camera.params,
-        torch.as_tensor(scale, dtype=like.dtype, device=like.device),
+    return (
+        counted,
+        finite_frames,
+        Inputs(
+            torch.where(finite_frames[:, None, None], T_cw, eye),
+            torch.where(torch.isfinite(points_w), points_w, 0.0),
+            torch.where(counted[:, None], pixels, 0.0),
+            torch.where(counted, weights, 0.0),
+            problem.camera.params,
+            torch.as_tensor(scale, dtype=like.dtype, device=like.device),
+        ),
     )
 
 

@@ -26,10 +26,9 @@ from torchslam.solvers.schur import (
     Marginals,
     NormalEquations,
     Structure,
-    Tangent,
     build_structure,
 )
-from torchslam.solvers.tangent import move, pull_back, retract
+from torchslam.solvers.tangent import retract
 
 _MIN_POINTS_PER_FRAME = 3
 _MIN_FRAMES_PER_POINT = 2
@@ -169,10 +168,6 @@ class Bundle:
         """(K,) how a step (n,) changes the camera's parameters."""
         return step if self.directions is None else self.directions @ step
 
-    def _across(self, gradient: Tensor) -> Tensor:
-        """(n,) of a gradient in the camera's parameters (K,)."""
-        return gradient if self.directions is None else gradient @ self.directions
-
     def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
         return new if bool(accept) else old
 
@@ -209,21 +204,9 @@ class Bundle:
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         return Marginals(factor * frames, factor * points[layout.point_rank], factor * camera)
 
-    def adjoint(self, minimum: Estimate, gradient: Estimate) -> Tensor:
-        """g(minimum, inputs) . lambda with H lambda = gradient of the loss in the unknowns, for `implicit.attach`."""
-        layout = self.layout
-        with torch.no_grad():
-            exact = self._exact_equations(minimum).factorized(gauge=self._gauge(minimum.T_cw))
-            direction = exact.solve(self._tangent(minimum, gradient))
-        at = self.at_minimum(minimum)
-        lin, points_c, R_cw = self._linearize(at)
-        motion = direction.frames.new_zeros(len(at.T_cw), 6).index_copy(
-            0, layout.free_frames, direction.frames
-        )
-        velocity = move(points_c, motion[layout.frame_index])
-        velocity = velocity + (R_cw @ direction.points[layout.point_index][..., None]).squeeze(-1)
-        velocity = torch.cat((velocity, direction.camera.expand(len(velocity), -1)), dim=-1)
-        return (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
+    def exact_factorized(self, estimate: Estimate) -> FactorizedEquations:
+        """The exact Hessian at a minimum, ready to be solved."""
+        return self._exact_equations(estimate).factorized(gauge=self._gauge(estimate.T_cw))
 
     def _linearize(self, estimate: Estimate) -> tuple[Linearization, Tensor, Tensor]:
         """Errors, points in the camera frame (O', 3) and rotations (O', 3, 3) of the observing frames."""
@@ -248,25 +231,3 @@ class Bundle:
             expansion = Expansion(gradient @ self.columns, self.columns.mT @ hessian @ self.columns)
         layout = self.layout
         return assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
-
-    def _tangent(self, estimate: Estimate, gradient: Estimate) -> Tangent:
-        """The gradient of a loss in the unknowns, from its gradient in poses, points and parameters."""
-        frames = self.layout.free_frames
-        return Tangent(
-            pull_back(estimate.T_cw[frames], gradient.T_cw[frames]),
-            gradient.points_w,
-            self._across(gradient.params) if self.free_camera else gradient.params[:0],
-        )
-
-    def at_minimum(self, minimum: Estimate) -> Estimate:
-        """The minimum where things move, the inputs, with their graph, where they are fixed."""
-        frames = torch.zeros(len(minimum.T_cw), dtype=torch.bool, device=minimum.T_cw.device)
-        frames[self.layout.free_frames] = True
-        params = minimum.params if self.free_camera else self.start.params
-        if self.directions is not None:  # what does not move of the parameters reaches them unchanged
-            params = params + (self.start.params - self.start.params.detach())
-        return Estimate(
-            torch.where(frames[:, None, None], minimum.T_cw, self.start.T_cw),
-            torch.where(self.layout.free_points[:, None], minimum.points_w, self.start.points_w),
-            params,
-        )

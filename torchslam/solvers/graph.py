@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.precision import full_precision
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust, refine_pose
 from torchslam.solvers.implicit import Backward
 from torchslam.solvers.levenberg import Progress
@@ -139,6 +140,7 @@ class GraphSolution:
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
+@full_precision
 def solve(
     graph: ObservationGraph,
     kernel: Kernel = "huber",
@@ -177,7 +179,9 @@ def solve(
             T_cw.index_copy(0, keyframes, bundle.T_cw),
             points_w.index_copy(0, points, bundle.points_w),
         )
-        success[keyframes], moved[points] = bundle.success, bundle.moved_points
+        finite = torch.isfinite(problem.T_cw).flatten(1).all(-1)
+        success = success.index_copy(0, keyframes, bundle.success & finite)
+        moved = moved.index_copy(0, points, bundle.moved_points)
     if bool((solved > 1).any()):
         raise ValueError("a point is seen in two worlds")
     if not bundles:

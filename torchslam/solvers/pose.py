@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,7 +11,9 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
-from torchslam.solvers.implicit import Backward, attach, check_backward
+from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.solvers.folding import Tensors
+from torchslam.solvers.implicit import Backward, Ndims, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence, minimize
 from torchslam.solvers.linear import factorize
 from torchslam.solvers.pose_expansion import PoseModel, PoseObservations
@@ -24,7 +26,7 @@ from torchslam.solvers.residuals import (
     variance_factor,
 )
 from torchslam.solvers.robust import Kernel
-from torchslam.solvers.tangent import move, point_jacobian, pull_back, retract
+from torchslam.solvers.tangent import move, point_jacobian, pull_back, push, retract
 
 _MIN_POINTS = 3
 
@@ -35,7 +37,7 @@ class RefinedPose:
 
     T_cw:        (B, 4, 4) world to camera; the start, without gradient, where `success` is False
     cost:        (B,) half the sum of robustified squared whitened residuals, detached
-    success:     (B,) bool, the usable points (at least three) or the prior determine the pose
+    success:     (B,) bool, the start is finite, and the usable points (at least three) or the prior determine the pose
     convergence: iterations and convergence per element
     """
 
@@ -43,7 +45,7 @@ class RefinedPose:
     cost: Tensor
     success: Tensor
     convergence: Convergence
-    _problem: _PoseProblem = field(repr=False)
+    _inputs: _Inputs = field(repr=False)
 
     @cached_property
     def covariance(self) -> Tensor:
@@ -52,9 +54,11 @@ class RefinedPose:
         Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
         """
         with torch.no_grad():
-            return torch.where(self.success[:, None, None], self._problem.covariance(self.T_cw), 0.0)
+            covariance = _PoseProblem(self._inputs).covariance(self.T_cw)
+            return torch.where(self.success[:, None, None], covariance, 0.0)
 
 
+@full_precision
 def refine_pose(
     T_cw: Tensor,
     points_w: Tensor,
@@ -86,29 +90,19 @@ def refine_pose(
     """
     check_backward(backward)
     inputs = _Inputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
-    identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
-    start = torch.where(torch.isfinite(T_cw).flatten(1).all(-1)[:, None, None], T_cw, identity)
-
-    with torch.set_grad_enabled(torch.is_grad_enabled() and backward == "unroll"):
+    minimization = _Minimization(inputs, iterations, tolerance)
+    tensors = (T_cw, *inputs.tensors())
+    if backward == "unroll":
+        found = minimization.minimize(tensors)
+    else:
+        attached = backward == "implicit"
+        found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
+    refined, success, cost, steps, converged, initial_cost = found
+    if backward == "truncated":
         problem = _PoseProblem(inputs)
-        model, convergence = minimize(problem, start, iterations, tolerance)
-    with torch.no_grad():
-        success = problem.solvable & factorize(model.hessian).definite
-    good = success[:, None, None]
-    refined = torch.where(good, model.T_cw, start.detach())
-
-    if backward == "implicit" and torch.is_grad_enabled():
-        minimum = refined
-
-        def adjoint(grad_solution: Sequence[Tensor], tensors: Sequence[Tensor]) -> Tensor:
-            return _PoseProblem(inputs.replaced(tensors)).adjoint(minimum, grad_solution[0], success)
-
-        (refined,) = attach((minimum,), inputs.tensors(), adjoint)
-    elif backward == "truncated":
-        problem = _PoseProblem(inputs)
-        last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(convergence.cost))
-        refined = torch.where(good, last, refined)
-    return RefinedPose(refined, convergence.cost, success, convergence, problem)
+        last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))
+        refined = torch.where(success[:, None, None], last, refined)
+    return RefinedPose(refined, cost, success, Convergence(steps, converged, initial_cost, cost), inputs)
 
 
 @dataclass(frozen=True)
@@ -136,13 +130,27 @@ class _Inputs:
                 "T_cw, points_w and pixels must be (B, 4, 4), (B, N, 3) and (B, N, 2), not "
                 f"{tuple(T_cw.shape)}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
             )
+        prior_T, information = (None, None) if prior is None else (prior.T_cw, prior.information)
+        check_dtypes(
+            T_cw=T_cw,
+            points_w=points_w,
+            pixels=pixels,
+            weights=weights,
+            camera_params=camera.params,
+            prior_T_cw=prior_T,
+            prior_information=information,
+        )
         batch, count = T_cw.shape[0], points_w.shape[1]
+        if weights is not None and weights.shape not in ((batch, count), (1, count)):
+            raise ValueError(f"weights must be (B, N) = {(batch, count)}, not {tuple(weights.shape)}")
         points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
         weights = torch.ones_like(pixels[..., 0]) if weights is None else weights.expand(batch, count)
         use = usable(pixels, points_w, weights)
         use = use if mask is None else use & mask
         rows = use[..., None]
         scale = torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device)
+        if prior is not None:
+            prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
         observations = Observations(
             torch.where(rows, pixels, 0.0), torch.where(use, weights, 0.0), camera, kernel, scale[..., None]
         )
@@ -211,19 +219,6 @@ class _PoseProblem:
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
         return factor * factorize(information).solve(self.eye.expand_as(information))
 
-    def adjoint(self, T_cw: Tensor, grad_T_cw: Tensor, success: Tensor) -> Tensor:
-        """g(T_cw, inputs) . lambda with H lambda = the loss's gradient in xi, for `implicit.attach`."""
-        with torch.no_grad():
-            grad_xi = torch.where(success[:, None], pull_back(T_cw, grad_T_cw), 0.0)
-            direction = factorize(self.hessian(T_cw)).solve(grad_xi[..., None]).squeeze(-1)
-        points_c = transform(T_cw, self.points_w)
-        lin = linearize(self.observations, points_c)
-        velocity = lin.J @ move(points_c, direction[:, None])[..., None]
-        slope = (lin.force[..., None, :] @ velocity).sum()
-        if self.prior is not None:
-            slope = slope + (prior_expansion(self.prior, T_cw)[1] * direction).sum()
-        return slope
-
     def hessian(self, T_cw: Tensor) -> Tensor:
         """The exact Hessian (B, 6, 6) of the cost in xi."""
         points_c = transform(T_cw, self.points_w)
@@ -238,3 +233,57 @@ class _PoseProblem:
         )
         result = result + torch.nn.functional.pad(bend, (3, 0, 3, 0))
         return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
+
+
+class _Minimization:
+    """`refine_pose` for `implicit.minimum`: found are the poses, and `success`, `cost` and how it went."""
+
+    num_unknowns = 1
+    num_vectors = 1
+
+    def __init__(self, inputs: _Inputs, iterations: int, tolerance: float) -> None:
+        self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
+        prior = () if inputs.prior is None else (2, 2)
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (1,), (2, 0, 0, 0, 0, 0), (2, 2, 2, 1, 1, 1, *prior)
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        T_cw, problem = inputs[0], _PoseProblem(self.inputs.replaced(inputs[1:]))
+        finite = torch.isfinite(T_cw).flatten(1).all(-1)
+        identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+        start = torch.where(finite[:, None, None], T_cw, identity)
+        model, convergence = minimize(problem, start, self.iterations, self.tolerance)
+        with torch.no_grad():
+            success = problem.solvable & factorize(model.hessian).definite & finite
+        refined = torch.where(success[:, None, None], model.T_cw, start.detach())
+        how = convergence.iterations, convergence.converged, convergence.initial_cost
+        return refined, success, convergence.cost, *how
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        T_cw, success, *_ = found
+        with torch.no_grad():
+            factor = factorize(_PoseProblem(self.inputs.replaced(inputs[1:])).hessian(T_cw))
+
+        def solve(right: Tensors) -> Tensors:
+            right_of_successes = torch.where(success[:, None], right[0], 0.0)
+            return (factor.solve(right_of_successes[..., None]).squeeze(-1),)
+
+        return solve
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        T_cw, (xi,), problem = found[0], direction, self.inputs.replaced(inputs[1:])
+        points_c = transform(T_cw, problem.points_w)
+        lin = linearize(problem.observations, points_c)
+        velocity = lin.J @ move(points_c, xi[:, None])[..., None]
+        slope = (lin.force[..., None, :] @ velocity).sum()
+        if problem.prior is not None:
+            slope = slope + (prior_expansion(problem.prior, T_cw)[1] * xi).sum()
+        return slope
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        return retract(found[0], direction[0]), *found[1:]
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        return (push(found[0], direction[0]),)
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        return (pull_back(found[0], gradient[0]),)

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.lie import sim3_scale
-from torchslam.solvers.implicit import Backward, attach, check_backward
-from torchslam.solvers.levenberg import Convergence, minimize
-from torchslam.solvers.pose_graph_layout import build_layout
-from torchslam.solvers.pose_graph_model import Inputs, PoseGraphProblem
+from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.solvers.implicit import Backward, check_backward, minimum
+from torchslam.solvers.levenberg import Convergence
+from torchslam.solvers.pose_graph_minimization import PoseGraphMinimization
+from torchslam.solvers.pose_graph_model import Inputs
 from torchslam.solvers.robust import Kernel
 
 # 95 % of the norms of seven standard normal numbers lie below.
@@ -63,6 +64,7 @@ class PoseGraphSolution:
     convergence: Convergence
 
 
+@full_precision
 def pose_graph_optimize(
     graph: PoseGraph,
     kernel: Kernel = "huber",
@@ -86,31 +88,25 @@ def pose_graph_optimize(
     """
     check_backward(backward)
     counted, fixed, inputs = _sanitized(graph, scale)
-    layout = build_layout(graph.edges, counted, fixed, inputs.information.shape[-1])
-
-    with torch.set_grad_enabled(torch.is_grad_enabled() and backward == "unroll"):
-        problem = PoseGraphProblem(layout, inputs, kernel)
-        model, convergence = minimize(problem, inputs.S_cw, iterations, tolerance)
-    with torch.no_grad():
-        success = problem.solvable & problem.factorized(model).definite
-    minimum, solution = model.S_cw.detach(), model.S_cw
-
-    if backward == "implicit" and torch.is_grad_enabled():
-
-        def adjoint(gradient: Sequence[Tensor], tensors: Sequence[Tensor]) -> Tensor:
-            return PoseGraphProblem(layout, Inputs(*tensors), kernel).adjoint(minimum, gradient[0], success)
-
-        solution = problem.at_minimum(*attach((minimum,), inputs, adjoint))
+    minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
+    tensors = (*inputs, counted, fixed, graph.edges)
+    if backward == "unroll":
+        found = minimization.minimize(tensors)
+    else:
+        attached = backward == "implicit"
+        found = minimum(minimization, tensors if attached else [x.detach() for x in tensors])
+    solution, success, moving, cost, steps, converged, initial_cost = found
+    at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
+    if backward == "implicit":
+        solution = torch.where(moving[..., None, None], solution, inputs.S_cw)
     elif backward == "truncated":
-        problem = PoseGraphProblem(layout, inputs, kernel)
-        last = problem.evaluate(problem.at_minimum(minimum), ~success)
-        solution, _ = problem.step(last, torch.zeros_like(last.cost))
+        solution = minimization.last_step(at_minimum, tensors, success)
     if backward != "detached":
-        solution = torch.where(success[:, None, None, None], solution, problem.at_minimum(minimum))
+        solution = torch.where(success[:, None, None, None], solution, at_minimum)
 
     row = slice(None) if graph.S_cw.ndim == 4 else 0
     return PoseGraphSolution(
-        solution[row], convergence.cost[row], success[row], layout.moving[row], convergence
+        solution[row], cost[row], success[row], moving[row], Convergence(steps, converged, initial_cost, cost)
     )
 
 
@@ -133,6 +129,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
     if (edges[:, 0] == edges[:, 1]).any():
         raise ValueError("an edge must join two nodes, not one with itself")
     S_ji = S_ji.expand(batch, num_edges, 4, 4)
+    check_dtypes(S_cw=S_cw, S_ji=S_ji, information=graph.information)
     information = _information(graph, S_cw, batch, num_edges)
 
     nodes, measured = _is_similarity(S_cw), _is_similarity(S_ji)

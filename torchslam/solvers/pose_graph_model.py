@@ -82,7 +82,6 @@ class PoseGraphProblem:
     def __init__(self, layout: Layout, inputs: Inputs, kernel: Kernel) -> None:
         self.layout, self.inputs, self.kernel = layout, inputs, kernel
         self.dims = inputs.information.shape[-1]
-        self.S_ij = sim3_inverse(inputs.S_ji)
         self.solvable = layout.moving.any(-1)
 
     def evaluate(self, S_cw: Tensor, near: Tensor) -> PoseGraphModel:
@@ -99,7 +98,7 @@ class PoseGraphProblem:
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         decrease = 0.5 * (xi * model.gradient).sum((-2, -1))
-        moved = torch.where(self.layout.moving[..., None, None], _retract(model.S_cw, -xi), model.S_cw)
+        moved = torch.where(self.layout.moving[..., None, None], retract(model.S_cw, -xi), model.S_cw)
         return moved, torch.where(factor.definite, decrease, torch.inf)
 
     def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
@@ -118,33 +117,9 @@ class PoseGraphProblem:
         lin = self._linearize(S_cw)
         return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.force))
 
-    def at_minimum(self, minimum: Tensor) -> Tensor:
-        """The minimum where nodes move, the inputs, with their graph, where they do not."""
-        return torch.where(self.layout.moving[..., None, None], minimum, self.inputs.S_cw)
-
-    def adjoint(self, minimum: Tensor, grad_S_cw: Tensor, success: Tensor) -> Tensor:
-        """g(minimum, inputs) . lambda with H lambda = the loss's gradient in xi, for `implicit.attach`."""
-        with torch.no_grad():
-            use = (self.layout.moving & success[:, None])[..., None]
-            grad_xi = torch.where(use, _pull_back(minimum, grad_S_cw)[..., : self.dims], 0.0)
-            direction = self.factorized(self.exact_model(minimum)).solve(grad_xi)
-        lin = self._linearize(self.at_minimum(minimum))
-        xi_i, xi_j = direction[:, self.layout.i, :, None], direction[:, self.layout.j, :, None]
-        velocity = (lin.J @ (xi_j - lin.carry @ xi_i)).squeeze(-1)
-        return (lin.kernel.weight * (lin.pull * velocity).sum(-1)).sum()
-
     def _linearize(self, S_cw: Tensor) -> Linearization:
-        layout, dims = self.layout, self.dims
-        relative = S_cw.index_select(1, layout.j) @ sim3_inverse(S_cw).index_select(1, layout.i)
-        full = sim3_log(relative @ self.S_ij)
-        error, sigma = full[..., :dims], full[..., 6]
-        pull = (self.inputs.information @ error[..., None]).squeeze(-1)
-        squared = (error * pull).sum(-1)
-        kernel = robustify(squared, self.kernel, self.inputs.scale)
-        kernel = Robustified(*(torch.where(layout.counted, x, 0.0) for x in kernel))
-        J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
-        carry = sim3_adjoint(relative)[..., :dims, :dims]
-        return Linearization(error, J, carry, pull, squared, kernel, sigma)
+        layout = self.layout
+        return linearize(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.kernel)
 
     def _assemble(
         self, S_cw: Tensor, lin: Linearization, hessian: Tensor, twist: Tensor | None
@@ -194,16 +169,43 @@ class PoseGraphProblem:
         return torch.where(self.layout.counted[..., None, None], 0.5 * (hessian + hessian.mT), 0.0)
 
 
-def _retract(S: Tensor, xi: Tensor) -> Tensor:
+def linearize(
+    S_cw: Tensor, i: Tensor, j: Tensor, counted: Tensor, inputs: Inputs, kernel: Kernel
+) -> Linearization:
+    """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
+    dims = inputs.information.shape[-1]
+    relative = S_cw.index_select(1, j) @ sim3_inverse(S_cw).index_select(1, i)
+    full = sim3_log(relative @ sim3_inverse(inputs.S_ji))
+    error, sigma = full[..., :dims], full[..., 6]
+    pull = (inputs.information @ error[..., None]).squeeze(-1)
+    squared = (error * pull).sum(-1)
+    robust = robustify(squared, kernel, inputs.scale)
+    robust = Robustified(*(torch.where(counted, x, 0.0) for x in robust))
+    J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
+    carry = sim3_adjoint(relative)[..., :dims, :dims]
+    return Linearization(error, J, carry, pull, squared, robust, sigma)
+
+
+def retract(S: Tensor, xi: Tensor) -> Tensor:
     """exp(xi) @ S, the scale kept where xi has no seventh number. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
     return sim3_exp(torch.nn.functional.pad(xi, (0, 7 - xi.shape[-1]))) @ S
 
 
-def _pull_back(S: Tensor, grad_S: Tensor) -> Tensor:
+def pull_back(S: Tensor, grad_S: Tensor) -> Tensor:
     """The gradient with respect to xi (..., 7), at zero, of a loss with gradient `grad_S` at exp(xi) @ S."""
     columns, grads = S[..., :3, :], grad_S[..., :3, :]
     rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
     return torch.cat((grads[..., 3], rotation, (columns * grads).sum((-2, -1))[..., None]), dim=-1)
+
+
+def push(S: Tensor, xi: Tensor) -> Tensor:
+    """The change of S, to first order, when it moves along xi. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
+    columns = S[..., :3, :]
+    turned = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
+    if xi.shape[-1] == 7:
+        turned = turned + xi[..., 6:, None] * columns
+    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    return torch.nn.functional.pad(changed, (0, 0, 0, 1))
 
 
 def _bracket(force: Tensor) -> Tensor:

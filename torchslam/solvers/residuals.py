@@ -104,8 +104,10 @@ def _project(camera: Camera, points_c: Tensor, free_camera: bool) -> tuple[Tenso
     """Pixels, validity and Jacobian with respect to points_c and, where it is free, the camera."""
     if camera.model == "pinhole" and not free_camera:
         return _project_pinhole(camera, points_c)
+    if not free_camera:
+        return camera.project_with_point_jacobians(points_c)
     pixels, valid, J_points, J_camera = camera.project_with_jacobians(points_c)
-    return pixels, valid, torch.cat((J_points, J_camera), dim=-1) if free_camera else J_points
+    return pixels, valid, torch.cat((J_points, J_camera), dim=-1)
 
 
 def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:

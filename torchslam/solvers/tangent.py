@@ -32,6 +32,14 @@ def pull_back(T: Tensor, grad_T: Tensor) -> Tensor:
     return torch.cat((grads[..., 3], rotation), dim=-1)
 
 
+def push(T: Tensor, xi: Tensor) -> Tensor:
+    """The change of T, to first order, when it moves along xi. (..., 4, 4), (..., 6) -> (..., 4, 4)."""
+    columns = T[..., :3, :]
+    turned = torch.linalg.cross(xi[..., 3:, None].expand_as(columns), columns, dim=-2)
+    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    return torch.nn.functional.pad(changed, (0, 0, 0, 1))
+
+
 def move(points_c: Tensor, xi: Tensor) -> Tensor:
     """The velocity of points in the camera frame when the pose moves along xi: v + omega x p.
 

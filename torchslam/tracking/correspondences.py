@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
-from torchslam.features import hamming, match, match_projected
+from torchslam.features import match, match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.values import View
 from torchslam.world.map import Map
@@ -28,13 +28,6 @@ class Projected:
 def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
     """The threshold for this kind of descriptor: bits, or 1 - cosine."""
     return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
-
-
-def descriptor_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """(n1, n2) float32 distances of all pairs: Hamming for bits, 1 - cosine for floats."""
-    if descriptors_1.dtype == torch.uint8:
-        return hamming(descriptors_1[None], descriptors_2[None])[0].float()
-    return 1.0 - descriptors_1.float() @ descriptors_2.float().mT
 
 
 def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
@@ -62,18 +55,34 @@ def project_points(
 
     Expected scales stay in `scale_range`, those that the detector has.
     """
+    pixels, scales, visible = look_at(slam_map, ids, T_cw, camera, max_view_angle_deg, scale_range)
+    kept = torch.nonzero(visible)[:, 0]
+    ids = ids[kept]
+    return Projected(ids, pixels[kept], scales[kept], slam_map.points["angles"][ids])
+
+
+def look_at(
+    slam_map: Map,
+    ids: Tensor,
+    T_cw: Tensor,
+    camera: Camera,
+    max_view_angle_deg: float,
+    scale_range: tuple[float, float] | tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where points (n,) should appear in cameras (..., 4, 4): (..., n, 2) pixels, (..., n) scales, (..., n) whether.
+
+    scale_range: as in `project_points`, numbers or (..., 1)
+    """
     points = slam_map.points
     positions_w = points["positions_w"][ids]
     pixels, valid = camera.project(transform(T_cw, positions_w))
-    rays_w = positions_w - se3_inverse(T_cw)[:3, 3]
-    distance = torch.linalg.vector_norm(rays_w, dim=-1)
-    cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance.clamp(min=1e-12)
+    rays_w = positions_w - se3_inverse(T_cw)[..., None, :3, 3]
+    distance = torch.linalg.vector_norm(rays_w, dim=-1).clamp(min=1e-12)
+    cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance
     least = math.cos(math.radians(max_view_angle_deg))
     valid &= points["alive"][ids]  # a track may still name points that died since
-    kept = torch.nonzero(valid & camera.in_image(pixels) & (cosine > least))[:, 0]
-    ids = ids[kept]
-    scales = (points["reach"][ids] / distance[kept].clamp(min=1e-12)).clamp(*scale_range)
-    return Projected(ids, pixels[kept], scales, points["angles"][ids])
+    scales = (points["reach"][ids] / distance).clamp(*scale_range)
+    return pixels, scales, valid & camera.in_image(pixels) & (cosine > least)
 
 
 def match_near(

@@ -12,10 +12,9 @@ from torchslam.geometry import (
     Camera,
     RelativePose,
     Triangulation,
-    essential_from_pose,
+    epipolar_offsets,
     estimate_relative_pose,
     fits,
-    sampson_errors,
     squared_reprojection_errors,
     transform,
     triangulate,
@@ -108,7 +107,8 @@ class Initializer:
 
     def _scene(self, view: View, first: Tensor, second: Tensor, motion: Tensor) -> Tensor | None:
         """(n,) bool, which matches belong to the scene: without those that stay in place, unless the motion of the
-        others explains them too, as it does far points and what the camera turns around. None where nobody can tell.
+        others explains them too, as it does far points and what the camera turns around: on their epipolar lines, and
+        not behind the camera. None where nobody can tell.
         """
         everyone = torch.ones_like(motion, dtype=torch.bool)
         still = motion < STILL_PX
@@ -120,19 +120,14 @@ class Initializer:
         others = self._relative_pose(view, first[~still], second[~still])
         if others.model[0] != "essential":
             return None if self._relative_pose(view, first, second).model[0] == "essential" else everyone
-        errors = self._epipolar_errors(view, first[still], second[still], others.T_21[0])
-        explained = errors.abs() < self.config.initialization.threshold_px
+        pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
+        across, along = epipolar_offsets(others.T_21[0], pixels_1, pixels_2, self.camera, self.camera)
+        threshold = self.config.initialization.threshold_px
+        explained = (across.abs() < threshold) & (along > -threshold)
         if float(explained.double().mean()) >= EXPLAINED_SHARE:
             return everyone
         self.still = view.keypoints[second[still]]
         return ~still
-
-    def _epipolar_errors(self, view: View, first: Tensor, second: Tensor, T_21: Tensor) -> Tensor:
-        """(n,) Sampson distances in pixels of matches (n,), (n,) under a motion (4, 4)."""
-        rays_1 = self.camera.unproject(self.reference.keypoints[first])
-        rays_2 = self.camera.unproject(view.keypoints[second])
-        x_1, x_2 = rays_1[:, :2] / rays_1[:, 2:], rays_2[:, :2] / rays_2[:, 2:]
-        return self.camera.focal * sampson_errors(essential_from_pose(T_21[:3, :3], T_21[:3, 3]), x_1, x_2)
 
     def _relative_pose(self, view: View, first: Tensor, second: Tensor) -> RelativePose:
         """The motion from the reference frame to a view by matching keypoints (n,), (n,) of the two."""

@@ -50,6 +50,10 @@ class Probation:
 
     def release(self) -> list[Held]:
         """What was held back and is believed now; nothing is held any more."""
-        held, self._held = self._held, []
         self._needed, self.came_back = 0, False
+        return self.hand_over()
+
+    def hand_over(self) -> list[Held]:
+        """What is held back, believed or not; frames that come later still have to confirm the camera's place."""
+        held, self._held = self._held, []
         return held

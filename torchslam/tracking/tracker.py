@@ -29,6 +29,9 @@ from torchslam.world.track import Track
 from torchslam.world.world import World
 
 MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
+NEGLIGIBLE = (
+    1e-4  # share of the cost that a step must promise: less moves the pose by hundredths of its noise
+)
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 
 
@@ -202,8 +205,8 @@ class Tracker:
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
         weights = scales**-2 * voices(pixels, self.camera.size)
-        passes: tuple[tuple[Kernel, int], ...] = (("cauchy", 10), ("huber", 5))
-        for kernel, iterations in passes:
+        kernels: tuple[Kernel, ...] = ("cauchy", "huber")
+        for kernel in kernels:
             refined = refine_pose(
                 T_cw[None],
                 points_w[None],
@@ -213,8 +216,9 @@ class Tracker:
                 mask=mask[None],
                 kernel=kernel,
                 scale=2.0,
-                iterations=iterations,
                 backward="detached",
+                iterations=10,
+                tolerance=NEGLIGIBLE,
             )
             T_cw = refined.T_cw[0]
             mask = self.agrees(slam_map, T_cw, ids, pixels, scales)

@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
-from torchslam.values import View
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.geometry import Camera, epipolar_offsets, se3_inverse
+from torchslam.tracking.initialization import Initializer
+from torchslam.values import Start, View
 from torchslam.world.world import World
+
+INTERVAL = 5  # frames between two looks: within a few of them, a turning camera has left what it saw first
+# Of the support of the motion that two frames alone tell, what that of the map has at least. On 46 cuts of real
+# sequences it has 0.83 or more where the map is right; of maps begun wrongly on purpose, mostly less than 0.4.
+LEAST_SUPPORT = 0.5
 
 
 class Youth:
@@ -18,3 +28,31 @@ class Youth:
         """Another frame was posed."""
         self.views.append(view)
         self.age += 1
+
+    def rival(self, camera: Camera, config: Config) -> Start | None:
+        """A start by the first and the last frame alone, if it contradicts the map.
+
+        The map keeps what agrees with it, so its own observations never contradict it: these two frames are matched
+        anew. None where they make no start, or one whose matches the motion in the map explains about as well.
+        """
+        if self.age % INTERVAL != 0:
+            return None
+        initializer = Initializer(camera, config)
+        initializer.step(self.views[0])
+        start, _ = initializer.step(self.views[-1])
+        if start is None:
+            return None
+        T_1w, T_2w = self.world.history.T_cw(self.world.map)[0], self.world.T_cw
+        own, by_map = (
+            support(start, T_21, camera, config.initialization.threshold_px)
+            for T_21 in (start.T_cw, T_2w @ se3_inverse(T_1w))
+        )
+        return start if by_map < LEAST_SUPPORT * own else None
+
+
+def support(start: Start, T_21: Tensor, camera: Camera, threshold_px: float) -> float:
+    """How well a motion T_21 (4, 4) explains the matches of a start: sum of 1 - (error / threshold)^2, if positive."""
+    pixels_1 = start.reference.keypoints[start.keypoints_1]
+    pixels_2 = start.view.keypoints[start.keypoints_2]
+    across, _ = epipolar_offsets(T_21, pixels_1, pixels_2, camera, camera)
+    return float((1 - (across / threshold_px) ** 2).clamp_min(0.0).sum())

@@ -6,16 +6,13 @@ Rows are renumbered wherever a world refers to them. Whoever keeps rows elsewher
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
 from torchslam.world.map import NO_POINT, Map
-
-if TYPE_CHECKING:
-    from torchslam.world.world import World
+from torchslam.world.world import World
 
 LEAST_DEAD = 4096  # rows of dead points that are not worth the trouble
 _PRICE = 64  # rows of the history that may be rewritten per row of a dead point
@@ -101,6 +98,11 @@ def _leave_points(slam_map: Map, goes: Tensor, heirs: Tensor) -> None:
     first = torch.where(observers >= 0, observers, len(goes)).amin(1)
     born = slam_map.points["born"][orphans]
     slam_map.points["born"][orphans] = torch.where(first < len(goes), first, heirs[born])
+
+
+def compact(world: World) -> Renumbering | None:
+    """Give back the rows of dead points where that is worth it; returns where rows went, None if they stay."""
+    return drop_dead_points(world) if is_worth_compacting(world) else None
 
 
 def is_worth_compacting(world: World) -> bool:

@@ -85,6 +85,15 @@ class Map:
             mask=points["alive"][point_ids][None],
         )
 
+    def features(self, keyframes: Tensor) -> Features:
+        """What keyframes (k,) saw, as a batch, for matching."""
+        table = self.keyframes
+        scales, mask = table["scales"][keyframes], table["mask"][keyframes]
+        keypoints, angles, descriptors = (
+            table[name][keyframes] for name in ("keypoints", "angles", "descriptors")
+        )
+        return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
+
     def centre_covariances_w(self) -> Tensor:
         """(K, 3, 3) covariances of the positions of the keyframes, zero where unknown."""
         R_cw = self.T_cw[:, :3, :3]
@@ -128,6 +137,7 @@ class Map:
             positions_w=positions_w,
             covariances_w=like.new_zeros(n, 3, 3) if covariances_w is None else covariances_w,
             descriptors=descriptors,
+            colors=torch.zeros(n, 3, dtype=torch.uint8, device=like.device),
             normals_w=like.new_zeros(n, 3),
             reach=like.new_zeros(n),
             angles=like.new_zeros(n),
@@ -141,8 +151,8 @@ class Map:
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
 
-    def observe(self, keyframe: int, keypoint_index: Tensor, point_ids: Tensor) -> None:
-        """Note that keypoints (n,) of a keyframe, which see nothing yet, see points (n,)."""
+    def observe(self, keyframe: int | Tensor, keypoint_index: Tensor, point_ids: Tensor) -> None:
+        """Note that keypoints (n,) of a keyframe, or of one each (n,), which see nothing yet, see points (n,)."""
         self._index_of_points.add(point_ids, keyframe * self._keypoints + keypoint_index)
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)

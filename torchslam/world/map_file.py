@@ -26,7 +26,8 @@ from torchslam.world.table import Table
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
-FORMAT = 3  # 1 had no covariances, 2 a single map without the frames between keyframes
+FORMAT = 4  # 1 had no covariances, 2 a single map without the frames between keyframes
+WITHOUT_COLORS = 3  # is read as well: its points have the colours of a map that has seen no image
 TABLES: dict[str, Schema] = {
     "points": POINTS,
     "keyframes": KEYFRAMES,
@@ -152,9 +153,21 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         found = about["format"]
     except (ValueError, KeyError, TypeError):
         raise ResultsError(f"{path}: a safetensors file, but not a torchslam map") from None
-    if found != FORMAT:
+    if found == WITHOUT_COLORS:
+        tensors |= _without_colors(tensors)
+    elif found != FORMAT:
         raise ResultsError(f"{path}: map format {found}, this version reads format {FORMAT}: run again")
     return tensors, about
+
+
+def _without_colors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The columns of colours that a file of before lacks: unknown."""
+    positions = ".points.positions_w"
+    return {
+        name.removesuffix(positions) + ".points.colors": torch.zeros((*rows.shape[:1], 3), dtype=torch.uint8)
+        for name, rows in tensors.items()
+        if name.endswith(positions)
+    }
 
 
 def _tables(world: World) -> dict[str, Table]:

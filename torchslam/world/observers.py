@@ -18,9 +18,10 @@ class Observers:
     """For every point the places (keyframe row * N + keypoint) that see it, in rows that are filled from the left.
 
     A point takes a row when it is seen first and gives it back when nobody sees it: memory goes with the points that
-    are seen, not with all that ever were.
+    are seen, not with all that ever were. As that of the table, it is made outside of inference mode.
     """
 
+    @torch.inference_mode(False)
     def __init__(self, table: Tensor) -> None:
         """The index of a table (K, N) of point rows, negative where a keypoint sees nothing."""
         # Half the memory of int64: enough for two million keyframes of a thousand keypoints.
@@ -45,6 +46,7 @@ class Observers:
         """(n, w) the places that see points (n,), in rows filled from the left, then NOWHERE."""
         return self._places[self._rows(point_ids)]
 
+    @torch.inference_mode(False)
     def add(self, point_ids: Tensor, places: Tensor) -> None:
         """Note that points (n,) are seen at places (n,); a point may stand there several times."""
         if len(point_ids) == 0:

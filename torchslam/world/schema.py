@@ -1,7 +1,8 @@
 """The columns of a world's tables: what they hold, in which shape and which unit.
 
 A letter in a shape is a size that the first row of a table decides: N keypoints a frame, D numbers a descriptor. Kinds:
-"float" is the floating-point type of the geometry, "int" int64, "bool" bool, "descriptor" bytes or floats.
+"float" is the floating-point type of the geometry, "int" int64, "bool" bool, "byte" uint8, "descriptor" bytes or
+floats.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ _KINDS = {
     "float": lambda dtype: dtype in (torch.float32, torch.float64),
     "int": lambda dtype: dtype == torch.int64,
     "bool": lambda dtype: dtype == torch.bool,
+    "byte": lambda dtype: dtype == torch.uint8,
     "descriptor": lambda dtype: dtype == torch.uint8 or dtype.is_floating_point,
 }
 
@@ -46,6 +48,7 @@ POINTS: Schema = {
     "positions_w": Column((3,), "float", "in the world"),
     "covariances_w": Column((3, 3), "float", "of the position; zero where unknown"),
     "descriptors": Column(("D",), "descriptor", "of the newest observation"),
+    "colors": Column((3,), "byte", "red, green, blue in the images; black where unknown"),
     "normals_w": Column((3,), "float", "unit direction from the newest observer to the point"),
     "reach": Column(
         (), "float", "distance times keypoint scale of the newest observation: px times map units"

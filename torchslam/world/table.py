@@ -13,7 +13,8 @@ class Table:
 
     The schema fixes names, shapes and kinds; the first `append` fixes dtypes, device and the sizes that the schema
     leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. What is appended
-    is detached: a world holds values, not graphs.
+    is detached: a world holds values, not graphs. Its memory is made outside of inference mode, so that autograd may
+    read it and anybody may write it.
     """
 
     def __init__(self, schema: Schema) -> None:
@@ -34,6 +35,7 @@ class Table:
         """All columns by name, the rows in use."""
         return {name: self[name] for name in self._columns}
 
+    @torch.inference_mode(False)
     def append(self, **rows: Tensor) -> Tensor:
         """Add rows, one tensor (n, ...) per column; returns their ids (n,) int64.
 
@@ -47,6 +49,7 @@ class Table:
         self._size = end
         return torch.arange(start, end, device=next(iter(rows.values())).device)
 
+    @torch.inference_mode(False)
     def keep(self, rows: Tensor) -> None:
         """Keep some rows (n,), by index, in this order; the others are gone.
 

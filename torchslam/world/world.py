@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
-from torchslam.geometry import rigid, sim3_inverse, sim3_scale, transform
-from torchslam.values import Trajectory
-from torchslam.world.compaction import (
-    Renumbering,
-    drop_dead_points,
-    is_worth_compacting,
-    remove_keyframes,
+from torchslam.geometry import sim3_inverse, sim3_scale
+from torchslam.geometry.correction import (
+    carry_points,
+    covariances_with_unit,
+    with_unit,
+    without_scale,
 )
+from torchslam.values import Trajectory
 from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.track import Track
@@ -58,36 +57,28 @@ class World:
         Its scale says how large a map unit is around the keyframe. Points follow the keyframe that made them, frames
         the one they refer to, and so does the track.
         """
-        scale = sim3_scale(S_cw)
-        T_cw = rigid(S_cw[:, :3, :3] / scale[:, None, None], S_cw[:, :3, 3] / scale[:, None])
-        points, born = self.map.points, self.map.points["born"]
-        S_wc = sim3_inverse(S_cw)[born]
-        points_c = transform(self.map.T_cw[born], self.map.positions_w[:, None])
-        R_wc = S_wc[:, :3, :3] @ self.map.T_cw[born][:, :3, :3]
-        points["positions_w"][:] = transform(S_wc, points_c)[:, 0]
-        points["covariances_w"][:] = R_wc @ points["covariances_w"] @ R_wc.mT
-        points["normals_w"][:] = (scale[born, None, None] * R_wc @ points["normals_w"][..., None])[..., 0]
+        points, born, scale = self.map.points, self.map.points["born"], sim3_scale(S_cw)
+        points["positions_w"][:], points["covariances_w"][:], points["normals_w"][:] = carry_points(
+            points["positions_w"],
+            points["covariances_w"],
+            points["normals_w"],
+            self.map.T_cw[born],
+            S_cw[born],
+        )
         points["reach"][:] /= scale[born]
-        self.map.keyframes["covariances"][:] = rescaled(self.map.keyframes["covariances"], 1 / scale)
-        self.map.keyframes["T_cw"][:] = T_cw
+        covariances = self.map.keyframes["covariances"]
+        covariances[:] = covariances_with_unit(covariances, scale)
+        self.map.keyframes["T_cw"][:] = without_scale(S_cw)
         self.history.rescale(1 / scale)
         if self.track.reference >= 0:
             around = scale[self.track.reference]
-            self.track.T_cr = _shrunk(self.track.T_cr, around)
+            self.track.T_cr = with_unit(self.track.T_cr, around)
             if self.track.velocity is not None:
-                self.track.velocity = _shrunk(self.track.velocity, around)
+                self.track.velocity = with_unit(self.track.velocity, around)
 
     def move(self, S_ba: Tensor) -> None:
         """Give the world another frame and unit: points p become S_ba p, S_ba (4, 4) a similarity."""
         self.correct(self.map.T_cw @ sim3_inverse(S_ba))
-
-    def remove(self, keyframes: Tensor) -> Renumbering:
-        """Take keyframes (k,) out of the map, see `compaction.remove_keyframes`; returns where rows went."""
-        return remove_keyframes(self, keyframes)
-
-    def compact(self) -> Renumbering | None:
-        """Give back the rows of dead points where that is worth it; returns where rows went, None if they stay."""
-        return drop_dead_points(self) if is_worth_compacting(self) else None
 
     def absorb(self, other: World, S_ab: Tensor) -> None:
         """Take over everything of another world, moved by S_ab (4, 4) into this one; the other is empty afterwards.
@@ -107,15 +98,3 @@ class World:
             local_points=track.local_points + points,
         )
         other.map, other.history = Map(), History()
-
-
-def _shrunk(T: Tensor, factor: Tensor) -> Tensor:
-    """T (4, 4) in a unit of length that is `factor` times as long."""
-    return rigid(T[:3, :3], T[:3, 3] / factor)
-
-
-def rescaled(covariances: Tensor, factor: Tensor) -> Tensor:
-    """Covariances (K, 6, 6) of poses whose unit of length changes by factors (K,)."""
-    units = torch.ones_like(covariances[..., 0])
-    units[:, :3] = factor[:, None]
-    return units[:, :, None] * covariances * units[:, None, :]

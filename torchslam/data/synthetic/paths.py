@@ -16,6 +16,31 @@ OUTWARD = 0.5
 HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
 """Of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n, weights J_n(1 / 4) / (1 - 4 n)."""
 
+WALK = (  # over the storey: x, z and heading in quarter turns to the right from z, of each end of a step or a turn
+    (-4.0, -4.1, 1),
+    (5.1, -4.1, 1),
+    (5.1, -4.1, 0),
+    (5.1, 0.0, 0),
+    (5.1, 0.0, -1),  # into the room ...
+    (2.2, 0.0, -1),
+    (2.2, 0.0, -3),  # ... around, and out again
+    (5.1, 0.0, -3),
+    (5.1, 0.0, -4),
+    (5.1, 4.1, -4),
+    (5.1, 4.1, -5),
+    (-5.1, 4.1, -5),
+    (-5.1, 4.1, -6),
+    (-5.1, -4.1, -6),
+    (-5.1, -4.1, -7),
+    (-4.0, -4.1, -7),
+)
+QUARTER_TIME = 1.4
+"""A quarter turn takes as long as a walk of so many metres."""
+EASING = 0.6
+"""Metres of the walk before and after over which speeds even out."""
+ARM = 0.3
+"""Metres: so far in front of the body is the camera held, so that it moves where the body only turns."""
+
 
 def loop(phase: Tensor) -> Tensor:
     """A figure of eight through the middle of the room, one round a phase of 2 pi, held in a hand that sways.
@@ -73,6 +98,41 @@ def round_the_core(phase: Tensor) -> Tensor:
         -0.03 + 0.012 * torch.sin(31.7 * phase + 0.4),
         0.01 * torch.sin(41.2 * phase),
     )
+
+
+def round_the_storey(phase: Tensor) -> Tensor:
+    """Around the corridor of `storey` and into its room, one round a phase of 2 pi; the body turns in place.
+
+    The camera is held at arm's length and looks ahead, it sways and glances to the sides.
+    """
+    x, z, yaw = _walked(phase)
+    yaw = yaw + 0.15 * torch.sin(17.3 * phase) + 0.015 * torch.sin(61.7 * phase)
+    return _poses(
+        x + ARM * torch.sin(yaw) + 0.012 * torch.sin(49.1 * phase),
+        -0.1 + 0.015 * torch.sin(83.7 * phase) + 0.05 * torch.sin(5.3 * phase + 0.5),
+        z + ARM * torch.cos(yaw) + 0.012 * torch.sin(43.9 * phase + 1.0),
+        yaw,
+        -0.02 + 0.012 * torch.sin(57.7 * phase + 0.4),
+        0.01 * torch.sin(71.2 * phase),
+    )
+
+
+def _walked(phase: Tensor) -> Tensor:
+    """(3, N) x, z and yaw of the body on `WALK`, eased by a Hann window over the time."""
+    ends = torch.tensor(WALK, dtype=torch.float64)
+    steps = ends.diff(dim=0)
+    durations = steps[:, :2].norm(dim=-1) + QUARTER_TIME * steps[:, 2].abs()
+    starts = torch.cat((durations.new_zeros(1), durations.cumsum(0)))
+    window = torch.linspace(-1, 1, 25, dtype=torch.float64)[1:-1]
+    weights = torch.cos(0.5 * math.pi * window) ** 2
+    time = (phase[:, None] * (starts[-1] / (2 * math.pi)) + EASING * window) % starts[-1]
+    row = (torch.searchsorted(starts, time, right=True) - 1).clamp(max=len(steps) - 1)
+    share = (time - starts[row]) / durations[row]
+    at = ends[row] + share[..., None] * steps[row]
+    # A round ends eight quarter turns from where it began: in a window over its end the heading goes on from there.
+    jump = torch.round((at[..., 2] - at[:, len(window) // 2, None, 2]) / 8) * 8
+    at = torch.stack((at[..., 0], at[..., 1], 0.5 * math.pi * (at[..., 2] - jump)))
+    return (at * weights).sum(-1) / weights.sum()
 
 
 def phases(frames: int, frames_per_round: int) -> Tensor:

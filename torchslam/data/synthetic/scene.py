@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchslam.data.synthetic.textures import surface
+from torchslam.data.synthetic.textures import COVERAGE, surface
 
 Vector = tuple[float, float, float]
 X, Y, Z = np.eye(3)
@@ -39,15 +39,17 @@ class Painter:
 
     rng:   of the textures
     texel: metres, at most
+    coverage: the part of a surface that the largest shapes cover
     """
 
     rng: np.random.Generator
     texel: float = TEXEL
+    coverage: float = COVERAGE
 
     def rectangle(
         self, origin: np.ndarray, axis_u: np.ndarray, axis_v: np.ndarray, size: tuple[float, float]
     ) -> Rectangle:
-        texture = surface(self.rng, size, self.texel, 2 ** (MIP_LEVELS - 1))
+        texture = surface(self.rng, size, self.texel, 2 ** (MIP_LEVELS - 1), self.coverage)
         normal = np.cross(axis_u, axis_v)
         light = 0.8 + 0.15 * abs(float(normal @ Z)) + 0.2 * float(abs(normal @ Y))
         return Rectangle(origin, axis_u, axis_v, size, (texture * min(light, 1.0)).astype(np.uint8))

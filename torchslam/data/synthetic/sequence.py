@@ -12,17 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.image_file import grey_to_tensor
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, room, wall
-from torchslam.errors import SequenceError
+from torchslam.data.synthetic.storey import storey
+from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.values import Trajectory
 
+LOOKS_FOR = "synthetic:room"
 FRAME_RATE = 20.0
 SIZE = (640, 480)
 FOCAL = 500.0
@@ -53,6 +56,8 @@ SCENES = {
     "loop": Scene(rooms, paths.round_the_core, 670, 720),
     # Ends before the start comes into sight: what looks like a return is none. With 720 frames it returns.
     "corridors": Scene(corridors, paths.round_the_core, 670, 560),
+    # A corridor all around with a room on the way, and 100 frames on, over the start.
+    "storey": Scene(storey, paths.round_the_storey, 1160, 1260),
 }
 
 
@@ -105,6 +110,24 @@ class SyntheticSequence(Sequence):
 
     def image_name(self, index: int) -> str:
         return f"synthetic:{self.name}#{index}"
+
+
+def matches(path: str) -> bool:
+    """Whether this is the name of a rendered sequence."""
+    return path.startswith("synthetic:")
+
+
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
+    """A rendered sequence, with its own camera or a guess, as if that were not known.
+
+    Raises SequenceError, and CalibrationError for a camera that claims to be right.
+    """
+    sequence = open_synthetic(path)
+    if camera is None:
+        return sequence
+    if not is_guessed(camera):
+        raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
+    return sequence.with_camera(fit_camera(camera, sequence.size, path), Calibrated.GUESSED)
 
 
 def open_synthetic(name: str) -> SyntheticSequence:

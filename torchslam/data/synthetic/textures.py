@@ -18,10 +18,17 @@ FRACTION_BITS = 4
 """Of the coordinates of polygons, so that their corners lie off the pixel grid."""
 
 
-def surface(rng: np.random.Generator, size: tuple[float, float], texel: float, multiple: int) -> np.ndarray:
+def surface(
+    rng: np.random.Generator,
+    size: tuple[float, float],
+    texel: float,
+    multiple: int,
+    coverage: float = COVERAGE,
+) -> np.ndarray:
     """A painted surface: shapes of every size from a third of it down to two centimetres, over smooth noise.
 
     size: (width, height) metres; texel: metres, at most; multiple: of which rows and columns are to be
+    coverage: the part of the surface that the largest shapes cover
     Returns (rows, columns) uint8.
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
@@ -29,8 +36,8 @@ def surface(rng: np.random.Generator, size: tuple[float, float], texel: float, m
     extent = largest = min(size) / 3
     while extent > FINEST:
         # The small ones leave more room, so that what is below them stays visible.
-        coverage = COVERAGE * (extent / largest) ** 0.5
-        count = int(coverage * size[0] * size[1] / (0.3 * extent**2)) + 1
+        share = coverage * (extent / largest) ** 0.5
+        count = int(share * size[0] * size[1] / (0.3 * extent**2)) + 1
         _draw_shapes(rng, image, count, extent / texel)
         extent /= 1.7
     return cv2.GaussianBlur(image, (0, 0), 0.7)

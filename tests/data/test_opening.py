@@ -1,0 +1,187 @@
+"""What is read, what is left out, and what is proposed where nothing is."""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torchslam.data import image_file as image_files
+from torchslam.data import open_sequence
+from torchslam.errors import CalibrationError, FrameError, SequenceError
+
+CAMERA = "60,60,32,24"
+Write = Callable[..., np.ndarray]
+
+
+def names(sequence) -> list[str]:
+    return [Path(sequence.image_name(index)).name for index in range(len(sequence))]
+
+
+@pytest.mark.parametrize("inner", ["images", "rgb"])
+def test_images_in_a_folder_inside(tmp_path: Path, write_picture: Write, inner: str) -> None:
+    for index in range(3):
+        write_picture(tmp_path / inner / f"{index}.png", index)
+        write_picture(tmp_path / "depth" / f"{index}.png", index)
+    (tmp_path / "calibration.txt").write_text("60 61 32 24")
+    sequence = open_sequence(tmp_path)
+    assert names(sequence) == ["0.png", "1.png", "2.png"]
+    assert inner in sequence.image_name(0)
+    assert float(sequence.camera.fy) == 61.0
+    assert sequence.name == tmp_path.name
+
+
+def test_what_is_no_frame_is_left_out_with_a_word(tmp_path: Path, write_picture: Write) -> None:
+    for index in range(2):
+        for name in (f"{index:04d}.png", f"._{index:04d}.png", f"{index:04d}_depth.png"):
+            write_picture(tmp_path / name, index)
+    write_picture(tmp_path / "mask.png", 9)
+    sequence = open_sequence(tmp_path, CAMERA)
+    assert names(sequence) == ["0000.png", "0001.png"]
+    (note,) = sequence.notes
+    assert note.startswith("left out what are no frames: ")
+    assert {"2 hidden files", "2 depth images", "1 masks"} == set(note.partition(": ")[2].split(", "))
+
+
+def test_a_word_of_a_name_is_a_whole_word(tmp_path: Path, write_picture: Write) -> None:
+    for index, name in enumerate(("masked_ball1.png", "depths2.png", "flower3.png")):
+        write_picture(tmp_path / name, index)
+    assert len(open_sequence(tmp_path, CAMERA)) == 3
+
+
+def test_two_series_are_not_mixed(tmp_path: Path, write_picture: Write) -> None:
+    for index in range(3):
+        write_picture(tmp_path / f"left-{index}.png", index)
+        write_picture(tmp_path / f"right-{index:02d}.png", index)
+    with pytest.raises(SequenceError, match=r"several series .* '.*/left-\*\.png' or '.*/right-\*\.png'"):
+        open_sequence(tmp_path, CAMERA)
+    sequence = open_sequence(tmp_path / "left-*.png", CAMERA)
+    assert names(sequence) == ["left-0.png", "left-1.png", "left-2.png"]
+    with pytest.raises(SequenceError, match="does not exist"):
+        open_sequence(tmp_path / "middle-*.png", CAMERA)
+
+
+def test_series_that_go_on_are_one(tmp_path: Path, write_picture: Write) -> None:
+    for index, name in enumerate(("a1.png", "a2.png", "b3.png", "b4.jpg")):
+        write_picture(tmp_path / name, index)
+    assert names(open_sequence(tmp_path, CAMERA)) == ["a1.png", "a2.png", "b3.png", "b4.jpg"]
+
+
+def test_proposals(tmp_path: Path, tum_folder: Callable[..., Path], write_picture: Write) -> None:
+    folder = tum_folder()
+    for wrong, message in (
+        (folder.with_name("sequense"), f"does not exist; did you mean {folder}?"),
+        (folder / "rgb.txt", f"neither a video nor a recording .*; did you mean {folder}?"),
+        (folder.parent, f"did you mean {folder}?"),
+    ):
+        with pytest.raises(SequenceError, match=message.replace("?", r"\?")):
+            open_sequence(wrong)
+    write_picture(tmp_path / "other" / "depth" / "1.png")
+    write_picture(tmp_path / "other" / "images" / "1.png")
+    with pytest.raises(SequenceError, match=r"no frames, only 1 depth images; did you mean .*other\?"):
+        open_sequence(tmp_path / "other" / "depth")
+    shutil.copytree(folder, tmp_path / "second")
+    with pytest.raises(
+        SequenceError, match=r"3 folders with one; which of .*other, .*second or .*sequence\?"
+    ):
+        open_sequence(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SequenceError, match="folder is empty"):
+        open_sequence(tmp_path / "empty")
+    (tmp_path / "texts").mkdir()
+    (tmp_path / "texts" / "a.txt").write_text("a")
+    with pytest.raises(
+        SequenceError, match=r"no images .*; looked for a video .*rgb\.txt \(ETH3D, TUM\).*TartanAir"
+    ):
+        open_sequence(tmp_path / "texts")
+
+
+def test_zip(tmp_path: Path, tum_folder: Callable[..., Path]) -> None:
+    folder = tum_folder()
+    archive = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", folder.parent, folder.name))
+    sequence = open_sequence(archive)
+    kept = Path(sequence.image_name(0))
+    part = sequence.part(1, 3)
+    expected = open_sequence(folder)
+    assert (sequence.name, len(sequence)) == ("packed", 5)
+    del sequence
+    assert torch.equal(part[0].image, expected[1].image)
+    assert kept.exists()
+    del part
+    assert not kept.exists()
+
+
+def test_wrong_archives(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(SequenceError, match=r"a\.zip: not a zip archive"):
+        open_sequence(tmp_path / "a.zip")
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+        archive.writestr("../evil.png", b"x")
+    with pytest.raises(SequenceError, match="climbs out of the folder"):
+        open_sequence(tmp_path / "b.zip")
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
+        archive.writestr("notes.txt", b"x")
+    with pytest.raises(SequenceError, match=r"c\.zip: no images"):
+        open_sequence(tmp_path / "c.zip")
+
+
+def test_an_archive_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("0.png", b"x" * 1000)
+    monkeypatch.setattr(
+        "torchslam.data.archive.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 1 << 30)
+    )
+    with pytest.raises(SequenceError, match="do not fit into"):
+        open_sequence(tmp_path / "a.zip")
+
+
+@pytest.mark.parametrize(("bits", "white"), [(10, 1023), (12, 4095), (14, 16383), (16, 65535)])
+def test_bits_in_16(tmp_path: Path, bits: int, white: int) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, white + 1, (3, 48, 64)).astype(np.uint16)
+    images[1, 0, 0] = white
+    for index, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), image)
+    sequence = open_sequence(tmp_path, CAMERA)
+    assert sequence.notes == (f"{bits} of 16 bits are used",)
+    for index, image in enumerate(images):
+        expected = torch.from_numpy(image.astype(np.float32)) / white
+        torch.testing.assert_close(sequence.image(index)[0, 0], expected)
+
+
+def test_brighter_than_the_images_looked_at(tmp_path: Path, write_picture: Write) -> None:
+    for index in range(60):
+        cv2.imwrite(
+            str(tmp_path / f"{index}.png"), np.full((48, 64), 8000 if index == 4 else 4000, np.uint16)
+        )
+    sequence = open_sequence(tmp_path, CAMERA)
+    assert float(sequence.image(4).max()) == 1.0
+    assert float(sequence.image(5).max()) == pytest.approx(4000 / 4095)
+
+
+def test_nothing_is_read_without_a_limit(
+    tmp_path: Path, write_picture: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm"):
+        image = tmp_path / f"0.{suffix}"
+        write_picture(image)
+        assert image_files.read_grey(image, "here").shape == (1, 1, 48, 64)
+        with monkeypatch.context() as patch:
+            patch.setattr(image_files, "MAX_PIXELS", 48 * 64 - 1)
+            with pytest.raises(FrameError, match=rf"0\.{suffix} is not an image"):
+                image_files.read_grey(image, "here")
+        if suffix != "png":
+            image.unlink()
+    monkeypatch.setattr(image_files, "MAX_BYTES", 100)
+    with pytest.raises(FrameError, match="more than the 100 of an image"):
+        image_files.read_grey(tmp_path / "0.png", "here")
+    (tmp_path / "calibration.txt").write_text("60 60 32 24\n" * 20)
+    monkeypatch.setattr("torchslam.data.text_file.MAX_BYTES", 100)
+    with pytest.raises(CalibrationError, match="more than the 100 of a text"):
+        open_sequence(tmp_path)

@@ -1,0 +1,48 @@
+"""Geometry is computed in the precision of its inputs: no autocast inside, no half precision, no mixture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+from torch._C import _is_any_autocast_enabled
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_DEVICE_TYPES = ("cpu", "cuda", "mps", "xpu")
+_DTYPES = (torch.float32, torch.float64)
+
+
+def full_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, with the same bits under `torch.autocast` as without.
+
+    Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other.
+    """
+
+    @wraps(function)
+    def precise(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not _is_any_autocast_enabled():
+            return function(*args, **kwargs)
+        with ExitStack() as stack:
+            for device_type in _DEVICE_TYPES:
+                if torch.is_autocast_enabled(device_type):
+                    stack.enter_context(torch.autocast(device_type, enabled=False))
+            return function(*args, **kwargs)
+
+    return precise
+
+
+def check_dtypes(**tensors: Tensor | None) -> None:
+    """Raises ValueError unless all tensors are float32, or all float64; names the first that is not."""
+    given = [(name, tensor.dtype) for name, tensor in tensors.items() if tensor is not None]
+    first, expected = given[0]
+    for name, dtype in given:
+        if dtype not in _DTYPES:
+            raise ValueError(f"{name} must be float32 or float64, not {dtype}")
+        if dtype != expected:
+            raise ValueError(f"{name} is {dtype}, but {first} is {expected}: all must be the same")

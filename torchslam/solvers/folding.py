@@ -1,0 +1,66 @@
+"""How a function of batches takes the further dimensions of `torch.func.vmap`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import vmap
+
+Tensors = tuple[Tensor, ...]
+InDims = Sequence[int | None]
+"""The dimension of each tensor along which the elements run; None where all share it."""
+
+
+def many_times(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
+    """A function of tensors, over `many` more leading dimensions of them."""
+    for _ in range(many):
+        function = vmap(function)
+    return function
+
+
+def leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
+    """A tensor whose elements run along its first dimension."""
+    return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+
+
+def looped(function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]) -> Tensors:
+    """One element after the other."""
+    elements = [
+        function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
+        for row in range(size)
+    ]
+    return tuple(torch.stack(parts) for parts in zip(*elements, strict=True))
+
+
+def folded(
+    function: Callable[..., Tensors],
+    size: int,
+    dims: InDims,
+    tensors: Sequence[Tensor],
+    ndims: Sequence[int],
+    before: Sequence[int],
+) -> Tensors:
+    """All elements at once, in the batch that the function knows, which comes after `before` dimensions."""
+    batched = [
+        x.ndim - (dim is not None) > ndim + skip
+        for x, dim, ndim, skip in zip(tensors, dims, ndims, before, strict=True)
+    ]
+    batch = next(
+        x.shape[skip + (dim is not None and dim <= skip)]
+        for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True)
+        if has
+    )
+    rows = []
+    for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True):
+        if dim is None and not has:
+            rows.append(x)
+            continue
+        x = leading(x, dim, size).movedim(0, skip)
+        if not has:
+            x = x.unsqueeze(skip + 1).expand(*x.shape[: skip + 1], batch, *x.shape[skip + 1 :])
+        rows.append(x.flatten(skip, skip + 1))
+    skip = before[0]
+    return tuple(part.unflatten(skip, (size, batch)) for part in function(*rows))
