@@ -114,6 +114,7 @@ def estimator_cases() -> dict[str, Case]:
         "essential_from_pose": (geometry.essential_from_pose, (views.T_21[:, :3, :3], views.T_21[:, :3, 3])),
         "decompose_essential": (geometry.decompose_essential, (E,)),
         "sampson_errors": (geometry.sampson_errors, (E, *x)),
+        "epipolar_offsets": (with_camera(geometry.epipolar_offsets, 2), (*pair[1:], params)),
         "five_point": (geometry.five_point, tuple(part[:, 25:30] for part in x)),
         "p3p": (geometry.p3p, (unit(4, 3, 3), normal(4, 3, 3, seed=1))),
         "homography_from_matches": (geometry.homography_from_matches, x),

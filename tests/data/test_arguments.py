@@ -44,7 +44,9 @@ def test_info_without_a_camera(
     assert (status, rows["camera"]) == (0, "missing: --camera gives it")
     assert rows["rate"] == "10.00 Hz over 0.20 s"
     assert "left out what are no frames: 3 hidden files" in errors
-    assert main(["run", str(tmp_path), "-o", str(tmp_path / "results")]) == 3  # the images decide, and these do not
+    assert (
+        main(["run", str(tmp_path), "-o", str(tmp_path / "results")]) == 3
+    )  # the images decide, and these do not
     assert "no calibration here: as with --camera auto" in capsys.readouterr().err
 
 

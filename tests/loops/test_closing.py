@@ -218,8 +218,6 @@ def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
         world, worlds = two_visits(S_21), Worlds(CAMERA.params)
         worlds._worlds = [world]
         memory = Memory(CAMERA, load_config(None, [f"loops.enabled={str(enabled).lower()}"]), worlds)
-        for keyframe in range(world.map.num_keyframes):
-            memory.add(world.map, keyframe)
         last = world.map.num_keyframes - 1
         points = world.map.num_points
         assert memory.recognize(world, last) is None

@@ -249,6 +249,7 @@ def sampson_errors(
     return torch.where(regular, (x_2 * line_2).sum(-1) * torch.where(regular, squared, 1.0).rsqrt(), 0.0)
 
 
+@full_precision
 def epipolar_offsets(
     T_21: Tensor, pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera
 ) -> tuple[Tensor, Tensor]:
