@@ -145,25 +145,29 @@ class IndependentMotion:
         strays = self._errors(last, look, first, second) > self.settings.min_error_px
         patience = last.patience[first] - int(T_cw is not None and last.T_cw is not None)
         known = ~strays & (patience > 0)
-        group = self._together(last.view, view, first, second, strays)
-        moves_now = len(group) > 0
-        group = torch.cat([group, self._together(last.view, view, first, second, known)])
+        moving = self._together(last.view, view, first, second, strays)
+        group = torch.cat([moving, self._together(last.view, view, first, second, known)])
         if len(group) == 0:
             self._mover, self._last = None, replace(look, patience=nobody)
             return NOTHING
         to, fro = view.keypoints[second], last.view.keypoints[first]
-        if moves_now and self._is_turned(to, group, strays, last.patience[first] > 0):
-            return Movement(True, f"{len(group)} matches in the rest of the image move against the map")
+        if len(moving) and self._is_turned(to, moving, strays, last.patience[first] > 0):
+            return Movement(True, f"{len(moving)} matches in the rest of the image move against the map")
         rest = torch.ones_like(strays)
         rest[group] = False
         belongs = self._nearer_to(view.keypoints, to[group], to[rest])
-        patience = (_LESS * belongs).index_put((second,), patience.where(~strays, _PATIENCE) * ~rest)
+        # What agrees with the map beside it goes with it only as long as nobody knows where the camera is.
+        beside = belongs[second].to(patience.dtype)
+        renewed = torch.where(strays, _PATIENCE, patience).where(~rest, beside)
+        patience = (_LESS * belongs).index_put((second,), renewed)
         self._mover = _Mover.of(view, belongs, (to - fro)[group].median(0).values / frames)
         self._last = replace(look, patience=patience)
-        if not moves_now:
+        if len(moving) == 0:
             return NOTHING
         self._unseen = 0
-        return Movement(False, f"{int(belongs.sum())} keypoints move by themselves and are left out")
+        return Movement(
+            False, f"{int((belongs & view.mask).sum())} keypoints move by themselves and are left out"
+        )
 
     def _is_turned(self, pixels: Tensor, group: Tensor, strays: Tensor, known: Tensor) -> bool:
         """Whether the map may have gone over to what moves, so that the group is the scene: if what was known to move
