@@ -29,6 +29,7 @@ from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.backwards import track_back
 from torchslam.tracking.foreign import Foreign
+from torchslam.tracking.independent_motion import NOTHING
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
@@ -198,22 +199,20 @@ class SLAM:
         if tracked is None:
             return self._lose(world, view)
         doubt = why_doubt(tracked, expected, world.track, self.config.judge)
-        moved = None if doubt else self.foreign.moves(tracked)
-        if moved and moved.is_doubt:
-            doubt = moved.words
-        if doubt or self.probation:
-            return self._hold(world, view, tracked, doubt)
+        moves = self.foreign.moves(tracked) if not doubt else NOTHING
+        if doubt or moves.is_doubt or self.probation:
+            return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
         self.state = State.TRACKING
         why = self._take(world, view, tracked)
         is_keyframe = bool(why)
         if is_keyframe:
             world = self._recall(world)
             self._tidy(world)
-        foreign = moved.words if moved else ""
+        stays = ""
         if self.mapping and self.foreign.stays(world.T_cw, tracked.depth):
             drop_covered(world, self.foreign.stillness.covers)
-            foreign = "some of the image does not move with the scene and is left out"
-        why = "; ".join(filter(None, [why, foreign]))
+            stays = "some of the image does not move with the scene and is left out"
+        why = "; ".join(filter(None, [why, stays, moves.words]))
         if self.youth is not None:
             self.youth.grow(view)
             if self._replace(self.youth):

@@ -24,8 +24,8 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
         "--camera",
         metavar="CAMERA",
         help="FX,FY,CX,CY[,K1,K2,P1,P2,K3] in pixels; a calibration file (OpenCV, ROS, Kalibr, ORB-SLAM3, COLMAP, "
-        f"nerfstudio); a preset ({', '.join(PRESETS)}); or a guess: fov=65 (degrees), f=0.8w (image widths), exif. "
-        "Replaces the calibration found with the images",
+        f"nerfstudio); a preset ({', '.join(PRESETS)}); a guess that the images improve: fov=65 (degrees), "
+        "f=0.8w (image widths), exif; or auto: the images decide. Replaces the calibration found with the images",
     )
     reading = parser.add_argument_group("which frames, and how")
     reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
