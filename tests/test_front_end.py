@@ -30,7 +30,7 @@ GROWING = {
 @pytest.mark.parametrize(
     ("size", "factor"),
     [
-        ((320, 240), 1), ((640, 480), 1), ((1241, 376), 1), ((960, 640), 1), ((961, 640), 1.41495),
+        ((320, 240), 1), ((640, 480), 1), ((1241, 376), 1), ((768, 640), 1), ((769, 640), 1.265734),
         ((1280, 960), 2), ((1920, 1440), 3), ((1920, 1080), 2.598076),
     ],
 )  # fmt: skip
@@ -89,6 +89,15 @@ def test_a_mask_holds_for_the_large_image() -> None:
     x = found.keypoints[found.mask][:, 0]
     assert 300 < float(x.max()) <= 332.5
     assert int(found.mask.sum()) > 300  # the budget goes there
+
+
+def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
+    slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
+    told = Config().for_size((1280, 960))
+    assert slam.config == Config()
+    assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, slam.initializer))
+    assert slam.tracker.settings == told.tracking
+    assert slam.foreign.stillness.evidence.shape == (121, 161)
 
 
 def run(size: str) -> Run:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from torchslam.settings import Settings, choices, enlarged, merged, setting, to_toml
 
-TOLERATED = 2.0
-"""Times the pixels that images are reduced to: those that have no more than this are taken as they are."""
-
 __all__ = ["CHOICES", "Config", "load_config", "to_toml"]
+
+TOLERATED = 1.6
+"""Times the pixels that images are reduced to: those with no more than this do as well as they are."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,8 @@ class InitializationConfig(Settings, section="initialization"):
     # what makes a point of the start a good one; configs/paper.toml goes by the parallax
     criterion: str = setting("uncertainty", choices=("uncertainty", "parallax"))
     min_matches: int = setting(100, low=1)  # fewer than this with the reference frame: a new reference
-    min_motion_px: float = setting(
-        2.0, low=0, grows=True
-    )  # of the matches, in the median; less is a standstill
+    # of the matches, in the median; less is a standstill
+    min_motion_px: float = setting(2.0, low=0, grows=True)
     still_px: float = setting(1.0, above=0, grows=True)  # matches that moved less stay in place
     min_points: int = setting(60, low=1)
     threshold_px: float = setting(1.5, above=0, grows=True)
@@ -112,14 +111,12 @@ class StillnessConfig(Settings, section="stillness"):
     """When pixels stay in place that should have moved with the scene, as logos and dirt on the lens do."""
 
     enabled: bool = True
-    min_motion_px: float = setting(
-        4.0, above=0, grows=True
-    )  # a point of the scene would have moved by at least this
+    # a point of the scene would have moved by at least this
+    min_motion_px: float = setting(4.0, above=0, grows=True)
     min_moving_share: float = setting(0.5, low=0, high=1)  # of the keypoints, before two frames are compared
     radius_px: float = setting(1.5, above=0, grows=True)  # within which a keypoint has stayed
-    cell_px: float = setting(
-        4.0, above=0, grows=True
-    )  # of the evidence: a corner wanders a little under noise
+    # of the cells that evidence is kept of: a corner wanders a little under noise
+    cell_px: float = setting(4.0, above=0, grows=True)
     max_distance_share: float = setting(0.6, above=0, high=1)  # of the distance at which descriptors match
     min_keypoints: int = setting(8, low=1)  # fewer that stay are chance
     min_evidence: int = setting(2, low=1)  # comparisons in which a pixel stayed

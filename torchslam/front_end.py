@@ -33,7 +33,7 @@ def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extra
         wanted = None if frame.mask is None else frame.mask.to(device)
         height, width = image.shape[-2:]
         factor = settings.reduction((width, height))
-        size = round(height / factor), round(width / factor)
+        size = max(1, round(height / factor)), max(1, round(width / factor))
         features = module(*_reduced(image, wanted, size))
         if factor > 1:
             features = _enlarged(features, (width / size[1], height / size[0]), factor)
