@@ -5,20 +5,33 @@ A configuration is valid however it was built: see `torchslam.settings`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchslam.settings import Settings, choices, merged, setting, to_toml
+from torchslam.settings import Settings, choices, enlarged, merged, setting, to_toml
 
 __all__ = ["CHOICES", "Config", "load_config", "to_toml"]
+
+TOLERATED = 1.6
+"""Times the pixels that images are reduced to: those with no more than this do as well as they are."""
 
 
 @dataclass(frozen=True)
 class FeaturesConfig(Settings, section="features"):
     kind: str = setting("orb", choices=("orb", "opencv-orb", "simulated", "xfeat", "aliked"))
     num_keypoints: int = setting(1000, low=1)
+    # that much larger images are reduced to before anything is looked for; 0: all are taken as they are
+    image_pixels: int = setting(640 * 480, low=0)
     weights: str = ""  # file with the weights of a learned front end
+
+    def reduction(self, size: tuple[int, int]) -> float:
+        """By what factor, in width and in height, images (width, height) are reduced: at least 1."""
+        pixels = size[0] * size[1]
+        if self.image_pixels == 0 or pixels <= TOLERATED * self.image_pixels:
+            return 1.0
+        return math.sqrt(pixels / self.image_pixels)
 
 
 @dataclass(frozen=True)
@@ -56,9 +69,11 @@ class InitializationConfig(Settings, section="initialization"):
     # what makes a point of the start a good one; configs/paper.toml goes by the parallax
     criterion: str = setting("uncertainty", choices=("uncertainty", "parallax"))
     min_matches: int = setting(100, low=1)  # fewer than this with the reference frame: a new reference
-    min_motion_px: float = setting(2.0, low=0)  # of the matches, in the median; less is a standstill
+    # of the matches, in the median; less is a standstill
+    min_motion_px: float = setting(2.0, low=0, grows=True)
+    still_px: float = setting(1.0, above=0, grows=True)  # matches that moved less stay in place
     min_points: int = setting(60, low=1)
-    threshold_px: float = setting(1.5, above=0)
+    threshold_px: float = setting(1.5, above=0, grows=True)
     # uncertainty: a point counts when its relative depth is known better than this
     max_depth_std: float = setting(0.1, above=0)
     min_good_share: float = setting(0.15, low=0, high=1)  # ... and this share of the matches must count
@@ -82,7 +97,7 @@ class TrackingConfig(Settings, section="tracking"):
     radius_px: float = setting(12.0, above=0)  # at the finest pyramid level
     wide_radius_factor: float = setting(3.0, low=1)
     refine_radius_px: float = setting(5.0, above=0)
-    threshold_px: float = setting(3.0, above=0)  # of the PnP RANSAC
+    threshold_px: float = setting(3.0, above=0, grows=True)  # of the PnP RANSAC
     min_matches: int = setting(20, low=1)
     min_inliers: int = setting(20, low=1)
     local_keyframes: int = setting(12, low=1)
@@ -96,9 +111,12 @@ class StillnessConfig(Settings, section="stillness"):
     """When pixels stay in place that should have moved with the scene, as logos and dirt on the lens do."""
 
     enabled: bool = True
-    min_motion_px: float = setting(4.0, above=0)  # a point of the scene would have moved by at least this
+    # a point of the scene would have moved by at least this
+    min_motion_px: float = setting(4.0, above=0, grows=True)
     min_moving_share: float = setting(0.5, low=0, high=1)  # of the keypoints, before two frames are compared
-    radius_px: float = setting(1.5, above=0)  # within which a keypoint has stayed
+    radius_px: float = setting(1.5, above=0, grows=True)  # within which a keypoint has stayed
+    # of the cells that evidence is kept of: a corner wanders a little under noise
+    cell_px: float = setting(4.0, above=0, grows=True)
     max_distance_share: float = setting(0.6, above=0, high=1)  # of the distance at which descriptors match
     min_keypoints: int = setting(8, low=1)  # fewer that stay are chance
     min_evidence: int = setting(2, low=1)  # comparisons in which a pixel stayed
@@ -111,7 +129,9 @@ class IndependentMotionConfig(Settings, section="independent_motion"):
     enabled: bool = True
     frames: int = setting(5, low=1)  # from one comparison to the next
     min_error_px: float = setting(4.0, above=0)  # by which a match misses where a point of the scene can be
-    threshold_px: float = setting(2.0, above=0)  # of the motion that they share
+    threshold_px: float = setting(2.0, above=0, grows=True)  # of the motion that they share
+    # how far a keypoint is looked for from where the last motion took it
+    search_px: float = setting(16.0, above=0, grows=True)
     min_matches: int = setting(20, low=5)
     min_share: float = setting(0.5, low=0, high=1)  # of the matches that miss the scene
     max_share: float = setting(2.0, above=0)  # of the image, as a multiple of what agrees with the map
@@ -212,6 +232,13 @@ class Config(Settings):
     mapping: MappingConfig = field(default_factory=MappingConfig)
     loops: LoopsConfig = field(default_factory=LoopsConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
+
+    def for_size(self, size: tuple[int, int]) -> Config:
+        """The configuration for images (width, height): what is said in pixels of reduced ones grows with them.
+
+        What is said in units of a keypoint's scale does not: the scale has grown already.
+        """
+        return enlarged(self, self.features.reduction(size))
 
 
 CHOICES = choices(Config)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.errors import ConfigError, FrameError
@@ -18,18 +21,42 @@ Extractor = Callable[[Frame], Features]
 
 
 def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extractor:
-    """The front end that reads images, on a device; under a frame's mask it finds nothing."""
+    """The front end that reads images, on a device; under a frame's mask it finds nothing.
+
+    Much larger images than configured it reduces first, and its keypoints and their scales grow back.
+    """
     settings = config.features
     module = extractor(settings.kind, settings.num_keypoints, settings.weights or None).to(device)
 
     def extract(frame: Frame) -> Features:
-        if frame.mask is None:
-            return module(frame.image.to(device))
-        wanted = frame.mask.to(device)
+        image = frame.image.to(device)
+        wanted = None if frame.mask is None else frame.mask.to(device)
+        height, width = image.shape[-2:]
+        factor = settings.reduction((width, height))
+        size = max(1, round(height / factor)), max(1, round(width / factor))
+        features = module(*_reduced(image, wanted, size))
+        if factor > 1:
+            features = _enlarged(features, (width / size[1], height / size[0]), factor)
         # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
-        return only_where(module(frame.image.to(device), wanted), wanted)
+        return features if wanted is None else only_where(features, wanted)
 
     return extract
+
+
+def _reduced(image: Tensor, wanted: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
+    """An image and the mask of it at (height, width)."""
+    if image.shape[-2:] == size:
+        return image, wanted
+    if wanted is not None:
+        wanted = F.interpolate(wanted.float(), size, mode="nearest-exact") > 0
+    # Bilinear reduction blurs: the corners of a reduced image would be others than those of a small one.
+    return F.interpolate(image, size, mode="bicubic", antialias=True).clamp(0, 1), wanted
+
+
+def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> Features:
+    """Features in pixels of an image that is wider and higher by a ratio."""
+    keypoints = (features.keypoints + 0.5) * features.keypoints.new_tensor(ratio) - 0.5
+    return replace(features, keypoints=keypoints, scales=factor * features.scales)
 
 
 def check_size(frame: Frame, camera: Camera) -> None:

@@ -57,9 +57,13 @@ def setting(
     high: float = math.inf,
     above: float = -math.inf,
     choices: tuple[str, ...] = (),
+    grows: bool = False,
 ) -> Value:
-    """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number."""
-    return field(default=default, metadata={"allowed": Allowed(low, high, above, choices)})
+    """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number.
+
+    grows: whether it is a length in the image, for `enlarged`
+    """
+    return field(default=default, metadata={"allowed": Allowed(low, high, above, choices), "grows": grows})
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,17 @@ def merged(config: Section, path: Path | str | None = None, overrides: Iterable[
     for override in overrides:
         config = _merge(config, _parse_override(override), f"--set {override}", type(config))
     return config
+
+
+def enlarged(config: Section, factor: float) -> Section:
+    """The configuration with every setting that `grows` multiplied by a factor."""
+    changes: dict[str, Any] = {}
+    for name in _declared(type(config)):
+        value = getattr(config, name)
+        if isinstance(value, Settings):
+            changes[name] = enlarged(value, factor)
+    changes |= {f.name: factor * getattr(config, f.name) for f in fields(config) if f.metadata.get("grows")}
+    return replace(config, **changes)
 
 
 def to_toml(config: Settings) -> str:

@@ -65,9 +65,10 @@ class SLAM:
             extractor = image_extractor(self.config, self.camera.params.device)
         self._image_extractor = extractor
         self.clock = Stopwatch()
-        self.tracker = Tracker(self.camera, self.config)
-        self.relocalizer = Relocalizer(self.tracker, self.config)
-        self.mapper = Mapper(self.camera, self.config, self.clock)
+        scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
+        self.tracker = Tracker(self.camera, scaled)
+        self.relocalizer = Relocalizer(self.tracker, scaled)
+        self.mapper = Mapper(self.camera, scaled, self.clock)
         self.founder = Founder(self.tracker, self.mapper, self.config.initialization.min_explained)
         self.reset()
 
@@ -111,8 +112,8 @@ class SLAM:
         self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
         self.tracker.counts = session.mapping
         self.last_frame = last_frame
-        self.memory = Memory(self.camera, self.config, self.worlds)
-        self.foreign = Foreign(self.camera, self.config)
+        self.memory = Memory(self.camera, self.scaled, self.worlds)
+        self.foreign = Foreign(self.camera, self.scaled)
         self.waiting = Waiting(self.config.initialization.max_waiting)
         self._seek()
         self.world: World | None = world  # the one that is followed
@@ -285,7 +286,7 @@ class SLAM:
         """Nothing is followed any more."""
         self.world = None
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
-        self.initializer = Initializer(self.camera, self.config)
+        self.initializer = Initializer(self.camera, self.scaled)
         self.probation = Probation(self.config)
         self.foreign.forget_last()
         self.lost_for = 0
@@ -349,7 +350,7 @@ class SLAM:
     def _replace(self, youth: Youth) -> bool:
         """Begin anew with the first and the last frame of a young world, if these contradict it."""
         with self.clock("initialization"):
-            start = youth.rival(self.camera, self.config)
+            start = youth.rival(self.camera, self.scaled)
             replaced = start is not None and not self._begin(start, youth.views)
         if replaced:
             self.foreign.forget_last()  # its pose was one of the map before

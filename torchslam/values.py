@@ -39,7 +39,8 @@ class Features:
 
     keypoints:   (B, N, 2) pixels (x, y) of the full-resolution image; (0, 0) is the centre of the top left pixel
     scores:      (B, N) response of the detector, higher is better
-    scales:      (B, N) size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0)
+    scales:      (B, N) size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0,
+                 unless the image was reduced before)
     angles:      (B, N) radians, clockwise in the image (from x towards y)
     descriptors: (B, N, 32) uint8, 256 bits packed least significant first; or (B, N, D) floats of unit length
     mask:        (B, N) bool, True where the row is a keypoint

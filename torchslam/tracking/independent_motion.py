@@ -21,7 +21,6 @@ from torchslam.tracking.stillness import distances_to_segments
 from torchslam.values import Tracked, View
 
 _DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
-_SEARCH_PX = 16.0  # how far a keypoint is looked for from where the last motion took it
 _NEIGHBOURS = 3  # of a keypoint that say whether it belongs
 _PATIENCE, _LESS = (
     10,
@@ -120,7 +119,7 @@ class IndependentMotion:
         matches = match_projected(
             mover.descriptors[None],
             (mover.pixels + mover.motion)[None],
-            _SEARCH_PX,
+            self.settings.search_px,
             view.features,
             scales=mover.scales[None],
             max_distance=max_distance(view.descriptors, self.matching),

@@ -23,7 +23,7 @@ from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.tracking.correspondences import match_views
 from torchslam.values import Start, View
 
-STILL_PX = 1.0  # matches that moved less stay in place
+AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
 STILL_SHARE = 0.1  # of the matches, from which on it is asked whether they belong to the scene
 GONE_SHARE = 0.35  # of the keypoints that match where the camera stands still, at least
 EXPLAINED_SHARE = 0.5  # of them that the motion of the others must explain
@@ -69,7 +69,7 @@ class Initializer:
                 return None, "some of the image stays in place, and it is not clear what moves"
             return self._relate_moving(view, first[scene], second[scene], scene_only=False)
         if len(first) < GONE_SHARE * int(self.reference.mask.sum()):
-            self.still = view.keypoints[second[motion < STILL_PX]]
+            self.still = view.keypoints[second[motion < settings.still_px]]
             self.views = [view]
             return None, "what still matches stays in place, the rest has gone: took a new reference frame"
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
@@ -111,7 +111,7 @@ class Initializer:
         not behind the camera. None where nobody can tell.
         """
         everyone = torch.ones_like(motion, dtype=torch.bool)
-        still = motion < STILL_PX
+        still = motion < self.config.initialization.still_px
         if (
             int(still.sum()) < STILL_SHARE * len(motion)
             or int((~still).sum()) < self.config.initialization.min_matches
@@ -173,7 +173,7 @@ def is_good(seen: Triangulation, scales: Tensor, camera: Camera, settings: Initi
     z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
     With "parallax": when the angle is large enough.
     """
-    is_close = torch.maximum(seen.errors_1, seen.errors_2) < 2 * settings.threshold_px * scales
+    is_close = torch.maximum(seen.errors_1, seen.errors_2) < AWAY * scales
     if settings.criterion == "parallax":
         return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
     relative_std = scales / (camera.focal * seen.angles.clamp(min=1e-9))

@@ -17,7 +17,6 @@ from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.tracking.correspondences import max_distance
 from torchslam.values import View
 
-_CELL = 4  # pixels: a corner wanders a little under noise
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
 
 
@@ -38,7 +37,7 @@ class Stillness:
         self.settings = settings
         self.matching = matching
         width, height = camera.size
-        shape = (height // _CELL + 1, width // _CELL + 1)
+        shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
         self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
         self._last: _Look | None = None
 
@@ -118,7 +117,7 @@ class Stillness:
         self.evidence += hit
 
     def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        cells = torch.div(pixels, _CELL, rounding_mode="floor").long()
+        cells = torch.div(pixels, self.settings.cell_px, rounding_mode="floor").long()
         rows, columns = self.evidence.shape
         return cells[:, 1].clamp(0, rows - 1), cells[:, 0].clamp(0, columns - 1)
 
