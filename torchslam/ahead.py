@@ -112,8 +112,9 @@ class Worker:
     def __init__(self, task: bytes) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_work, args=(theirs, task), name="torchslam ahead", daemon=True
+        self._process = context.Process(target=_work, args=(theirs,), name="torchslam ahead", daemon=True)
+        self._task = (
+            task  # no argument: `start` would wait for ever for a process that dies before it reads it
         )
         self._is_ready = self._has_ended = False
         with _without_interrupts():
@@ -125,6 +126,7 @@ class Worker:
         try:
             if not self._is_ready and not self._has_ended and self._ours.poll():
                 self._is_ready = self._ours.recv_bytes() == b""
+                self._ours.send_bytes(self._task)
             if self._is_ready:
                 self._ours.send_bytes(pickle.dumps(index))
         except (EOFError, OSError):
@@ -170,13 +172,13 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(connection: Connection, task: bytes) -> None:
-    """A process: say that there is somebody, then answer until the one that asks has gone."""
-    sequence, camera, config, threads = pickle.loads(task)
-    torch.set_num_threads(threads)
-    extract = image_extractor(config)
+def _work(connection: Connection) -> None:
+    """A process: say that there is somebody, take the task, then answer until the one that asks has gone."""
     try:
         connection.send_bytes(b"")
+        sequence, camera, config, threads = pickle.loads(connection.recv_bytes())
+        torch.set_num_threads(threads)
+        extract = image_extractor(config)
         while True:
             index = pickle.loads(connection.recv_bytes())
             try:

@@ -159,7 +159,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                 checkpoints.offer(at_once=stopping.is_wanted)
                 progress.update(result)
 
-            with _frames(sequence, slam, plan.processes, so_far.next) as frames:
+            with frames_of(sequence, slam, plan.processes, so_far.next) as frames:
                 finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting, frames)
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
@@ -174,7 +174,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     return DONE
 
 
-def _frames(
+def frames_of(
     sequence: Sequence, slam: SLAM, processes: int | None, start: int
 ) -> AbstractContextManager[Frames]:
     """The frames of a sequence from `start` on, read ahead where they can be, and if so wanted or worth it."""
