@@ -14,12 +14,13 @@ from pathlib import Path
 
 from experiments.benchmarks.problems import PEERS
 from experiments.common import DATA_DIR, table, write_between
+from torchslam.ahead import WORTH
 from torchslam.data import open_sequence
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 
-SYSTEMS = ("ours", "ours, one process", "ORB-SLAM3")
+OURS, ALONE, PEER = "ours", "ours, one process", "ORB-SLAM3"
 HEADER = ["sequence", "system", "ms, median", "ms, 95 %", "frames/s", "CPU ms a frame", "ATE, m", "posed"]
 
 
@@ -71,7 +72,7 @@ def main() -> None:
             continue
         runs: dict[str, list[Figures]] = {}
         for _ in range(arguments.rounds):
-            for system in SYSTEMS[: None if peer else -1]:
+            for system in systems(recording, peer is not None):
                 runs.setdefault(system, []).append(measured(system, recording, peer))
                 print(recording.name, system, runs[system][-1], flush=True)
         rows += [row(recording, system, figures) for system, figures in runs.items()]
@@ -79,6 +80,12 @@ def main() -> None:
     print(text)
     if not arguments.no_readme:
         write_between(Path(__file__).parent / "README.md", text)
+
+
+def systems(recording: Recording, with_peer: bool) -> list[str]:
+    """Which ones run a recording: of a short one, ours has one process anyway."""
+    ours = [OURS, ALONE] if recording.frames >= WORTH else [OURS]
+    return [*ours, PEER] if with_peer else ours
 
 
 def find_peer() -> list[str] | None:
@@ -97,18 +104,18 @@ def measured(system: str, recording: Recording, peer: list[str] | None) -> Figur
     source = DATA_DIR / recording.name
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        if system == "ORB-SLAM3":
+        if system == PEER:
             line = [*(peer or []), str(source), str(folder), "--realtime", "--count", str(recording.frames)]
             line += ["--fps", str(recording.rate), "--features", str(recording.features)]
         else:
             line = [sys.executable, "-m", "experiments.benchmarks.slam.ours", str(source)]
             line += [str(folder / "trajectory.txt"), "--limit", str(recording.frames)]
-            line += ["--processes", "1"] if "one" in system else []
+            line += ["--processes", "1"] if system == ALONE else []
         said, seconds = with_cpu_time(line)
         figures = json.loads(said.strip().split("\n")[-1])
         ate, posed = accuracy(folder / "trajectory.txt", source, recording.frames)
     frames = figures["frames"]
-    if system == "ORB-SLAM3":
+    if system == PEER:
         rate, start_up = 1e3 / figures["ms_mean"], figures["vocab_load_s"]
     else:
         rate, start_up = figures["frames_per_s"], figures["start_up_s"]
