@@ -2,6 +2,7 @@
 #   VENV=path      use (or create) another virtual environment than .venv
 #   PYTHON=python  the interpreter that creates it
 #   SAMPLE=200 SEED=0  how many changes `make mutation` tries, and which; SAMPLE=0 tries all: hours
+#   RESULTS=path   the folder of results that `make profile` reads
 #   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
 
 PYTHON ?= python3
@@ -9,6 +10,7 @@ VENV ?= .venv
 PYTEST_ARGS ?=
 SAMPLE ?= 200
 SEED ?= 0
+RESULTS ?= results/demo
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --constraint constraints.txt
 
@@ -18,7 +20,7 @@ INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
 INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 
-.PHONY: help demo test mutation lint types format benchmarks clean distclean
+.PHONY: help demo test mutation lint types format benchmarks profile clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -49,6 +51,9 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 	$(BIN)/python -m experiments.benchmarks.geometry
 	$(BIN)/python -m experiments.benchmarks.solvers
 	$(BIN)/python -m experiments.benchmarks.pose_graph
+
+profile: $(INSTALLED)  ## milliseconds by stage of the run in RESULTS (results/demo)
+	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)
 
 clean:  ## remove results and caches, keep the environment
 	rm -rf results build dist mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis

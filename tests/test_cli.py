@@ -6,9 +6,12 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -16,7 +19,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchslam.cli import main
+import torchslam
+from torchslam.cli import COMMANDS, main
 from torchslam.config import load_config
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
@@ -329,12 +333,51 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
     assert f"usage: torchslam {command}" in capsys.readouterr().out
 
 
+def test_the_list_of_commands_says_what_each_of_them_says() -> None:
+    for home, summary in COMMANDS.values():
+        first = (import_module(f"torchslam.commands.{home}").__doc__ or "").split("\n")[0].rstrip(".")
+        assert summary == first[0].lower() + first[1:]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "absent"),
+    [
+        (["--help"], {"torch", "numpy", "cv2", "kornia"}),
+        (["--version"], {"torch", "numpy", "cv2", "kornia"}),
+        (["fly"], {"torch", "numpy", "cv2", "kornia"}),
+        (["info", "synthetic:room?frames=2&blank=1"], {"kornia", "matplotlib", "torchslam.slam"}),
+    ],
+)
+def test_nothing_is_imported_before_it_is_needed(arguments: list[str], absent: set[str]) -> None:
+    script = (
+        "import atexit, sys; atexit.register(lambda: print('imported:', *sys.modules)); "
+        "from torchslam.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False
+    )
+    imported = done.stdout.partition("imported: ")[2].split()
+    assert "torchslam.cli" in imported, done.stderr
+    assert not absent & set(imported)
+
+
+def test_public_names_are_imported_when_they_are_asked_for() -> None:
+    names = [name for home in torchslam.HOMES.values() for name in home.split()]
+    assert sorted(names) == sorted(torchslam.__all__)
+    for name in names:
+        assert getattr(torchslam, name).__name__ == name
+    assert set(names) < set(dir(torchslam))
+    with pytest.raises(AttributeError, match="no attribute 'teleport'"):
+        torchslam.teleport  # noqa: B018
+
+
 def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (
         ["run", ROOM, "-o", "x", "--checkpoint", "-1"],
         ["run", ROOM, "-o", "x", "--resume", "--overwrite"],
         ["run", ROOM],
         ["run", ROOM, "-o", "x", "--features", "sift"],
+        ["run", ROOM, "-o", "x", "--processes", "0"],
         ["export", "x"],
         ["export", "x", "--to", "obj"],
         ["fly"],

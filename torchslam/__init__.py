@@ -5,18 +5,30 @@ run = torchslam.SLAM(sequence.camera).run(sequence)
 torchslam.evaluate(run.trajectory, sequence.groundtruth).ate_m
 """
 
-from torchslam.config import Config, load_config
-from torchslam.data import open_sequence
-from torchslam.errors import TorchslamError
-from torchslam.evaluation import evaluate
-from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
-from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, triangulate, umeyama
-from torchslam.learning.clip import ClipPoses, ClipSLAM, clip_loss
-from torchslam.run import Run
-from torchslam.slam import SLAM
-from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
-from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
-from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchslam.config import Config, load_config
+    from torchslam.data import open_sequence
+    from torchslam.errors import TorchslamError
+    from torchslam.evaluation import evaluate
+    from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
+    from torchslam.geometry import (
+        Camera,
+        estimate_absolute_pose,
+        estimate_relative_pose,
+        triangulate,
+        umeyama,
+    )
+    from torchslam.learning.clip import ClipPoses, ClipSLAM, clip_loss
+    from torchslam.run import Run
+    from torchslam.slam import SLAM
+    from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
+    from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
+    from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
 
 __version__ = "0.1.0"
 
@@ -55,3 +67,31 @@ __all__ = [
     "triangulate",
     "umeyama",
 ]
+
+HOMES = {
+    "torchslam.config": "Config load_config",
+    "torchslam.data": "open_sequence",
+    "torchslam.errors": "TorchslamError",
+    "torchslam.evaluation": "evaluate",
+    "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_projected",
+    "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
+    "torchslam.learning.clip": "ClipPoses ClipSLAM clip_loss",
+    "torchslam.run": "Run",
+    "torchslam.slam": "SLAM",
+    "torchslam.solvers": "BundleProblem bundle_adjust refine_pose",
+    "torchslam.solvers.graph": "GraphSolution ObservationGraph solve",
+    "torchslam.values": "Features Frame Matches State StepResult Trajectory",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first asked for: torch alone takes a second or two."""
+    for home, names in HOMES.items():
+        if name in names.split():
+            value = globals()[name] = getattr(import_module(home), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

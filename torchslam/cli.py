@@ -10,30 +10,41 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-
-import torch
+from importlib import import_module
 
 from torchslam import __version__
-from torchslam.commands import demo, download, evaluate, export, info, plot, run
 from torchslam.errors import TorchslamError
 
 ERROR = 2
 INTERRUPTED = 130
 
+# Module, and the first line of its docstring: only that of the command at hand is imported.
 COMMANDS = {
-    "run": run,
-    "demo": demo,
-    "eval": evaluate,
-    "plot": plot,
-    "export": export,
-    "info": info,
-    "download": download,
+    "run": ("run", "run SLAM on a sequence and write trajectory, map, figures and pictures"),
+    "demo": (
+        "demo",
+        "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",
+    ),
+    "eval": ("evaluate", "compare two trajectory files in TUM format: absolute and relative errors"),
+    "plot": ("plot", "draw the pictures of a run again, from the files in its folder of results"),
+    "export": (
+        "export",
+        "give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
+    ),
+    "info": ("info", "say what would be read from a sequence: frames, size, rate, calibration, ground truth"),
+    "download": (
+        "download",
+        "fetch a public sequence: with a progress bar, taking up a transfer that broke off",
+    ),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
-    options = build_parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = build_parser(next(iter(arguments), "")).parse_args(arguments)
+    import torch  # not before the arguments are known to be right
+
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)  # a frame's tensors are small: threads cost more than they bring
     try:
@@ -46,25 +57,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; each command's module adds its own arguments."""
+def build_parser(chosen: str) -> argparse.ArgumentParser:
+    """The parser of all commands, with the arguments of the chosen one, which its module adds."""
     parser = argparse.ArgumentParser(
         prog="torchslam",
         description="Monocular visual SLAM: images in, the camera's trajectory and a sparse map out.",
     )
     parser.add_argument("--version", action="version", version=f"torchslam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, module in COMMANDS.items():
-        description = (module.__doc__ or "").strip()
-        summary = description.split("\n")[0].rstrip(".")
+    for name, (home, summary) in COMMANDS.items():
         command = commands.add_parser(
-            name,
-            help=summary[0].lower() + summary[1:],
-            description=description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        module.add_arguments(command)
-        command.set_defaults(execute=module.execute)
+        if name == chosen:
+            module = import_module(f"torchslam.commands.{home}")
+            command.description = (module.__doc__ or "").strip()
+            module.add_arguments(command)
+            command.set_defaults(execute=module.execute)
     return parser
 
 

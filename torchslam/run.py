@@ -43,6 +43,12 @@ class System(Protocol):
     def conclude(self) -> None: ...
 
 
+class Frames(Protocol):
+    """Where a run takes its frames from, each once, in the order of its index: a sequence, or `ahead.Ahead`."""
+
+    def __getitem__(self, index: int) -> Frame: ...
+
+
 @dataclass(frozen=True)
 class Run:
     """The result of a run.
@@ -153,6 +159,7 @@ def run_sequence(
     progress: Callable[[StepResult], None] | None = None,
     so_far: Progressed | None = None,
     adjusting: Progress | None = None,
+    frames: Frames | None = None,
 ) -> Run:
     """Feed every frame of a sequence to the system.
 
@@ -161,6 +168,7 @@ def run_sequence(
 
     so_far:    where to go on, and what is kept up to date after every frame
     adjusting: told before each iteration of the final adjustments its number and how many there are at most
+    frames:    those of the sequence, from elsewhere than from itself
 
     Raises TorchslamError where the system has processed frames that `so_far` does not know of.
     """
@@ -172,11 +180,12 @@ def run_sequence(
     so_far = Progressed() if so_far is None else so_far
     if slam.extractor is None:
         slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
+    frames = sequence if frames is None else frames
     interrupted = False
     try:
         for index in sequence.indices(so_far.next):
             try:
-                so_far.results.append(slam.step(sequence[index]))
+                so_far.results.append(slam.step(frames[index]))
             except EndOfSequence:
                 break
             except FrameError as error:

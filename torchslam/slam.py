@@ -173,10 +173,11 @@ class SLAM:
                 "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
             )
         check_order(frame, self.last_frame)
-        if self._image_extractor is not None:
+        if self._image_extractor is not None and frame.features is None:
             check_size(frame, self.camera)
         with self.clock("features"):
-            view = View.of(frame, self.extractor(frame), self.camera.params)
+            features = self.extractor(frame) if frame.features is None else frame.features
+            view = View.of(frame, features, self.camera.params)
             self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)

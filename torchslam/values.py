@@ -23,6 +23,7 @@ class Frame:
     T_cw_groundtruth: (4, 4) float64 world to camera, where the sequence knows it. Read only by simulated features,
                by scale from ground truth and by evaluation.
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
+    features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
     """
 
     index: int
@@ -31,6 +32,7 @@ class Frame:
     name: str = ""
     T_cw_groundtruth: Tensor | None = None
     mask: Tensor | None = None
+    features: Features | None = None
 
 
 @dataclass(frozen=True)

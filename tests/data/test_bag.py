@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,8 @@ def test_recordings(tmp_path: Path, kind: str) -> None:
     assert sequence.calibrated is Calibrated.GIVEN
     assert sequence.camera.params.tolist() == [60, 61, 32.5, 24.5, *BROWN]
     for index in (2, 0, 1):
-        assert torch.equal(sequence.image(index)[0, 0] * 255, torch.from_numpy(pictures()[index]).float())
+        for each in (sequence, pickle.loads(pickle.dumps(sequence))):
+            assert torch.equal(each.image(index)[0, 0] * 255, torch.from_numpy(pictures()[index]).float())
     assert float(open_sequence(path, "f=0.8w").camera.fx) == pytest.approx(51.2)
 
 

@@ -111,6 +111,16 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_processes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--processes",
+        type=_positive,
+        metavar="N",
+        help="with 2 or more, features are found ahead by others than the one that tracks: the same results, sooner "
+        "(default: 2 for long recordings where there are two processors, else 1)",
+    )
+
+
 def _device(text: str) -> torch.device:
     try:
         device = torch.device(text)

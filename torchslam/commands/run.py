@@ -11,12 +11,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 
+from torchslam.ahead import WORTH, Ahead, processors, why_alone
 from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
 from torchslam.commands.camera import find_camera, judged
@@ -35,7 +37,7 @@ from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
-from torchslam.run import Progressed, Run, run_sequence
+from torchslam.run import Frames, Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
 
@@ -55,6 +57,7 @@ class Plan:
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     refine:     improve the given camera by the images first; distortion: its distortion, too
+    processes:  how many; None: what is best
     """
 
     source: str
@@ -67,6 +70,7 @@ class Plan:
     checkpoint: int = CHECKPOINT_EVERY
     refine: bool = False
     distortion: bool = False
+    processes: int | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,6 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
     )
     arguments.add_device(parser)
+    arguments.add_processes(parser)
     arguments.add_config(parser)
 
 
@@ -126,6 +131,7 @@ def execute(options: argparse.Namespace) -> int:
         checkpoint=options.checkpoint,
         refine=options.refine_camera or options.refine_distortion,
         distortion=options.refine_distortion,
+        processes=options.processes,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -153,7 +159,8 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                 checkpoints.offer(at_once=stopping.is_wanted)
                 progress.update(result)
 
-            finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
+            with frames_of(sequence, slam, plan.processes, so_far.next) as frames:
+                finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting, frames)
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
     print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
@@ -165,6 +172,21 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
         print(f"torchslam: {finished.failure}", file=sys.stderr)
         return NO_MAP
     return DONE
+
+
+def frames_of(
+    sequence: Sequence, slam: SLAM, processes: int | None, start: int
+) -> AbstractContextManager[Frames]:
+    """The frames of a sequence from `start` on, read ahead where they can be, and if so wanted or worth it."""
+    alone = why_alone(sequence, slam.config, slam.camera.params.device)
+    if processes is None:
+        is_worth_it = not alone and len(sequence) - start >= WORTH
+        processes = min(2, processors()) if is_worth_it else 1
+    elif processes > 1 and alone:
+        print(f"torchslam: one process: {alone}", file=sys.stderr)
+    if alone or processes == 1:
+        return nullcontext(sequence)
+    return Ahead(sequence, slam.camera, slam.config, slam.clock, processes - 1)
 
 
 def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:

@@ -100,6 +100,20 @@ class BagSequence(Sequence):
             notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {
+            "_reader": None,
+            "_stream": None,
+            "_connection": self._connection.topic,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Raises SequenceError where the recording has gone."""
+        self.__dict__.update(state)
+        self._reader = _open_reader(self._path)
+        self._connection = _connection(self._reader, state["_connection"])
+        self._rewind()
+
     def image(self, index: int) -> Tensor:
         try:
             grey = self._read(self._messages[index])
@@ -171,19 +185,31 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequen
 
     Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
     """
+    name, _, query = path.partition("?")
+    wanted = dict(parse_qsl(query)).get("topic")
+    source = Path(name)
+    reader = _open_reader(source)
+    return BagSequence(source, reader, _find_topic(reader, name, wanted), camera)
+
+
+def _open_reader(path: Path) -> AnyReader:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
-    name, _, query = path.partition("?")
-    wanted = dict(parse_qsl(query)).get("topic")
-    source = Path(name)
-    with _errors(name):
+    with _errors(str(path)):
         # A single file of ROS 2 is in the folder of its recording, or a recording of its own.
-        reader = AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    return BagSequence(source, reader, _find_topic(reader, name, wanted), camera)
+    return reader
+
+
+def _connection(reader: AnyReader, topic: str) -> Connection:
+    """The one that a topic's images come by."""
+    return next(
+        each for each in reader.connections if each.topic == topic and each.msgtype in (IMAGE, COMPRESSED)
+    )
 
 
 def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
@@ -198,7 +224,7 @@ def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
     if len(topics) > 1:
         proposals = " or ".join(f"'{path}?topic={topic}'" for topic in topics[:6])
         raise SequenceError(f"{path}: {len(topics)} topics of images; which one? Give {proposals}")
-    connection = next(each for each in images if each.topic == topics[0])
+    connection = _connection(reader, topics[0])
     beside = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
     infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == beside]
     calibration = None

@@ -6,6 +6,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from enum import Enum
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,6 +78,10 @@ class Sequence(ABC):
         if groundtruth is not None:
             T_wc, self._has_pose = interpolate_poses(groundtruth, timestamps, GROUNDTRUTH_TOLERANCE)
             self._T_cw = se3_inverse(T_wc)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process reads the same frames from, while this one keeps what `holder` holds."""
+        return self.__dict__ | {"holder": None}
 
     @property
     def camera(self) -> Camera:

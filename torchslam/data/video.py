@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,9 +33,7 @@ class VideoSequence(Sequence):
     def __init__(self, path: Path, camera: GivenCamera | None) -> None:
         """Raises SequenceError for a file that holds no video, CalibrationError for a camera that does not fit."""
         self._path = path
-        self._capture = cv2.VideoCapture(str(path))
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        self._position = 0  # of the decoder, among all frames that can be decoded
+        self._rewind()
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         times, notes = self._read_times(), []
         rate = self._capture.get(cv2.CAP_PROP_FPS)
@@ -63,6 +62,13 @@ class VideoSequence(Sequence):
             notes=notes,
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_capture": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._rewind()
+
     def image(self, index: int) -> Tensor:
         return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
 
@@ -71,6 +77,11 @@ class VideoSequence(Sequence):
 
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
+
+    def _rewind(self) -> None:
+        self._capture = cv2.VideoCapture(str(self._path))
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        self._position = 0  # of the decoder, among all frames that can be decoded
 
     def _read_times(self) -> list[float]:
         """Seconds of every frame that can be decoded, as the container has them."""
@@ -91,10 +102,7 @@ class VideoSequence(Sequence):
     def _read(self, frame: int) -> np.ndarray | None:
         """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion."""
         if frame < self._position:
-            self._capture.release()
-            self._capture.open(str(self._path))
-            self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-            self._position = 0
+            self._rewind()
         while self._position < frame:
             if not self._capture.grab():
                 return None

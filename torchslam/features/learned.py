@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-import kornia
 import torch
 import torch.nn.functional as F
 from safetensors import SafetensorError
@@ -37,6 +36,8 @@ class XFeat(nn.Module):
     """
 
     def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
+        import kornia  # here: whoever has no use for the networks need not wait for it
+
         super().__init__()
         self.num_keypoints = num_keypoints
         self.threshold = threshold
@@ -52,6 +53,8 @@ class XFeat(nn.Module):
 
         Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
         """
+        from kornia.geometry.subpix import nms2d
+
         check_images(images, wanted)
         height, width = images.shape[-2:]
         # The network halves its input five times.
@@ -61,7 +64,7 @@ class XFeat(nn.Module):
         # 64 places of a cell of 8x8 pixels, row by row, and one for "no keypoint here".
         heat = F.pixel_shuffle(logits.softmax(1)[:, :64], 8)
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
-        peaks = kornia.geometry.subpix.nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
+        peaks = nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
         if wanted is not None:
             peaks &= F.interpolate(wanted.float(), inner, mode="nearest-exact") > 0
         ranked = torch.where(peaks, scores, 0).flatten(1)
@@ -97,6 +100,8 @@ class ALIKED(nn.Module):
     """
 
     def __init__(self, weights: str | Path, num_keypoints: int = 1000) -> None:
+        import kornia
+
         super().__init__()
         self.num_keypoints = num_keypoints
         state = _read(weights)

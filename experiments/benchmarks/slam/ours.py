@@ -1,0 +1,62 @@
+"""One run of a sequence, in a process of its own; prints its figures as JSON. For `run.py`, which measures it.
+
+python -m experiments.benchmarks.slam.ours SEQUENCE TRAJECTORY --processes 2 --limit 160
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from pathlib import Path
+
+import torch
+
+from torchslam.commands.run import frames_of
+from torchslam.config import Config
+from torchslam.data import open_sequence
+from torchslam.data.trajectory_file import write_trajectory
+from torchslam.run import run_sequence
+from torchslam.slam import SLAM
+from torchslam.values import StepResult
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("trajectory", type=Path)
+    parser.add_argument("--processes", type=int)
+    parser.add_argument("--limit", type=int)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    sequence = open_sequence(arguments.sequence, limit=arguments.limit)
+    slam = SLAM(sequence.camera, Config())
+    ends: list[float] = []
+
+    def after_frame(result: StepResult) -> None:
+        ends.append(time.perf_counter())
+
+    start_up, begin = cpu_seconds(), time.perf_counter()
+    with frames_of(sequence, slam, arguments.processes, 0) as frames:
+        finished = run_sequence(slam, sequence, after_frame, frames=frames)
+    write_trajectory(arguments.trajectory, finished.trajectory)
+    totals = torch.tensor([result.stage_ms["total"] for result in finished.results])
+    figures = {
+        "frames": len(finished.results) + len(finished.skipped),
+        "ms_median": float(totals.median()),
+        "ms_p95": float(totals.quantile(0.95)),
+        "frames_per_s": len(ends) / (ends[-1] - begin),
+        "start_up_s": start_up,
+    }
+    print(json.dumps(figures))
+
+
+def cpu_seconds() -> float:
+    """What this process has taken of the processors."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+if __name__ == "__main__":
+    main()
