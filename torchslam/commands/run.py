@@ -35,6 +35,7 @@ from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
+from torchslam.output.view import VIEW, write_view
 from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
@@ -156,7 +157,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
-    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
+    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output), 'view': str(plan.output / VIEW)})}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status
@@ -220,7 +221,9 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
     figures["source"] = full_name(plan.source)
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)
-    draw(read_results(plan.output), plan.output)
+    results = read_results(plan.output)
+    draw(results, plan.output)
+    write_view(results, plan.output)
     return figures
 
 

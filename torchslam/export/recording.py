@@ -47,7 +47,7 @@ def write_recording(path: Path, scene: Scene, R_up: Tensor, images: Images | Non
         camera_xyz=rr.ViewCoordinates.RDF,
     )
     positions_w = upright.T_wc[:, :3, 3]
-    strips = [part.numpy() for part in torch.tensor_split(positions_w, _gaps(scene.frame_ids))]
+    strips = [part.numpy() for part in torch.tensor_split(positions_w, gaps(scene.frame_ids))]
     for entity, content in (
         ("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
         ("world/points", rr.Points3D(upright.points_w.numpy(), colors=scene.colors.numpy())),
@@ -80,7 +80,7 @@ def _log_view(rr: ModuleType, recording: Any, scene: Scene, row: int, images: Im
         recording.log("world/keyframe", rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
 
-def _gaps(frame_ids: Tensor) -> list[int]:
+def gaps(frame_ids: Tensor) -> list[int]:
     """Rows before which the path is broken."""
     if len(frame_ids) < 3:
         return []
