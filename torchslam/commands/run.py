@@ -157,7 +157,9 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
             finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
-    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output), 'view': str(plan.output / VIEW)})}")
+    print(
+        f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output), 'view': str(plan.output / VIEW)})}"
+    )
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status

@@ -39,7 +39,7 @@ def page_data(results: Results) -> dict[str, Any]:
     """
     figures = results.metrics
     frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
-    times = torch.tensor([frame.timestamp for frame in results.frames], dtype=torch.float64)
+    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
     reasons = list(dict.fromkeys(frame.reason for frame in frames))
     number_of = {reason: number for number, reason in enumerate(reasons)}
     paths = {figures["world"]: results.trajectory} | results.others
@@ -159,6 +159,8 @@ def _during(results: Results, path: Trajectory) -> Trajectory:
 
 def _points(world: World) -> tuple[Tensor, Tensor]:
     """(P, 3) positions and (P, 3) colours of the living points."""
+    if world.map.num_points == 0:
+        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
     ids = world.map.living_points()
     positions_w = world.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)

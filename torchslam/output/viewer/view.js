@@ -118,7 +118,7 @@ function draw() {
       ...view,
       size: shown.pointSize * 0.006 * world.radius * canvas.height,
       limits: [shown.finest * scale * shown.pointSize, 7 * scale * shown.pointSize],
-      lift: [...ink, 0.1],
+      lift: [...ink, 0.2],
     });
   if (isOn("truth")) painter.draw(layers.truth, { ...view, width: 1.4 * scale });
   if (isOn("keyframes"))
@@ -193,7 +193,8 @@ function drawStrip() {
     before = frame;
   });
   pen.stroke();
-  $("curve").textContent = last < 0 ? "" : hasErrors ? `error, up to ${length(most, world.unit)}` : `points seen, up to ${number(most)}`;
+  document.querySelectorAll("#curve [data-state]").forEach((word) => (word.hidden = !frames.state.includes(STATES.indexOf(word.dataset.state))));
+  $("curve-words").textContent = last < 0 ? "" : hasErrors ? `error, up to ${length(most, world.unit)}` : `points seen, up to ${number(most)}`;
 }
 
 function play(playing) {
@@ -280,7 +281,8 @@ function begin() {
   $("frame").max = Math.max(last, 0);
   data.worlds.forEach((world, i) => $("world").add(new Option(world.name, i)));
   $("world-choice").hidden = data.worlds.length < 2;
-  if (innerWidth <= 600) $("legend").open = false;
+  $("legend").open = innerWidth > 600;
+  $("legend").hidden = data.worlds.length === 0;
   $("trouble").hidden = painter !== null && data.worlds.length > 0;
   $("trouble").textContent = painter ? data.failure || "There is no map." : "This browser has no WebGL 2, which draws the map.";
   listen();
