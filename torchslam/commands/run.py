@@ -31,11 +31,13 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate
 from torchslam.export.colours import paint
+from torchslam.export.recording import import_rerun
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.output.view import VIEW, write_view
+from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
 from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
@@ -56,6 +58,7 @@ class Plan:
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     refine:     improve the given camera by the images first; distortion: its distortion, too
+    view:       show the run live in rerun; video: write a film of what is tracked
     """
 
     source: str
@@ -68,6 +71,8 @@ class Plan:
     checkpoint: int = CHECKPOINT_EVERY
     refine: bool = False
     distortion: bool = False
+    view: bool = False
+    video: bool = False
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,6 +107,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
     )
+    parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
+    parser.add_argument(
+        "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
+    )
     arguments.add_device(parser)
     arguments.add_config(parser)
 
@@ -111,6 +120,8 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError("--refine-camera: a --map has the camera that it was made with")
     if options.localize and options.map is None:
         raise ConfigError("--localize needs a --map to find poses in")
+    if options.view:
+        import_rerun()
     saved = options.map
     if saved is not None and saved.is_dir():
         beside = saved / CONFIG
@@ -127,6 +138,8 @@ def execute(options: argparse.Namespace) -> int:
         checkpoint=options.checkpoint,
         refine=options.refine_camera or options.refine_distortion,
         distortion=options.refine_distortion,
+        view=options.view,
+        video=options.video,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -146,20 +159,23 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     sequence, found = _with_camera(sequence, config, plan)
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
-    with Stopping() as stopping:
+    with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
         bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
                 checkpoints.offer(at_once=stopping.is_wanted)
+                watching.show(result)
                 progress.update(result)
 
-            finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting)
+            finished = run_sequence(slam, watching.sequence, after_frame, so_far, progress.adjusting)
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
-    print(
-        f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output), 'view': str(plan.output / VIEW)})}"
-    )
+        watching.end(finished)
+    written = {"results": plan.output, "view": plan.output / VIEW}
+    written |= {"video": plan.output / VIDEO} if plan.video else {}
+    words = summary(figures) | {label: str(path) for label, path in written.items()}
+    print(f"\n{sequence.name}\n{table(words)}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status
@@ -204,6 +220,15 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
             f"the sequence has {_words(mine.model, mine.params, mine.size)}"
         )
     return slam, Progressed()
+
+
+def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> Watching:
+    """What shows the frames as they pass; a film of an earlier run goes."""
+    (plan.output / VIDEO).unlink(missing_ok=True)
+    screens: list[Screen] = [LiveView.spawn(slam)] if plan.view else []
+    if plan.video:
+        screens.append(film_of(sequence, plan.output))
+    return Watching(slam, sequence, screens)
 
 
 def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
