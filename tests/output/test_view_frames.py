@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.export.test_recording import read
 from tests.walks import Walk, arc
 from torchslam import SLAM, Run, load_config
 from torchslam.cli import main
@@ -102,6 +101,8 @@ def test_what_is_watched_is_the_same_run() -> None:
 @pytest.mark.parametrize("distortion", [0.0, -0.2])
 def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, distortion: float) -> None:
     rr = pytest.importorskip("rerun")
+    from tests.export.test_recording import read
+
     walk = Pictured()
     camera = walk.camera
     if distortion:
