@@ -71,6 +71,7 @@ def test_run_writes_all_results(finished: Path) -> None:
         "map.safetensors",
         "map.ply",
         "config.toml",
+        "view.html",
     }
     assert names == files | {"metrics.json", "frames.csv", "example.png"} | pictures
     figures = json.loads((finished / "metrics.json").read_text())
@@ -106,7 +107,8 @@ def test_plot_draws_again_from_the_files_alone(
     status, out, _ = run_and_read(capsys, "plot", str(copy))
     assert status == 0
     drawn = {Path(line).name for line in out.splitlines()}
-    assert drawn == {path.name for path in (finished / "plots").iterdir()}
+    assert drawn == {path.name for path in (finished / "plots").iterdir()} | {"view.html"}
+    assert (copy / "view.html").read_bytes() == (finished / "view.html").read_bytes()
     for name in ("scene.png", "top_view.png", "features.png"):
         assert (copy / "plots" / name).read_bytes() == (finished / "plots" / name).read_bytes()
 

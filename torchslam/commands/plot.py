@@ -1,4 +1,4 @@
-"""Draw the pictures of a run again, from the files in its folder of results."""
+"""Draw the pictures of a run and make its view.html again, from the files in its folder of results."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from torchslam.output.pictures import draw
 from torchslam.output.results import read_results
+from torchslam.output.view import write_view
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    for path in draw(read_results(options.directory), options.directory):
+    results = read_results(options.directory)
+    for path in [*draw(results, options.directory), write_view(results, options.directory)]:
         print(path)
     return 0

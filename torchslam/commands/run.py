@@ -33,10 +33,13 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate
 from torchslam.export.colours import paint
+from torchslam.export.recording import import_rerun
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
+from torchslam.output.view import VIEW, write_view
+from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
 from torchslam.run import Frames, Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
@@ -58,6 +61,7 @@ class Plan:
     checkpoint: keyframes from one checkpoint to the next; 0: none
     refine:     improve the given camera by the images first; distortion: its distortion, too
     processes:  how many; None: what is best
+    view:       show the run live in rerun; video: write a film of what is tracked
     """
 
     source: str
@@ -71,6 +75,8 @@ class Plan:
     refine: bool = False
     distortion: bool = False
     processes: int | None = None
+    view: bool = False
+    video: bool = False
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +111,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
     )
+    parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
+    parser.add_argument(
+        "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
+    )
     arguments.add_device(parser)
     arguments.add_processes(parser)
     arguments.add_config(parser)
@@ -115,6 +125,8 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError("--refine-camera: a --map has the camera that it was made with")
     if options.localize and options.map is None:
         raise ConfigError("--localize needs a --map to find poses in")
+    if options.view:
+        import_rerun()
     saved = options.map
     if saved is not None and saved.is_dir():
         beside = saved / CONFIG
@@ -132,6 +144,8 @@ def execute(options: argparse.Namespace) -> int:
         refine=options.refine_camera or options.refine_distortion,
         distortion=options.refine_distortion,
         processes=options.processes,
+        view=options.view,
+        video=options.video,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -151,19 +165,27 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     sequence, found = _with_camera(sequence, config, plan)
     slam, so_far = _begin(sequence, config, plan)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
-    with Stopping() as stopping:
+    processes = 1 if plan.view or plan.video else plan.processes  # images are wanted here, not elsewhere
+    with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
         bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
                 checkpoints.offer(at_once=stopping.is_wanted)
+                watching.show(result)
                 progress.update(result)
 
-            with frames_of(sequence, slam, plan.processes, so_far.next) as frames:
-                finished = run_sequence(slam, sequence, after_frame, so_far, progress.adjusting, frames)
+            with frames_of(watching.sequence, slam, processes, so_far.next) as frames:
+                finished = run_sequence(
+                    slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
+                )
         stopping.begin("when the results are written")
         figures = _write(finished, sequence, plan, found)
-    print(f"\n{sequence.name}\n{table(summary(figures) | {'results': str(plan.output)})}")
+        watching.end(finished)
+    written = {"results": plan.output, "view": plan.output / VIEW}
+    written |= {"video": plan.output / VIDEO} if plan.video else {}
+    words = summary(figures) | {label: str(path) for label, path in written.items()}
+    print(f"\n{sequence.name}\n{table(words)}")
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status
@@ -225,6 +247,15 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     return slam, Progressed()
 
 
+def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> Watching:
+    """What shows the frames as they pass; a film of an earlier run goes."""
+    (plan.output / VIDEO).unlink(missing_ok=True)
+    screens: list[Screen] = [LiveView.spawn(slam)] if plan.view else []
+    if plan.video:
+        screens.append(film_of(sequence, plan.output))
+    return Watching(slam, sequence, screens)
+
+
 def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     numbers = ",".join(f"{number:.9g}" for number in params.tolist())
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
@@ -242,7 +273,9 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
     figures["source"] = full_name(plan.source)
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)
-    draw(read_results(plan.output), plan.output)
+    results = read_results(plan.output)
+    draw(results, plan.output)
+    write_view(results, plan.output)
     return figures
 
 

@@ -45,8 +45,12 @@ def undistorted(scene: Scene) -> Scene:
     if scene.camera.model == "pinhole":
         return scene
     pinhole = pinhole_within(scene.camera)
-    pixels = scene.camera.normalize(scene.pixels) * pinhole.params[:2] + pinhole.params[2:]
-    return replace(scene, camera=pinhole, pixels=pixels)
+    return replace(scene, camera=pinhole, pixels=undistorted_pixels(scene.pixels, scene.camera, pinhole))
+
+
+def undistorted_pixels(pixels: Tensor, camera: Camera, pinhole: Camera) -> Tensor:
+    """(N, 2) pixels of a camera as its `pinhole_within` sees them."""
+    return camera.normalize(pixels) * pinhole.params[:2] + pinhole.params[2:]
 
 
 class Undistorter:

@@ -55,7 +55,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     if evaluation is not None:
         yield "errors", _errors(evaluation, results)
         S = evaluation.S_groundtruth_estimate
-        trajectory, keyframes, truth = evaluation.aligned, _aligned(keyframes, S), _truth(results)
+        trajectory, keyframes, truth = evaluation.aligned, aligned(keyframes, S), _truth(results)
         title += f", ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
     unit = "" if truth is None else "m"
     ids = results.map.living_points()
@@ -112,7 +112,7 @@ def _errors(evaluation: Evaluation, results: Results) -> Figure:
     )
 
 
-def _aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
+def aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
     """Poses after a similarity (4, 4) of the world."""
     rotation = S[:3, :3] / torch.linalg.det(S[:3, :3]) ** (1 / 3)
     return Trajectory(

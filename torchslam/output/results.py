@@ -17,11 +17,13 @@ from torchslam.data.sequence import Sequence
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
 from torchslam.export.ply import write_map_cloud
+from torchslam.geometry import Camera
 from torchslam.output.frames_file import read_frames, write_frames
 from torchslam.run import Run, keyframe_rows
 from torchslam.values import StepResult, Trajectory
 from torchslam.world.map import Map
 from torchslam.world.map_file import read_worlds, write_worlds
+from torchslam.world.world import World
 
 TRAJECTORY = "trajectory.txt"
 OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the world of that number
@@ -46,7 +48,9 @@ class Results:
 
     trajectory, keyframes: of the main world, camera to world, in the units of its map; without poses where none is
     groundtruth:           in metres, where the sequence had it
+    others:                of the other worlds in which the run has poses, by their numbers
     map:                   of the main world; empty where there is none
+    worlds, camera:        all of them, with their camera
     frames:                one per frame, without poses
     metrics:               the content of metrics.json
     example_image:         (H, W) in [0, 1] of keyframe `example_keyframe(map, session)`, where it could be read
@@ -55,7 +59,10 @@ class Results:
     trajectory: Trajectory
     keyframes: Trajectory
     groundtruth: Trajectory | None
+    others: dict[int, Trajectory]
     map: Map
+    worlds: tuple[World, ...]
+    camera: Camera
     frames: list[StepResult]
     metrics: dict[str, Any]
     example_image: Tensor | None
@@ -97,12 +104,16 @@ def read_results(directory: Path) -> Results:
         raise ResultsError(f"{directory}: no such folder of results")
     saved, figures = read_worlds(directory / MAP), read_metrics(directory)
     main = [world.map for world in saved.worlds if world.number == figures["world"]]
+    beside = {world.number: directory / OTHER_TRAJECTORY.format(world.number) for world in saved.worlds}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
         trajectory=read_trajectory(directory / TRAJECTORY) if figures["posed"] else Trajectory.empty(),
         keyframes=read_trajectory(directory / KEYFRAMES) if figures["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
+        others={number: read_trajectory(path) for number, path in beside.items() if path.exists()},
         map=main[0] if main else Map(),
+        worlds=tuple(saved.worlds),
+        camera=saved.camera,
         frames=read_frames(directory / FRAMES),
         metrics=figures,
         example_image=read_grey(example, str(example))[0, 0] if example.exists() else None,

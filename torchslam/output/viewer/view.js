@@ -1,0 +1,297 @@
+/* The page: worlds, layers, the frames in time. */
+
+const $ = (id) => document.getElementById(id);
+const data = decodeAll(JSON.parse($("data").textContent));
+const frames = data.frames;
+const last = frames.index.length - 1;
+const dark = matchMedia("(prefers-color-scheme: dark)");
+const painter = createPainter($("scene"));
+const eye = createEye($("scene"), redraw, () => ($("follow").checked = false));
+const layers = {};
+const shown = { world: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
+
+const number = (value) => value.toLocaleString("en");
+const tone = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const rgb = (name) => [1, 3, 5].map((i) => parseInt(tone(name).slice(i, i + 2), 16));
+const isOn = (layer) => document.querySelector(`[data-layer=${layer}]`).checked;
+
+// --- worlds and layers ---------------------------------------------------------------------------------------------
+
+/** Row of the pose of a frame in the world that is shown, -1 where it has none. */
+function rowOf(frame) {
+  const row = countUpTo(shown.world.frame, frame) - 1;
+  return row >= 0 && shown.world.frame[row] === frame ? row : -1;
+}
+
+function showWorld(world) {
+  shown.world = world;
+  if (world) {
+    world.positions ??= positionsOf(world.poses);
+    world.most ??= mostOf(world.errors);
+    const hasErrors = Number.isFinite(world.most);
+    $("colour-choice").hidden = !hasErrors;
+    $("colour").value = hasErrors ? "error" : "state";
+    document.querySelector("[data-for=truth]").hidden = world.truth.length === 0;
+    const all = world.points.length / 3;
+    $("count-points").textContent = number(all) + (all < world.points_total ? ` of ${number(world.points_total)}` : "");
+    $("count-path").textContent = length(world.path_length, world.unit);
+    $("count-keyframes").textContent = number(world.keyframe.length);
+    build();
+    resetView();
+  }
+  drawStrip();
+  showFrame(shown.frame);
+}
+
+/** Make all layers of the world that is shown, in the colours of the theme. */
+function build() {
+  const world = shown.world;
+  if (!world || !painter) return;
+  Object.values(layers).forEach(painter.remove);
+  const points = world.colors.length ? world.colors : new Uint8Array(world.points.length).map((_, i) => rgb("unpainted")[i % 3]);
+  layers.points = painter.points(world.points, points);
+  shown.finest = world.points.length > 3e5 ? 1.3 : 2.6; // pixels: few points would hardly be seen
+  const path = pathLines(world.positions, (row) => world.breaks.includes(row));
+  shown.pathFrames = path.rows.map((row) => world.frame[row]);
+  layers.path = painter.lines(path.ends, colours(path.rows.length, (i) => pathColour(path.rows[i])));
+  const truth = pathLines(world.truth, () => false);
+  layers.truth = painter.lines(truth.ends, colours(truth.rows.length, rgb("truth"), 190));
+  const edges = [];
+  for (let at = 0; at < world.keyframe_poses.length; at += 12)
+    edges.push(...frustumLines(world.keyframe_poses.subarray(at, at + 12), data.corners, world.frustum));
+  layers.keyframes = painter.lines(new Float32Array(edges), colours(edges.length / 6, rgb("keyframe"), 150));
+  const grid = gridLines(world.box);
+  layers.grid = painter.lines(grid.ends, colours(grid.ends.length / 6, rgb("grid"), 140));
+  $("count-grid").textContent = length(grid.step, world.unit);
+  const byError = $("colour").value === "error";
+  $("ramp").hidden = !byError;
+  $("states").hidden = byError;
+  $("ramp").firstElementChild.style.background = `linear-gradient(90deg, ${RAMP.map((c) => `rgb(${c})`)})`;
+  $("ramp-high").textContent = `≥ ${length(world.most, world.unit)}`;
+}
+
+function pathColour(row) {
+  const world = shown.world;
+  if ($("colour").value === "error")
+    return Number.isFinite(world.errors[row]) ? rampColour(world.errors[row], world.most) : rgb("unpainted");
+  const state = STATES[frames.state[world.frame[row]]];
+  return rgb(state === "tracking" || state === "uncertain" ? state : "later");
+}
+
+function currentFrustum() {
+  painter.remove(layers.camera);
+  layers.camera = null;
+  const row = rowOf(shown.frame);
+  if (row < 0) return;
+  const world = shown.world;
+  const edges = frustumLines(world.poses.subarray(12 * row, 12 * row + 12), data.corners, 1.8 * world.frustum);
+  layers.camera = painter.lines(new Float32Array(edges), colours(8, rgb("camera")));
+  if ($("follow").checked) eye.look({ target: [...world.positions.subarray(3 * row, 3 * row + 3)] });
+}
+
+// --- drawing -------------------------------------------------------------------------------------------------------
+
+/** Draw before the next refresh of the screen, however often it is asked for. */
+function redraw() {
+  if (shown.waiting || !painter) return;
+  shown.waiting = true;
+  requestAnimationFrame(() => {
+    shown.waiting = false;
+    draw();
+  });
+}
+
+function draw() {
+  const canvas = $("scene");
+  const scale = Math.min(devicePixelRatio || 1, 2);
+  const size = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(scale * side));
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+  painter.begin(rgb("ground").map((value) => value / 255));
+  const world = shown.world;
+  if (!world) return;
+  const view = eye.projection();
+  const past = { faded: 0.22, cut: countUpTo(shown.pathFrames, shown.frame) };
+  const ink = rgb("ink").map((value) => value / 255);
+  if (isOn("grid")) painter.draw(layers.grid, { ...view, width: scale });
+  if (isOn("points"))
+    painter.draw(layers.points, {
+      ...view,
+      size: shown.pointSize * 0.006 * world.radius * canvas.height,
+      limits: [shown.finest * scale * shown.pointSize, 7 * scale * shown.pointSize],
+      lift: [...ink, 0.2],
+    });
+  if (isOn("truth")) painter.draw(layers.truth, { ...view, width: 1.4 * scale });
+  if (isOn("keyframes"))
+    painter.draw(layers.keyframes, { ...view, width: scale, faded: 0.25, cut: 8 * countUpTo(world.keyframe, shown.frame) });
+  if (isOn("path")) painter.draw(layers.path, { ...view, width: 2.6 * scale, ...past });
+  painter.draw(layers.camera, { ...view, width: 2 * scale, above: true });
+}
+
+function resetView(pitch = 0.55) {
+  const [low, high] = shown.world.box;
+  const isWide = high[0] - low[0] > high[1] - low[1];
+  const narrow = Math.min(1, $("scene").clientWidth / $("scene").clientHeight);
+  const distance = (0.85 * shown.world.radius) / Math.tan(FIELD_OF_VIEW / 2) / narrow;
+  eye.look({ yaw: isWide ? -1.2 : -0.4, pitch, distance, target: low.map((value, i) => (value + high[i]) / 2) });
+}
+
+function toggle(layer) {
+  const box = document.querySelector(`[data-layer=${layer}]`);
+  box.checked = !box.checked;
+  redraw();
+}
+
+// --- frames in time ------------------------------------------------------------------------------------------------
+
+function showFrame(frame) {
+  shown.frame = Math.max(0, Math.min(last, frame));
+  $("frame").value = shown.frame;
+  if (last < 0) return;
+  const words = [`frame ${frames.index[shown.frame]}`, `${frames.seconds[shown.frame].toFixed(2)} s`, STATES[frames.state[shown.frame]]];
+  if (shown.world && painter) {
+    const row = rowOf(shown.frame);
+    if (row < 0) words.push("no pose here");
+    else if (Number.isFinite(shown.world.errors[row])) words.push(`error ${length(shown.world.errors[row], shown.world.unit)}`);
+    currentFrustum();
+  }
+  if (frames.inliers[shown.frame]) words.push(`${number(frames.inliers[shown.frame])} points seen`);
+  if (frames.keyframe[shown.frame]) words.push("keyframe");
+  $("frame").setAttribute("aria-valuetext", words.join(", "));
+  const reason = data.reasons[frames.reason[shown.frame]];
+  $("readout").textContent = words.concat(reason || []).join(" · ");
+  redraw();
+}
+
+/** State, and the error or the points seen, over the frames. */
+function drawStrip() {
+  const canvas = $("strip");
+  const scale = devicePixelRatio || 1;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  [canvas.width, canvas.height] = [width * scale, height * scale];
+  const pen = canvas.getContext("2d");
+  pen.scale(scale, scale);
+  const x = (frame) => 1.5 + ((width - 3) * frame) / Math.max(last, 1); // as the middle of the slider's thumb goes
+  const bands = { initializing: "start", lost: "lost", uncertain: "doubt" };
+  for (let frame = 0, next = 0; frame <= last; frame = next) {
+    while (next <= last && frames.state[next] === frames.state[frame]) next++;
+    pen.fillStyle = tone(bands[STATES[frames.state[frame]]] ?? "hair");
+    pen.fillRect(x(frame - 0.5), 0, x(next - 0.5) - x(frame - 0.5), height);
+  }
+  const world = shown.world;
+  const hasErrors = world && Number.isFinite(world.most);
+  const values = hasErrors ? world.errors : frames.inliers;
+  const most = hasErrors ? values.reduce((a, b) => (b > a ? b : a), 0) : Math.max(...frames.inliers, 1);
+  pen.strokeStyle = tone("ink");
+  pen.lineWidth = 1.2;
+  pen.lineJoin = "round";
+  pen.beginPath();
+  let before = NaN;
+  values.forEach((value, i) => {
+    const frame = hasErrors ? world.frame[i] : i;
+    if (!Number.isFinite(value)) return;
+    pen[frame - before === 1 ? "lineTo" : "moveTo"](x(frame), height - 2 - ((height - 5) * value) / most);
+    before = frame;
+  });
+  pen.stroke();
+  document.querySelectorAll("#curve [data-state]").forEach((word) => (word.hidden = !frames.state.includes(STATES.indexOf(word.dataset.state))));
+  $("curve-words").textContent = last < 0 ? "" : hasErrors ? `error, up to ${length(most, world.unit)}` : `points seen, up to ${number(most)}`;
+}
+
+function play(playing) {
+  if (playing === shown.playing || last < 1) return;
+  shown.playing = playing;
+  $("play").setAttribute("aria-label", playing ? "Pause" : "Play");
+  $("play").querySelector("path").setAttribute("d", playing ? "M3.5 2.5h3v11h-3zM9.5 2.5h3v11h-3z" : "M4 2.5v11l9.5-5.5z");
+  if (!playing) return;
+  if (shown.frame >= last) showFrame(0);
+  let before = performance.now();
+  shown.clock = frames.seconds[shown.frame];
+  requestAnimationFrame(function tick(now) {
+    if (!shown.playing) return;
+    shown.clock += (Math.max(0, now - before) / 1000) * Number($("speed").value);
+    before = now;
+    const frame = Math.max(shown.frame, countUpTo(frames.seconds, shown.clock) - 1);
+    if (frame !== shown.frame) showFrame(frame);
+    if (frame >= last) play(false);
+    else requestAnimationFrame(tick);
+  });
+}
+
+function seek(frame) {
+  play(false);
+  showFrame(frame);
+}
+
+// --- the page's own controls ---------------------------------------------------------------------------------------
+
+const KEYS = {
+  " ": () => play(!shown.playing),
+  ArrowLeft: (event) => seek(shown.frame - (event.shiftKey ? 10 : 1)),
+  ArrowRight: (event) => seek(shown.frame + (event.shiftKey ? 10 : 1)),
+  Home: () => seek(0),
+  End: () => seek(last),
+  w: () => eye.turn(0, 0.06),
+  s: () => eye.turn(0, -0.06),
+  a: () => eye.turn(-0.08, 0),
+  d: () => eye.turn(0.08, 0),
+  "+": () => eye.zoom(0.9),
+  "=": () => eye.zoom(0.9),
+  "-": () => eye.zoom(1 / 0.9),
+  p: () => toggle("points"),
+  k: () => toggle("keyframes"),
+  g: () => toggle("grid"),
+  "[": () => resizePoints(0.8),
+  "]": () => resizePoints(1.25),
+  f: () => $("follow").click(),
+  r: () => shown.world && resetView(),
+  t: () => shown.world && resetView(STEEPEST),
+  "?": () => $("help").showModal(),
+};
+
+function resizePoints(factor) {
+  shown.pointSize = Math.max(0.3, Math.min(6, shown.pointSize * factor));
+  redraw();
+}
+
+function listen() {
+  $("frame").addEventListener("input", (event) => seek(Number(event.target.value)));
+  $("play").addEventListener("click", () => play(!shown.playing));
+  $("reset").addEventListener("click", KEYS.r);
+  $("top").addEventListener("click", KEYS.t);
+  $("help-open").addEventListener("click", KEYS["?"]);
+  $("follow").addEventListener("change", () => showFrame(shown.frame));
+  $("world").addEventListener("change", (event) => showWorld(data.worlds[event.target.value]));
+  $("colour").addEventListener("change", () => (build(), showFrame(shown.frame)));
+  document.querySelectorAll("[data-layer]").forEach((box) => box.addEventListener("change", redraw));
+  addEventListener("resize", () => (drawStrip(), redraw()));
+  dark.addEventListener("change", () => (build(), drawStrip(), showFrame(shown.frame)));
+  addEventListener("keydown", (event) => {
+    const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    const isTaken = event.ctrlKey || event.metaKey || event.altKey || $("help").open || event.target.tagName === "SELECT";
+    const presses = name === " " && /BUTTON|SUMMARY|INPUT/.test(event.target.tagName) && event.target.type !== "range";
+    if (isTaken || presses || !(name in KEYS)) return;
+    event.preventDefault();
+    KEYS[name](event);
+  });
+}
+
+function begin() {
+  $("title").textContent = data.title;
+  $("facts").textContent = data.facts;
+  $("frame").max = Math.max(last, 0);
+  data.worlds.forEach((world, i) => $("world").add(new Option(world.name, i)));
+  $("world-choice").hidden = data.worlds.length < 2;
+  $("legend").open = innerWidth > 600;
+  $("legend").hidden = data.worlds.length === 0;
+  $("trouble").hidden = painter !== null && data.worlds.length > 0;
+  $("trouble").textContent = painter ? data.failure || "There is no map." : "This browser has no WebGL 2, which draws the map.";
+  listen();
+  const asked = new URLSearchParams(location.hash.slice(1)); // view.html#world=0&frame=120
+  if (asked.has("frame")) shown.frame = Number(asked.get("frame")) || 0;
+  const chosen = data.worlds[Number(asked.get("world")) || 0] ?? data.worlds[0] ?? null;
+  $("world").value = data.worlds.indexOf(chosen);
+  showWorld(chosen);
+  document.documentElement.dataset.ready = $("readout").textContent;
+}
+
+begin();
