@@ -110,9 +110,9 @@ def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     if count <= 0:
         return torch.zeros_like(scores, dtype=torch.bool)
     left, middle, right = (scores[k : scores.shape[0] - 2 + k] for k in range(3))
-    rows = torch.maximum(torch.maximum(left, right), middle)  # rows[i] covers columns i, i+1, i+2
+    rows = _onto(torch.maximum(left, right), torch.maximum, middle)  # rows[i] covers columns i, i+1, i+2
     before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
     after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
-    before = torch.maximum(before, floor.narrow(0, margin, count))
+    before = _onto(before, torch.maximum, floor.narrow(0, margin, count))
     centre = middle.narrow(0, stride, count)
     return F.pad((centre > before) & (centre >= after), (margin, margin))
