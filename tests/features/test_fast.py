@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchslam.features import brief, fast
 from torchslam.features.fast import CIRCLE, fast_scores, find_peaks, patch_scores
 
 
@@ -24,6 +26,15 @@ def test_scores_are_the_best_arc_of_nine(height: int, width: int, seed: int) -> 
             arcs = [[ring[(start + k) % 16] for k in range(9)] for start in range(16)]
             expected = max(0, *(min(arc) for arc in arcs), *(-max(arc) for arc in arcs))
             assert scores[y, x] == expected
+
+
+def test_pieces_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    pixels = torch.from_numpy(noise(40, 50, 3)).flatten()
+    scores, blurred = fast_scores(pixels, 50), brief.blur(pixels, 50)
+    monkeypatch.setattr(fast, "PIECE", 333)
+    monkeypatch.setattr(brief, "PIECE", 333)
+    assert torch.equal(fast_scores(pixels, 50), scores)
+    assert torch.equal(brief.blur(pixels, 50), blurred)
 
 
 def test_corners_are_those_of_opencv() -> None:

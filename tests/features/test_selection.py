@@ -5,7 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchslam.features.pyramid import plan_atlas
-from torchslam.features.selection import best_of_cells, plan_grid, ranks_within, spread, true_indices
+from torchslam.features.selection import (
+    _falling,
+    best_of_cells,
+    plan_grid,
+    ranks_within,
+    spread,
+    true_indices,
+)
 
 CPU = torch.device("cpu")
 
@@ -68,6 +75,14 @@ def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
     # Weak corners are taken only as the best of their cell.
     rows, _ = spread(scores, ~everything, cells, image, grid, 1, 7)
     assert sorted(rows.tolist()) == [0, 4, 5, 6]
+
+
+@given(st.lists(st.floats(-4, 4, width=32) | st.sampled_from([0.0, -0.0, 1.0]), max_size=40))
+def test_falling_order_is_that_of_a_stable_sort(values: list[float]) -> None:
+    scores = torch.tensor(values, dtype=torch.float32)
+    expected = torch.argsort(scores, descending=True, stable=True)
+    assert torch.equal(_falling(scores), expected)
+    assert torch.equal(_falling(scores.double()), expected)
 
 
 def test_spread_gives_unused_budget_to_other_levels() -> None:

@@ -14,6 +14,7 @@ from torchslam.features.pattern import PATTERN
 
 RADIUS = 15
 BLUR_RADIUS = 3
+PIECE = 1 << 17  # pixels blurred at once: their sums stay in the cache
 ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 
 
@@ -46,11 +47,17 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
     pixel i + BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
     """
     # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
-    smooth = pixels.to(torch.int16) - 128
-    for shift in (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride):
-        length = smooth.shape[0] - shift
-        smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
-    return smooth
+    signed = (pixels ^ 128).view(torch.int8)
+    margin = 2 * BLUR_RADIUS * (stride + 1)
+    count = pixels.shape[0] - margin
+    pieces = []
+    for start in range(0, count, PIECE):
+        smooth = signed.narrow(0, start, min(PIECE, count - start) + margin).to(torch.int16)
+        for shift in (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride):
+            length = smooth.shape[0] - shift
+            smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
+        pieces.append(smooth)
+    return torch.cat(pieces)
 
 
 @lru_cache(maxsize=16)

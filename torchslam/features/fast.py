@@ -14,9 +14,11 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
-PIECE = 1 << 16  # pixels worked on at once: their intermediate results stay in the cache
+PIECE = 1 << 17  # pixels worked on at once: their intermediate results stay in the cache
 
-Extremum = Callable[[Tensor, Tensor], Tensor]
+Extremum = Callable[..., Tensor]
+Opposites = Callable[[Extremum, int, int], tuple[Tensor, Tensor]]
+"""(extremum, i, j) -> the extremum of neighbours i and j on the circle, and that of those opposite, i + 8 and j + 8."""
 
 
 def fast_scores(pixels: Tensor, stride: int) -> Tensor:
@@ -43,40 +45,59 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
 
 def _piece_scores(pixels: Tensor, stride: int, start: int, count: int) -> Tensor:
     """`fast_scores` of `count` pixels from `start` on."""
-    ring = [pixels.narrow(0, start + dy * stride + dx, count) for dx, dy in CIRCLE]
-    return _scores(ring, pixels.narrow(0, start, count))
+
+    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Tensor, Tensor]:
+        # The opposite pair has the same shape: it is this one elsewhere in the image.
+        first, second = (dy * stride + dx for dx, dy in (CIRCLE[i], CIRCLE[j]))
+        low, length = min(first, -second), count + abs(first + second)
+        here, there = (pixels.narrow(0, start + low + k, length) for k in (0, second - first))
+        found = extremum(here, there)
+        return found.narrow(0, first - low, count), found.narrow(0, -second - low, count)
+
+    return _scores(opposites, pixels.narrow(0, start, count))
 
 
 def patch_scores(patches: Tensor) -> Tensor:
     """FAST scores wherever the circle fits into a patch, differentiable: (N, S, S) floats -> (N, S - 6, S - 6)."""
     inner = patches.shape[-1] - 6
     ring = [patches[:, 3 + dy :, 3 + dx :][:, :inner, :inner] for dx, dy in CIRCLE]
-    return _scores(ring, patches[:, 3:-3, 3:-3])
+
+    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Tensor, Tensor]:
+        return extremum(ring[i], ring[j]), extremum(ring[i - 8], ring[j - 8])
+
+    return _scores(opposites, patches[:, 3:-3, 3:-3])
 
 
-def _scores(ring: list[Tensor], centre: Tensor) -> Tensor:
-    """FAST scores of pixels, given their sixteen neighbours on the circle."""
+def _scores(opposites: Opposites, centre: Tensor) -> Tensor:
+    """FAST scores of pixels, given what their neighbours on the circle are."""
     # The darkest pixel of the brightest arc, and the brightest pixel of the darkest one.
-    bright = _best_arc(ring, torch.minimum, torch.maximum)
-    dark = _best_arc(ring, torch.maximum, torch.minimum)
-    return torch.maximum(torch.maximum(bright, centre) - centre, centre - torch.minimum(dark, centre))
+    bright = _onto(_best_arc(opposites, torch.minimum, torch.maximum), torch.maximum, centre)
+    dark = _onto(_best_arc(opposites, torch.maximum, torch.minimum), torch.minimum, centre)
+    return torch.maximum(_onto(bright, torch.sub, centre), centre - dark)
 
 
-def _best_arc(ring: list[Tensor], inner: Extremum, outer: Extremum) -> Tensor:
+def _best_arc(opposites: Opposites, inner: Extremum, outer: Extremum) -> Tensor:
     """`outer` over the sixteen arcs of nine of `inner` within the arc.
 
-    Four arcs in a row share six pixels: min(six, a) and min(six, b) have the maximum min(six, max(a, b)).
+    Pair k holds the neighbours 2 k + 1 and 2 k + 2. The arcs from 2 k and 2 k + 1 on hold the pairs k to k + 3 and an
+    end, 2 k or 2 k + 9: min(pairs, a) and min(pairs, b) have the maximum min(pairs, max(a, b)).
     """
-    pairs = [inner(ring[k], ring[k + 1 - 16]) for k in range(1, 16, 2)]
-    best: Tensor | None = None
-    for k in range(0, 16, 4):  # the arcs from k, k + 1, k + 2 and k + 3 on; pair i holds 2 i + 1 and 2 i + 2
-        before, first, second, third, after = (pairs[k // 2 + i - 8] for i in range(5))
-        earlier = inner(before, outer(ring[k], ring[k + 9 - 16]))
-        later = inner(after, outer(ring[k + 2], ring[k + 11 - 16]))
-        arcs = inner(inner(first, second), inner(third, outer(earlier, later)))
-        best = arcs if best is None else outer(best, arcs)
-    assert best is not None
-    return best
+    pairs = [*zip(*(opposites(inner, 2 * k + 1, 2 * k + 2) for k in range(4)), strict=True)]
+    ends = [*zip(*(opposites(outer, 2 * k, 2 * k + 9) for k in range(4)), strict=True)]
+    halves = []
+    for half in (0, 1):  # eight arcs that have pair 3 of the half in common
+        p, e = (*pairs[half], *pairs[1 - half]), ends[half]
+        early = _onto(inner(p[0], e[0]), outer, inner(p[4], e[1]))
+        early = _onto(_onto(early, inner, p[1]), inner, p[2])
+        late = _onto(inner(p[2], e[2]), outer, inner(p[6], e[3]))
+        late = _onto(_onto(late, inner, p[4]), inner, p[5])
+        halves.append(_onto(_onto(early, outer, late), inner, p[3]))
+    return _onto(halves[0], outer, halves[1])
+
+
+def _onto(values: Tensor, function: Callable[..., Tensor], others: Tensor) -> Tensor:
+    """function(values, others), for bytes in the memory of the values: new memory costs more than the function."""
+    return function(values, others, out=None if values.is_floating_point() else values)
 
 
 def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
@@ -89,9 +110,9 @@ def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     if count <= 0:
         return torch.zeros_like(scores, dtype=torch.bool)
     left, middle, right = (scores[k : scores.shape[0] - 2 + k] for k in range(3))
-    rows = torch.maximum(torch.maximum(left, right), middle)  # rows[i] covers columns i, i+1, i+2
+    rows = _onto(torch.maximum(left, right), torch.maximum, middle)  # rows[i] covers columns i, i+1, i+2
     before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
     after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
-    before = torch.maximum(before, floor.narrow(0, margin, count))
+    before = _onto(before, torch.maximum, floor.narrow(0, margin, count))
     centre = middle.narrow(0, stride, count)
     return F.pad((centre > before) & (centre >= after), (margin, margin))

@@ -238,8 +238,10 @@ def _window_pairs(
     starts = left.flatten() - (counts.cumsum(0) - counts)
     row = torch.div(run, spans, rounding_mode="floor")
     column = _take(order, torch.arange(run.shape[0], device=run.device) + _take(starts, run))
-    offset = _take(keypoints.flatten(0, 1), column) - _take(pixels.flatten(0, 1), row)
-    return _where(offset.square().sum(-1) <= _take(radius.flatten() ** 2, row), row, column)
+    dx, dy = (
+        _take(keypoints[..., k].flatten(), column) - _take(pixels[..., k].flatten(), row) for k in (0, 1)
+    )
+    return _where(dx.square() + dy.square() <= _take(radius.flatten() ** 2, row), row, column)
 
 
 def _take(values: Tensor, rows: Tensor) -> Tensor:

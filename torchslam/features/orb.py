@@ -154,13 +154,14 @@ class ORB(nn.Module):
         """Out of all corners those to keep: positions, rows of the flattened (B, num_keypoints) table, strengths."""
         area, num_cells = grid.table.shape[0], grid.levels.shape[0]
         batch = pixels.shape[0] // area
-        image, cell = positions // area, grid.table[positions % area].to(torch.int64)
+        image = positions // area
+        cell = grid.table.index_select(0, positions - image * area).to(torch.int64)
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
         kept = (
             (strong | best_of_cells(image * num_cells + cell, fast, batch * num_cells)).nonzero().squeeze(1)
         )
-        positions, image, cell, strong = positions[kept], image[kept], cell[kept], strong[kept]
+        positions, image, cell, strong = (x.index_select(0, kept) for x in (positions, image, cell, strong))
         if self.ranking == "harris":
             patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)
             strengths = harris_responses(patches.to(torch.float32)).flatten()

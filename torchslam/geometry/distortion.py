@@ -58,8 +58,8 @@ def first_positive_root(coefficients: Tensor) -> Tensor:
 
 
 def _converged(step: Tensor) -> bool:
-    """Whether the largest Newton step has no more effect (a step converges quadratically)."""
-    return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.75
+    """Whether the next Newton step, about the square of the largest one, would have no effect."""
+    return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
 
 def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
