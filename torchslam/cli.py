@@ -1,4 +1,4 @@
-"""The command line: `torchslam run | demo | eval | plot | export | info | download`.
+"""The command line: `torchslam run | refine | demo | eval | plot | export | info | download`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
 130 and 143 ended by Ctrl-C and by SIGTERM.
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 
 from torchslam import __version__
-from torchslam.commands import demo, download, evaluate, export, info, plot, run
+from torchslam.commands import demo, download, evaluate, export, info, plot, refine, run
 from torchslam.errors import TorchslamError
 
 ERROR = 2
@@ -22,6 +22,7 @@ INTERRUPTED = 130
 
 COMMANDS = {
     "run": run,
+    "refine": refine,
     "demo": demo,
     "eval": evaluate,
     "plot": plot,

@@ -25,12 +25,17 @@ from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
 # COLMAP, src/colmap/sensor/models.h: the numbers of the models in binary files.
-MODEL_NAMES = dict(
-    enumerate(
-        "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
-        "RADIAL_FISHEYE".split()
-    )
-)
+MODEL_NAMES = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+}
 _POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 

@@ -100,9 +100,7 @@ def grow(slam_map: Map, camera: Camera, config: Config) -> None:
     adjust_all(slam_map, camera, config.bundle)
 
 
-def map_of(
-    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config
-) -> Map:
+def map_of(views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config) -> Map:
     """The adjusted map of keyframes whose poses T_cw (K, 4, 4) are only near the truth."""
     T_cw, kept, points_w = settle(views, T_cw, tracks, camera, config)
     made = make_map(views, T_cw, kept, points_w)

@@ -128,9 +128,7 @@ def refine(
     keyframes = [keyframes[row] for row in connected]
     start = T_cw[[chosen[row] for row in connected]]
     pairs = _renumbered(pairs, connected)
-    slam_map, camera, refined, rounds = _rounds(
-        keyframes, start, pairs, camera, config, choice, radial, say
-    )
+    slam_map, camera, refined, rounds = _rounds(keyframes, start, pairs, camera, config, choice, radial, say)
     world = World.empty(0, camera.params)
     world.map = slam_map
     results = Poser(camera, config).pose(world, views, T_cw)
@@ -242,7 +240,5 @@ def _run(
     failure: str,
 ) -> Run:
     if failure:
-        results = [
-            StepResult(view.index, view.timestamp, State.LOST, None, reason=failure) for view in views
-        ]
+        results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=failure) for view in views]
     return Run(worlds, camera, config, results, skipped, False, failure)
