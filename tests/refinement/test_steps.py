@@ -206,7 +206,7 @@ def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> N
     given = se3_exp(tangent * randn(generator, 8, 6)) @ T_cw
     pairs = find_pairs(views, given, CAMERA, CONFIG)
     tracks = join_matches(pairs, 8, len(views[0].mask))
-    made = map_of(views, turned(given, pairs), tracks, CAMERA, CONFIG)
+    made, _ = map_of(views, turned(given, pairs), tracks, CAMERA, CONFIG)
     S = back_to_given(made.T_cw, T_cw)
     centres = se3_inverse(made.T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
     off = (centres - se3_inverse(T_cw)[:, :3, 3]).norm(dim=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchslam.calibration.keyframes import FOCAL, directions
 from torchslam.config import Config
 from torchslam.geometry import Camera, squared_reprojection_errors, transform
 from torchslam.mapping.fusion import fuse
@@ -19,7 +20,7 @@ from torchslam.world.map import Map
 
 # Where the kernel lets go of a residual, in pixels of its level: given poses are off by tens of them.
 WIDTHS = 20.0, 6.0, 2.45
-GATE = 3.0  # widths beyond which an observation does not count in the next, narrower step
+GATE = 3.0  # of the last width: an observation further off does not go into the map
 ITERATIONS = 20
 TOLERANCE = 1e-4  # share of the cost; the last word has the adjustment of the map
 
@@ -40,53 +41,36 @@ def turned(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
 
 
 def settle(
-    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config
-) -> tuple[Tensor, Tracks, Tensor]:
-    """Poses (K, 4, 4), the tracks that agree with them, and their points (T, 3), from poses that are far off."""
-    pixels = torch.stack([view.keypoints for view in views])
-    scales = torch.stack([view.scales for view in views])
+    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool
+) -> tuple[Tensor, Camera, Tracks, Tensor]:
+    """Poses (K, 4, 4), the camera, the tracks that agree with them, and their points (T, 3), from poses far off.
+
+    free_focal: the focal length is adjusted as well: matches that a wrong one would rule out still count here
+    """
+    pixels = torch.stack([view.keypoints for view in views])[tracks.keyframe, tracks.keypoint]
+    scales = torch.stack([view.scales for view in views])[tracks.keyframe, tracks.keypoint]
     parallax = config.mapping.min_parallax_deg
     for width in WIDTHS:
-        seen = pixels[tracks.keyframe, tracks.keypoint]
-        points_w, good = triangulate_tracks(tracks, seen, T_cw, camera, parallax)
+        points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
         rows = good[tracks.track]
-        T_cw, points_w = _adjusted(
-            tracks, rows, seen, scales[tracks.keyframe, tracks.keypoint], T_cw, points_w, camera, width
+        problem = BundleProblem(
+            T_cw,
+            points_w,
+            tracks.keyframe[rows],
+            tracks.track[rows],
+            pixels[rows],
+            camera,
+            weights=scales[rows] ** -2,
         )
-    seen = pixels[tracks.keyframe, tracks.keypoint]
-    points_w, good = triangulate_tracks(tracks, seen, T_cw, camera, parallax)
+        free = directions(camera, [FOCAL]) if free_focal and width < WIDTHS[0] else False
+        solution = bundle_adjust(problem, "cauchy", width, free, "detached", ITERATIONS, TOLERANCE)
+        T_cw, camera = solution.T_cw, solution.camera
+    points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
     points_c = transform(T_cw[tracks.keyframe], points_w[tracks.track][:, None])[:, 0]
-    errors = squared_reprojection_errors(points_c, seen, camera).sqrt()
-    near = errors < GATE * WIDTHS[-1] * scales[tracks.keyframe, tracks.keypoint]
+    near = squared_reprojection_errors(points_c, pixels, camera).sqrt() < GATE * WIDTHS[-1] * scales
     kept = tracks.of(near & good[tracks.track])
-    seen = pixels[kept.keyframe, kept.keypoint]
-    return T_cw, kept, triangulate_tracks(kept, seen, T_cw, camera, 0.0)[0]
-
-
-def _adjusted(
-    tracks: Tracks,
-    rows: Tensor,
-    pixels: Tensor,
-    scales: Tensor,
-    T_cw: Tensor,
-    points_w: Tensor,
-    camera: Camera,
-    width: float,
-) -> tuple[Tensor, Tensor]:
-    """Poses (K, 4, 4) and points (T, 3) of least robust cost over some observations (O,)."""
-    problem = BundleProblem(
-        T_cw,
-        points_w,
-        tracks.keyframe[rows],
-        tracks.track[rows],
-        pixels[rows],
-        camera,
-        weights=scales[rows] ** -2,
-    )
-    solution = bundle_adjust(
-        problem, "cauchy", width, backward="detached", iterations=ITERATIONS, tolerance=TOLERANCE
-    )
-    return solution.T_cw, solution.points_w
+    seen = torch.stack([view.keypoints for view in views])[kept.keyframe, kept.keypoint]
+    return T_cw, camera, kept, triangulate_tracks(kept, seen, T_cw, camera, 0.0)[0]
 
 
 def grow(slam_map: Map, camera: Camera, config: Config) -> None:
@@ -100,10 +84,12 @@ def grow(slam_map: Map, camera: Camera, config: Config) -> None:
     adjust_all(slam_map, camera, config.bundle)
 
 
-def map_of(views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config) -> Map:
-    """The adjusted map of keyframes whose poses T_cw (K, 4, 4) are only near the truth."""
-    T_cw, kept, points_w = settle(views, T_cw, tracks, camera, config)
+def map_of(
+    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool = False
+) -> tuple[Map, Camera]:
+    """The adjusted map of keyframes whose poses T_cw (K, 4, 4) are only near the truth, and its camera."""
+    T_cw, camera, kept, points_w = settle(views, T_cw, tracks, camera, config, free_focal)
     made = make_map(views, T_cw, kept, points_w)
     adjust_all(made, camera, config.bundle)
     grow(made, camera, config)
-    return made
+    return made, camera

@@ -183,7 +183,9 @@ def _rounds(
     tracks = join_matches(pairs, len(keyframes), len(keyframes[0].mask))
     rounds, refined = 0, None
     while True:
-        slam_map, rounds = map_of(keyframes, T_cw, tracks, camera, config), rounds + 1
+        is_free = choice is not CameraChoice.FIXED and camera is not given
+        slam_map, camera = map_of(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
+        rounds += 1
         T_cw = slam_map.T_cw.clone()
         say(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
         if choice is CameraChoice.FIXED:
@@ -191,10 +193,10 @@ def _rounds(
         refined = refine_camera(graph_of(slam_map, camera), given, radial)
         if not refined.is_determined or rounds == MOST_ROUNDS:
             return slam_map, camera, refined, rounds
-        if choice is CameraChoice.JUDGED and camera is given and not contradiction(given, refined):
+        if choice is CameraChoice.JUDGED and not is_free and not contradiction(given, refined):
             return slam_map, camera, refined, rounds
         change = abs(math.log(float(refined.camera.focal) / float(camera.focal)))
-        if camera is not given and change < max(SETTLED, SETTLED_SHARE * refined.std):
+        if is_free and change < max(SETTLED, SETTLED_SHARE * refined.std):
             return slam_map, camera, refined, rounds
         camera = refined.camera
 
