@@ -117,28 +117,45 @@ def refine(
     frames = torch.tensor([view.index for view in views], dtype=torch.int64)
     T_cw = given.T_cw[rows[frames]].to(camera.params)
     say(f"{len(views)} images with poses")
-    chosen = choose_keyframes(views, camera.width, config) if views else []
-    keyframes = [views[row] for row in chosen]
-    pairs = find_pairs(keyframes, T_cw[chosen], camera, config) if len(chosen) >= FEWEST else []
-    connected = largest_part(pairs, len(chosen))
-    failure = "" if len(connected) >= FEWEST else _why_nothing(len(views), len(chosen))
+    chosen, pairs, failure = _connected(views, T_cw, camera, config)
     if failure:
         return Refined(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
-    say(f"{len(chosen)} keyframes, {len(connected)} of them connected by {len(pairs)} pairs")
-    keyframes = [keyframes[row] for row in connected]
-    start = T_cw[[chosen[row] for row in connected]]
-    pairs = _renumbered(pairs, connected)
-    slam_map, camera, refined, rounds = _rounds(keyframes, start, pairs, camera, config, choice, radial, say)
+    say(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
+    keyframes = [views[row] for row in chosen]
+    slam_map, camera, refined, rounds = _rounds(
+        keyframes, T_cw[chosen], pairs, camera, config, choice, radial, say
+    )
     world = World.empty(0, camera.params)
     world.map = slam_map
     results = Poser(camera, config).pose(world, views, T_cw)
-    graph = world.history.graph(slam_map, camera)
-    world.history.take(solve(graph, backward="detached"), graph, slam_map)
-    by_index = dict(zip(frames.tolist(), T_cw, strict=True))
-    posed = torch.stack([by_index[index] for index in world.history.frames["frame_index"].tolist()])
-    world.move(back_to_given(world.history.T_cw(slam_map), posed))
+    _conclude(world, camera, frames, T_cw)
     run = _run((world,), camera, config, views, results, skipped, "")
     return Refined(run, given, rows, refined, rounds)
+
+
+def _connected(
+    views: list[View], T_cw: Tensor, camera: Camera, config: Config
+) -> tuple[list[int], list[Pair], str]:
+    """The rows of the keyframes, the pairs of these that see the same, and why there are none, in words."""
+    if len(views) < FEWEST:
+        return [], [], f"no map: {len(views)} images with a pose are too few"
+    chosen = choose_keyframes(views, camera.width, config)
+    if len(chosen) < FEWEST:
+        return [], [], f"no map: nothing moves in the {len(views)} images"
+    pairs = find_pairs([views[row] for row in chosen], T_cw[chosen], camera, config)
+    if not pairs:
+        return [], [], f"no map: no two of {len(chosen)} keyframes see the same"
+    connected = largest_part(pairs, len(chosen))
+    return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
+
+
+def _conclude(world: World, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
+    """Everything once more as one graph, with covariances, and back to where the given poses T_cw of the frames are."""
+    graph = world.history.graph(world.map, camera)
+    world.history.take(solve(graph, backward="detached"), graph, world.map)
+    row_of = {index: row for row, index in enumerate(frames.tolist())}
+    posed = [row_of[index] for index in world.history.frames["frame_index"].tolist()]
+    world.move(back_to_given(world.history.T_cw(world.map), T_cw[posed]))
 
 
 def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
@@ -222,14 +239,6 @@ def _renumbered(pairs: list[Pair], kept: list[int]) -> list[Pair]:
         for pair in pairs
         if pair.first in row_of and pair.second in row_of
     ]
-
-
-def _why_nothing(views: int, keyframes: int) -> str:
-    if views < FEWEST:
-        return f"no map: {views} images with a pose are too few"
-    if keyframes < FEWEST:
-        return f"no map: nothing moves in the {views} images"
-    return f"no map: no two of {keyframes} keyframes see the same"
 
 
 def _run(
