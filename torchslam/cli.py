@@ -1,4 +1,4 @@
-"""The command line: `torchslam run | demo | eval | plot | export | info | download`.
+"""The command line: `torchslam run | refine | demo | eval | plot | export | info | download`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
 130 and 143 ended by Ctrl-C and by SIGTERM.
@@ -21,6 +21,10 @@ INTERRUPTED = 130
 # Module, and the first line of its docstring: only that of the command at hand is imported.
 COMMANDS = {
     "run": ("run", "run SLAM on a sequence and write trajectory, map, figures and pictures"),
+    "refine": (
+        "refine",
+        "make poses of another program better by the images, and write them in the form that they had",
+    ),
     "demo": (
         "demo",
         "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",

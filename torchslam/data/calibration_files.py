@@ -63,7 +63,7 @@ def read_calibration(path: str | Path) -> Calibration:
         return _from_yaml(path, text)
     lines = [line for _, line in numbered_lines(path, CalibrationError)]
     if lines and COLMAP_LINE.match(lines[0]):
-        return _from_colmap(path, lines)
+        return from_colmap(path, lines)
     return read_numbers(path)
 
 
@@ -183,7 +183,7 @@ def _from_orb_slam(path: Path, text: str, prefix: str) -> Calibration:
     return checked(known, coefficients, str(path), "fisheye" if fisheye else "", size)
 
 
-def _from_colmap(path: Path, lines: list[str]) -> Calibration:
+def from_colmap(path: Path, lines: list[str]) -> Calibration:
     """The single camera of a cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`."""
     if len(lines) != 1:
         raise CalibrationError(f"{path}: {len(lines)} cameras; a file with the one to be used is needed")
