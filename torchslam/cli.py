@@ -30,7 +30,10 @@ COMMANDS = {
         "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",
     ),
     "eval": ("evaluate", "compare two trajectory files in TUM format: absolute and relative errors"),
-    "plot": ("plot", "draw the pictures of a run again, from the files in its folder of results"),
+    "plot": (
+        "plot",
+        "draw the pictures of a run and make its view.html again, from the files in its folder of results",
+    ),
     "export": (
         "export",
         "give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
