@@ -178,7 +178,7 @@ class Cut(Walk):
 @pytest.fixture
 def cut(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Cut]]:
     """The sequence that every command gets, and what it does in the middle."""
-    monkeypatch.setattr(arguments, "sequence", lambda options, needs_camera=True: Cut(arc(FRAMES)))
+    monkeypatch.setattr(arguments, "sequence", lambda options: Cut(arc(FRAMES)))
     monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])
     yield Cut
     Cut.do = staticmethod(lambda: None)
@@ -394,7 +394,7 @@ class Slow(Walk):
         time.sleep(float(sys.argv[1]))
         return super().image(index)
 
-arguments.sequence = lambda options, needs_camera=True: Slow(arc(FRAMES))
+arguments.sequence = lambda options: Slow(arc(FRAMES))
 sys.exit(main(sys.argv[2:]))
 """.replace("FRAMES", str(FRAMES))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from torchslam.config import CHOICES, Config, load_config
-from torchslam.data import Calibrated, Sequence, open_sequence
+from torchslam.data import Sequence, open_sequence
 from torchslam.data.presets import PRESETS
 
 SEQUENCE_HELP = (
@@ -48,11 +48,8 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def sequence(options: argparse.Namespace, needs_camera: bool = True) -> Sequence:
-    """The sequence that the arguments of `add_sequence` name; what is to know about it goes to stderr.
-
-    Raises CalibrationError where a camera is needed and missing.
-    """
+def sequence(options: argparse.Namespace) -> Sequence:
+    """The sequence that the arguments of `add_sequence` name; what is to know about it goes to stderr."""
     found = open_sequence(
         options.path,
         options.camera,
@@ -66,8 +63,6 @@ def sequence(options: argparse.Namespace, needs_camera: bool = True) -> Sequence
     )
     for note in found.notes:
         print(f"torchslam: {found.name}: {note}", file=sys.stderr)
-    if needs_camera and found.camera and found.calibrated is Calibrated.GUESSED:
-        print(f"torchslam: {found.name}: its camera is only a guess", file=sys.stderr)
     return found
 
 

@@ -13,5 +13,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    print(table(arguments.sequence(options, needs_camera=False).describe()))
+    print(table(arguments.sequence(options).describe()))
     return 0

@@ -87,7 +87,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.fix_camera and options.refine_distortion:
         raise ConfigError("--refine-distortion: --fix-camera leaves the camera as it is")
     given = read_poses(options.poses)
-    sequence = _with_camera(arguments.sequence(options, needs_camera=False), given, options.camera)
+    sequence = _with_camera(arguments.sequence(options), given, options.camera)
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.JUDGED
     plan = Plan(

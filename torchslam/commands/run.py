@@ -152,7 +152,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _sequence(options: argparse.Namespace) -> Sequence:
     """The sequence; without a calibration, as with `--camera auto`."""
-    found = arguments.sequence(options, needs_camera=False)
+    found = arguments.sequence(options)
     if found.calibrated is not Calibrated.MISSING or found.known_length is None:
         return found
     print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)

@@ -22,9 +22,7 @@ from torchslam.world.map import Map
 from torchslam.world.world import World
 
 _ITERATIONS = 20
-_SIDE = (
-    20  # keyframes on either side of a seam that are searched for the other side's points: what a visit has
-)
+_SIDE = 20  # keyframes on either side of a seam that are searched for the other's points: what a visit has
 
 
 def close_loop(found: Recognition, camera: Camera, config: Config) -> None:

@@ -22,10 +22,8 @@ from torchslam.values import Tracked, View
 
 _DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
 _NEIGHBOURS = 3  # of a keypoint that say whether it belongs
-_PATIENCE, _LESS = (
-    10,
-    3,
-)  # comparisons in which what was seen to move, and what is only near it, may agree with the map
+# Comparisons in which what was seen to move, and what is only near it, may agree with the map.
+_PATIENCE, _LESS = 10, 3
 _REACH = 0.06  # of the image's width: what is further from all that is known to belong does not
 
 

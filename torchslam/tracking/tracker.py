@@ -29,9 +29,7 @@ from torchslam.world.track import Track
 from torchslam.world.world import World
 
 MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
-NEGLIGIBLE = (
-    1e-4  # share of the cost that a step must promise: less moves the pose by hundredths of its noise
-)
+NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 
 
