@@ -107,6 +107,21 @@ class TrackingConfig(Settings, section="tracking"):
 
 
 @dataclass(frozen=True)
+class PatchesConfig(Settings, section="patches"):
+    """When a frame is followed by patches of an earlier one, without features of its own."""
+
+    enabled: bool = False
+    count: int = setting(300, low=20)  # patches that are followed
+    min_similarity: float = setting(0.8, low=0, high=1)  # normalised cross-correlation with the earlier frame
+    min_share: float = setting(0.6, above=0, high=1)  # of the patches, that must agree with the pose
+    max_frames: int = setting(5, low=1)  # followed one after the other
+    # of the overlap at which a frame becomes a keyframe: patches are lost sooner than matches
+    overlap_share: float = setting(0.8, above=0)
+    # frames after which is known what came of one that was found by its features: it is mapped meanwhile
+    delay: int = setting(2, low=0, high=64)
+
+
+@dataclass(frozen=True)
 class StillnessConfig(Settings, section="stillness"):
     """When pixels stay in place that should have moved with the scene, as logos and dirt on the lens do."""
 
@@ -224,6 +239,7 @@ class Config(Settings):
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    patches: PatchesConfig = field(default_factory=PatchesConfig)
     stillness: StillnessConfig = field(default_factory=StillnessConfig)
     independent_motion: IndependentMotionConfig = field(default_factory=IndependentMotionConfig)
     judge: JudgeConfig = field(default_factory=JudgeConfig)

@@ -41,6 +41,7 @@ from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_
 from torchslam.output.view import VIEW, write_view
 from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
 from torchslam.run import Frames, Progressed, Run, run_sequence
+from torchslam.scouting import Scouting
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
 
@@ -208,6 +209,8 @@ def frames_of(
         print(f"torchslam: one process: {alone}", file=sys.stderr)
     if alone or processes == 1:
         return nullcontext(sequence)
+    if slam.config.patches.enabled:
+        return Scouting(sequence, slam)
     return Ahead(sequence, slam.camera, slam.config, slam.clock, processes - 1)
 
 

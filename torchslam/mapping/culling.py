@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import transform
-from torchslam.mapping.keyframes import apart
+from torchslam.geometry.motion import apart
 from torchslam.world.compaction import Renumbering, remove_keyframes
 from torchslam.world.map import Map
 from torchslam.world.world import World

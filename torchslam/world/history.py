@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers.graph import GraphSolution, ObservationGraph
 from torchslam.values import Tracked, Trajectory, View
-from torchslam.world.map import Map, key_of
+from torchslam.world.map import NO_KEYPOINT, Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
 
@@ -22,7 +22,8 @@ class RunGraph(ObservationGraph):
     frame_ids:      (F,) frames of the sequence of their session
     sessions:       (F,) which run over the map saw them
     point_ids:      (P,) rows of the points of the map of their world
-    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end
+    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
+                    NO_KEYPOINT where a patch was followed
     """
 
     frame_ids: Tensor
@@ -51,7 +52,9 @@ class History:
         self.observations.append(
             row=row.expand(tracked.inliers),
             point_ids=tracked.point_ids,
-            keypoints=tracked.keypoints,
+            keypoints=tracked.keypoints
+            if view.has_features
+            else torch.full_like(tracked.keypoints, NO_KEYPOINT),
             pixels=view.keypoints[tracked.keypoints],
             scales=view.scales[tracked.keypoints],
         )

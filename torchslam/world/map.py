@@ -17,6 +17,7 @@ from torchslam.world.schema import KEYFRAMES, POINTS
 from torchslam.world.table import Table
 
 NO_POINT = -1
+NO_KEYPOINT = -1  # of what a frame without features sees
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.geometry import Camera
 from torchslam.values import View
-from torchslam.world.map import Map
+from torchslam.world.map import NO_KEYPOINT, Map
 from torchslam.world.schema import Schema
 
 Columns = dict[str, dict[str, Tensor]]
@@ -128,7 +128,7 @@ def _check_rows(columns: Columns, sessions: int) -> None:
         (frames, "reference", 0, num_keyframes),
         (seen, "row", 0, num_frames),
         (seen, "point_ids", 0, num_points),
-        (seen, "keypoints", 0, None),
+        (seen, "keypoints", NO_KEYPOINT, None),
     )
     for table, name, low, end in ranges:
         rows = table.get(name)
