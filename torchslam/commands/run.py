@@ -268,7 +268,7 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
         _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
-    figures["camera"] = "; but over all frames ".join(filter(None, (camera, judged(finished))))
+    figures["camera"] = judged(finished, camera)
     figures["dropped"] = sequence.dropped
     figures["source"] = full_name(plan.source)
     paint([world.map for world in finished.worlds], sequence, finished.session)
