@@ -9,6 +9,10 @@
 
 Lengths are in map units. Up is the mean up direction of the keyframes' cameras: gravity is not known. Images are read
 again from the sequence that the run read.
+
+Then, for example, `ns-train splatfacto --data DIR/export/nerfstudio`, `train.py -s DIR/export/colmap` (3D Gaussian
+Splatting knows pinhole cameras alone: --undistort), `rerun DIR/export/recording.rrd`, `evo_traj tum
+DIR/export/trajectory.txt`.
 """
 
 from __future__ import annotations
@@ -51,7 +55,8 @@ class Job:
 
     directory: of the results; figures: of the run, from there
     world, camera: from its map
-    source:    what the images are read from; None where they are not wanted, or nothing says where they are
+    source:    what the images are read from, and
+    fps:       at what rate, where the run was told; None where they are not wanted, or nothing says where they are
     undistort: whether images and keypoints are to be as of a pinhole camera
     """
 
@@ -63,6 +68,7 @@ class Job:
     keyframes_alone: bool
     undistort: bool
     source: str | None
+    fps: float | None
 
     @property
     def session(self) -> int:
@@ -79,7 +85,7 @@ class Job:
         scene = scene_of(self.world, self.camera, self.session, self.keyframes_alone)
         images = None
         if self.source is not None:
-            images = open_images(self.source, scene, self.undistort)
+            images = open_images(self.source, scene, self.undistort, self.fps)
         return (undistorted(scene) if self.undistort else scene), images
 
     def trajectory(self) -> Trajectory:
@@ -167,6 +173,7 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
         keyframes_alone=keyframes_alone,
         undistort=options.undistort or options.to == "rerun",
         source=source,
+        fps=figures.get("source_fps"),
     )
 
 

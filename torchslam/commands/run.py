@@ -55,7 +55,8 @@ Errors = TypeVar("Errors")
 class Plan:
     """Where a run reads and writes.
 
-    source:     what the sequence was opened from, for those that need its images again
+    source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
+                where that was said
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
@@ -77,6 +78,7 @@ class Plan:
     processes: int | None = None
     view: bool = False
     video: bool = False
+    fps: float | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -146,6 +148,7 @@ def execute(options: argparse.Namespace) -> int:
         processes=options.processes,
         view=options.view,
         video=options.video,
+        fps=options.fps,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -270,7 +273,7 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
     )
     figures["camera"] = judged(finished, camera)
     figures["dropped"] = sequence.dropped
-    figures["source"] = full_name(plan.source)
+    figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)
     results = read_results(plan.output)
