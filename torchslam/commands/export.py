@@ -190,7 +190,7 @@ def _colmap(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
-    return {"camera": colmap_camera(scene.camera)[0]} | _figures(scene)
+    return {"camera": colmap_camera(scene.camera)[0]} | _figures(job, scene)
 
 
 def _nerfstudio(job: Job) -> dict[str, str]:
@@ -198,19 +198,23 @@ def _nerfstudio(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_nerfstudio(job.output, scene, job.R_up)
-    return _figures(scene)
+    return _figures(job, scene)
 
 
 def _rerun(job: Job) -> dict[str, str]:
     scene, images = job.scene()
     write_recording(job.output, scene, job.R_up, images)
-    return _figures(scene)
+    return _figures(job, scene)
 
 
-def _figures(scene: Scene) -> dict[str, str]:
+def _figures(job: Job, scene: Scene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
+    frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
+    if job.keyframes_alone:
+        posed = job.world.history.count(job.session)
+        frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all takes all of them"
     return {
-        "frames": f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes",
+        "frames": frames,
         "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
         "error": f"{error:.4f} px, mean over the points",
     }
