@@ -29,7 +29,7 @@ class FeaturesConfig(Settings, section="features"):
     def reduction(self, size: tuple[int, int]) -> float:
         """By what factor, in width and in height, images (width, height) are reduced: at least 1."""
         pixels = size[0] * size[1]
-        if self.image_pixels == 0 or pixels <= TOLERATED * self.image_pixels:
+        if self.kind == "simulated" or self.image_pixels == 0 or pixels <= TOLERATED * self.image_pixels:
             return 1.0
         return math.sqrt(pixels / self.image_pixels)
 

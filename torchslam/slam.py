@@ -57,6 +57,9 @@ class SLAM:
 
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
     `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
+
+    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones; set it
+    to 0 for an extractor of one's own that does not reduce them.
     """
 
     def __init__(

@@ -56,7 +56,8 @@ Errors = TypeVar("Errors")
 class Plan:
     """Where a run reads and writes.
 
-    source:     what the sequence was opened from, for those that need its images again
+    source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
+                where that was said
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
@@ -78,6 +79,7 @@ class Plan:
     processes: int | None = None
     view: bool = False
     video: bool = False
+    fps: float | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -147,6 +149,7 @@ def execute(options: argparse.Namespace) -> int:
         processes=options.processes,
         view=options.view,
         video=options.video,
+        fps=options.fps,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -271,9 +274,9 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
         _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
-    figures["camera"] = "; but over all frames ".join(filter(None, (camera, judged(finished))))
+    figures["camera"] = judged(finished, camera)
     figures["dropped"] = sequence.dropped
-    figures["source"] = full_name(plan.source)
+    figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)
     results = read_results(plan.output)
