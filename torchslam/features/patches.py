@@ -14,6 +14,8 @@ from torch import Tensor
 RADIUS = 4  # pixels of a level from the middle of a patch to its edge
 LEVELS = 3  # the coarsest patch covers four times as many pixels in width and height as the finest
 ITERATIONS = 3  # on each level; the coarser ones leave less than a pixel to the finest
+LEAST_CONTRAST = 1 / 255  # standard deviation of a patch: less is what the camera's steps of grey make
+CONVERGED = 0.5  # pixels: the last of them that moves a patch by less has found it
 
 Pyramid = tuple[Tensor, ...]
 
@@ -97,11 +99,16 @@ def cut(images: Pyramid, pixels: Tensor) -> Patches:
             dim=-2,
         )
         basis = basis - basis.mean(-1, keepdim=True)
-        inverse, failed = torch.linalg.inv_ex(basis @ basis.mT)
-        filters.append(inverse @ basis)
+        is_flat = basis[..., 2, :].square().mean(-1) < LEAST_CONTRAST**2
+        basis = torch.where(is_flat[..., None, None], 0.0, basis)
+        normal = basis @ basis.mT
+        unsolvable = torch.linalg.inv_ex(normal.detach()).info != 0
+        eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+        normal = torch.where(unsolvable[..., None, None], eye, normal)
+        filters.append(torch.linalg.solve(normal, basis))
         if level == 0:
             template = F.normalize(basis[..., 2, :], dim=-1)
-            usable = usable & (failed == 0)
+            usable = usable & ~unsolvable
     return Patches(pixels, tuple(filters), template, usable)
 
 
@@ -111,23 +118,51 @@ def align(
     """Find patches in other images, from a start (B, N, 2).
 
     warps: (B, N, 2, 2) from displacements in the image of the patches to displacements in these
+
+    Where an alignment has converged, its pixels have the gradient of the place where the displacement is zero, with
+    respect to both images; elsewhere none.
     """
+    around = offsets(RADIUS, start) @ warps.mT
     with torch.no_grad():
-        around = offsets(RADIUS, start) @ warps.mT
-        pixels, step = start, torch.zeros_like(start)
-        for level in range(len(images) - 1, -1, -1):
-            at = at_level(pixels, level)
-            for _ in range(iterations):
-                found = sample(images[level], at[:, :, None] + around)
-                measured = (patches.filters[level] @ found[..., None])[..., 0]
-                step = (measured[..., :2] / measured[..., 2:]).clamp(-RADIUS, RADIUS)
-                at = at - (warps @ step[..., None])[..., 0]
-            pixels = (at + 0.5) * 2**level - 0.5
-        found = sample(images[0], pixels[:, :, None] + around)
-        found = F.normalize(found - found.mean(-1, keepdim=True), dim=-1)
-        similarity = (found * patches.template).sum(-1)
-        mask = patches.mask & inside(pixels, images[0], RADIUS) & (step.abs().amax(-1) < 0.5)
-    return Aligned(pixels, similarity, mask)
+        pixels, last = _descend(patches, images, start, warps, around, iterations)
+        mask = patches.mask & inside(pixels, images[0], RADIUS) & (last < CONVERGED)
+    if torch.is_grad_enabled() and (images[0].requires_grad or patches.template.requires_grad):
+        pixels = _attached(patches, images[0], pixels, around, mask)
+    found = sample(images[0], pixels[:, :, None] + around)
+    found = F.normalize(found - found.mean(-1, keepdim=True), dim=-1)
+    similarity = (found * patches.template).sum(-1)
+    return Aligned(torch.where(mask[..., None], pixels, start), similarity, mask)
+
+
+def _descend(
+    patches: Patches, images: Pyramid, start: Tensor, warps: Tensor, around: Tensor, iterations: int
+) -> tuple[Tensor, Tensor]:
+    """(B, N, 2) where patches are in images, from the coarsest level to the finest; (B, N) size of the last step."""
+    pixels, step = start, torch.zeros_like(start)
+    for level in range(len(images) - 1, -1, -1):
+        at = at_level(pixels, level)
+        for _ in range(iterations):
+            found = sample(images[level], at[:, :, None] + around)
+            measured = (patches.filters[level] @ found[..., None])[..., 0]
+            step = (measured[..., :2] / measured[..., 2:]).nan_to_num().clamp(-RADIUS, RADIUS)
+            at = at - (warps @ step[..., None])[..., 0]
+        pixels = (at + 0.5) * 2**level - 0.5
+    return pixels, step.abs().amax(-1)
+
+
+def _attached(patches: Patches, image: Tensor, pixels: Tensor, around: Tensor, mask: Tensor) -> Tensor:
+    """The same pixels with the gradient of where the displacement that is measured is zero (implicit function)."""
+    finest = patches.filters[0][..., :2, :]
+    with torch.enable_grad():
+        moved = pixels.detach().requires_grad_()
+        there = sample(image.detach(), moved[:, :, None] + around)
+        measured = (finest.detach() @ there[..., None])[..., 0]
+        rows = [torch.autograd.grad(measured[..., k].sum(), moved, retain_graph=True)[0] for k in range(2)]
+    inverse, failed = torch.linalg.inv_ex(torch.stack(rows, dim=-2))
+    inverse = torch.where((mask & (failed == 0))[..., None, None], inverse, 0.0)
+    measured = (finest @ sample(image, pixels.detach()[:, :, None] + around)[..., None])[..., 0]
+    step = (inverse @ measured[..., None])[..., 0]
+    return pixels - (step - step.detach())
 
 
 def inside(pixels: Tensor, image: Tensor, margin: float) -> Tensor:
