@@ -34,9 +34,7 @@ def find_in(
         return point_ids[:0], point_ids[:0]
     table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
     features = slam_map.features(keyframes)
-    finest = features.scales.masked_fill(~features.mask, torch.inf).amin(1, keepdim=True)
-    coarsest = features.scales.masked_fill(~features.mask, 0.0).amax(1, keepdim=True)
-    T_cw, sizes = slam_map.T_cw[keyframes], (finest, coarsest)
+    T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
     pixels, scales, visible = look_at(slam_map, point_ids, T_cw, camera, angle, sizes)
     observers, _ = slam_map.scales_of(point_ids)
     visible &= (observers != keyframes[:, None, None]).all(-1)

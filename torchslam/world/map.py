@@ -85,14 +85,18 @@ class Map:
             mask=points["alive"][point_ids][None],
         )
 
-    def features(self, keyframes: Tensor) -> Features:
-        """What keyframes (k,) saw, as a batch, for matching."""
-        table = self.keyframes
-        scales, mask = table["scales"][keyframes], table["mask"][keyframes]
-        keypoints, angles, descriptors = (
-            table[name][keyframes] for name in ("keypoints", "angles", "descriptors")
-        )
+    def features(self, keyframes: Tensor, rows: Tensor | None = None) -> Features:
+        """What keyframes (k,) saw, as a batch, for matching: all keypoints, or some rows (k, n) of them."""
+        at = (keyframes,) if rows is None else (keyframes[:, None], rows)
+        names = ("keypoints", "scales", "angles", "descriptors", "mask")
+        keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
+
+    def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
+        """(k, 1), (k, 1) the finest and the coarsest scale among the keypoints of keyframes (k,)."""
+        scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
+        finest = scales.masked_fill(~mask, torch.inf).amin(1, keepdim=True)
+        return finest, scales.masked_fill(~mask, 0.0).amax(1, keepdim=True)
 
     def centre_covariances_w(self) -> Tensor:
         """(K, 3, 3) covariances of the positions of the keyframes, zero where unknown."""
