@@ -112,14 +112,14 @@ class BundleMinimization:
         bundle = self._bundle(Given(*inputs))
         layout = bundle.layout
         with torch.no_grad():
-            exact = bundle.exact_factorized(self._ordered(found, layout))
+            solver = bundle.exact_solver(self._ordered(found, layout))
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = right
             tangent = Tangent(
                 frames.index_select(0, layout.free_frames), points.index_select(0, layout.point_order), camera
             )
-            solved = exact.solve(tangent)
+            solved = solver(tangent)
             spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, solved.frames)
             vector = spread, solved.points.index_select(0, layout.point_rank), solved.camera
             return tuple(torch.where(found.success, part, 0.0) for part in vector)
