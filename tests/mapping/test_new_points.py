@@ -11,9 +11,10 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
-from torchslam.geometry import se3_inverse, transform, triangulation_covariance
+from torchslam.geometry import se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.mapping.new_points import (
     FreeKeypoints,
+    around,
     has_baseline,
     has_consistent_scale,
     match_along_epipolar_lines,
@@ -264,3 +265,29 @@ def test_sizes_beyond_those_of_the_detector_are_not_expected() -> None:
     assert has_consistent_scale(points_w, pose(), ahead, one, two, (finest, coarse)).all()
     assert not has_consistent_scale(points_w, pose(), ahead, one, two, (finest, coarser)).any()
     assert transform(pose(0, 0, -4.0), points_w)[0, 2] == 2.0
+
+
+def test_angles_around_an_axis() -> None:
+    generator = torch.Generator().manual_seed(0)
+    axes, rays = (
+        torch.randn(*shape, 3, generator=generator, dtype=torch.float64) for shape in ((4,), (4, 9))
+    )
+    axes[0] = torch.tensor([0.0, 0.0, 2.0])
+    angles, sines = around(axes, rays)
+    unit, across = (torch.nn.functional.normalize(x, dim=-1) for x in (axes[:, None], rays))
+    torch.testing.assert_close(sines, torch.linalg.cross(unit.expand_as(rays), across).norm(dim=-1))
+    turn = so3_exp(0.3 * unit[:, 0])
+    turned, _ = around(axes, rays @ turn.mT)
+    torch.testing.assert_close(torch.remainder(turned - angles, 2 * math.pi), torch.full_like(angles, 0.3))
+
+
+def test_a_window_reaches_over_the_end_of_a_turn() -> None:
+    """Forwards the planes turn around the middle of the image: all angles occur."""
+    ahead = torch.stack([pose(), pose(0, 0, -0.8)])
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ahead)]
+    rows = [torch.nonzero(view.mask)[:, 0] for view in views]
+    first, second = matched(views, rows, ahead[1])
+    shows = SCENE.shows(0)[first]
+    assert torch.equal(shows, SCENE.shows(1)[second])
+    both = set(SCENE.shows(0)[rows[0]].tolist()) & set(SCENE.shows(1)[rows[1]].tolist())
+    assert len(first) == len(both) > 50

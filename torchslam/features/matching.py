@@ -146,6 +146,36 @@ def match_projected(
     return _matches(local, distance, _one_to_one(local, distance.detach(), accepted, columns))
 
 
+@full_precision
+def match_pairs(
+    descriptors_1: Tensor, descriptors_2: Tensor, rows: Tensor, columns: Tensor, max_distance: float
+) -> tuple[Tensor, Tensor]:
+    """Who of some pairs are each other's nearest: rows (m,), ascending, and columns (m,).
+
+    descriptors_1, descriptors_2: (N1, 32) uint8 or (N1, D) unit-length floats, likewise (N2, ...)
+    rows, columns: (P,), (P,) the pairs that may match; max_distance: Hamming bits, or 1 - cosine for floats
+
+    Raises ValueError if the descriptors do not go together.
+    """
+    _check_descriptors(descriptors_1[None], descriptors_2[None])
+    distances = _pair_distances(_take(descriptors_1, rows), _take(descriptors_2, columns))
+    near = torch.nonzero(distances <= max_distance).squeeze(1)
+    rows, columns, distances = _take(rows, near), _take(columns, near), _take(distances, near)
+    column, found, _ = _best_of_pairs(rows, columns, distances, None, len(descriptors_1), None)
+    row, _, _ = _best_of_pairs(columns, rows, distances, None, len(descriptors_2), None)
+    kept = torch.nonzero(found).squeeze(1)
+    kept = kept[row[column[kept]] == kept]
+    return kept, column[kept]
+
+
+def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
+    counts = ends - starts
+    run = torch.repeat_interleave(counts)
+    shift = starts - (counts.cumsum(0) - counts)
+    return run, torch.arange(run.shape[0], device=run.device) + _take(shift, run)
+
+
 def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
     """(B, N1, N2) bool, the pairs that may match."""
     possible = mask_1[:, :, None] & mask_2[:, None, :]
@@ -240,11 +270,8 @@ def _window_pairs(
         torch.searchsorted(keys, key(bands, (pixels[..., 0] + sign * radius)[..., None]), right=sign > 0)
         for sign in (-1, 1)
     )
-    counts = torch.where(used, right - left, 0).flatten()
-    run = torch.repeat_interleave(counts)
-    starts = left.flatten() - (counts.cumsum(0) - counts)
-    row = torch.div(run, spans, rounding_mode="floor")
-    column = _take(order, torch.arange(run.shape[0], device=run.device) + _take(starts, run))
+    run, place = expand_runs(left.flatten(), torch.where(used, right, left).flatten())
+    row, column = torch.div(run, spans, rounding_mode="floor"), _take(order, place)
     dx, dy = (
         _take(keypoints[..., k].flatten(), column) - _take(pixels[..., k].flatten(), row) for k in (0, 1)
     )
@@ -270,7 +297,7 @@ def _pair_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
 
 
 def _best_of_pairs(
-    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor, rows: int, ratio: float | None
+    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor | None, rows: int, ratio: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of each row the nearest column, whether it passes the ratio test, and its distance (with its graph): (rows,).
 
@@ -291,7 +318,7 @@ def _best_of_pairs(
     distance = torch.where(found, nearest, torch.inf)
     if distances.requires_grad:
         distance = torch.where(found, distances[best_pair], torch.inf)
-    if ratio is not None:
+    if ratio is not None and scales is not None:
         same = (_take(scales, column) / _take(scales[best], row) - 1).abs() < 0.05
         rival_row, rival_value = _where(same & ~chosen, row, values)
         second = _lowest(rival_row, rival_value, rows)

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchslam.config import Config, MatchingConfig
-from torchslam.features import match
+from torchslam.features import expand_runs, match_pairs
 from torchslam.geometry import (
     Camera,
     fits,
     se3_inverse,
-    skew,
     transform,
     triangulate,
     triangulation_covariance,
@@ -111,31 +111,39 @@ def match_along_epipolar_lines(
     T_21: (k, 4, 4) from the one camera to the others. Returns for every match (m,) which of the others it is with, and
     the rows in `here` and `there`, ordered by these three.
 
-    The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it.
+    The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
+    contain the baseline, so that a plane is an angle around it.
     """
-    essential = skew(T_21[:, :3, 3]) @ T_21[:, :3, :3]
-    planes = _unit(torch.nn.functional.pad(here.normalized, (0, 1), value=1.0) @ essential.mT)
-    rays_2 = _unit(torch.nn.functional.pad(there.normalized, (0, 1), value=1.0))
-    sine = (planes.float() @ rays_2.float().mT).abs_()
-    width = (epipolar_px / camera.focal * there.features.scales).float()
-    count, features = len(T_21), here.features
-    expanded = Features(
-        *(getattr(features, name).expand(count, *x.shape[1:]) for name, x in vars(features).items())
+    rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
+    (angles_1, _), (angles_2, sines) = (
+        around(T_21[:, :3, 3], rays) for rays in (rays_1, pad(there.normalized, (0, 1), value=1.0))
     )
-    matches = match(
-        expanded,
-        there.features,
-        ratio=None,
-        max_distance=0.8 * max_distance(features.descriptors, settings),
-        allowed=sine < width[:, None, :],
+    width = epipolar_px / camera.focal * there.features.scales / sines.clamp(min=1e-12)
+    width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
+    # A number per angle and neighbour, each a turn below and above as well: a window may reach over the end of a turn.
+    offset = 6 * math.pi * torch.arange(len(T_21), device=width.device)[:, None]
+    turns = 2 * math.pi * torch.arange(-1, 2, device=width.device)
+    keys, order = (angles_1[..., None] + offset[..., None] + turns).flatten().sort(stable=True)
+    left, right = (torch.searchsorted(keys, angles_2 + offset + sign * width) for sign in (-1, 1))
+    column, place = expand_runs(left.flatten(), torch.where(there.features.mask, right, left).flatten())
+    count, descriptors = angles_1.shape[1], here.features.descriptors
+    row, column = match_pairs(
+        descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
+        there.features.descriptors.flatten(0, 1),
+        order[place] // 3,
+        column,
+        0.8 * max_distance(descriptors, settings),
     )
-    which, row = torch.nonzero(matches.mask, as_tuple=True)
-    return which, row, matches.indices_2[which, row]
+    return row // count, row % count, column % width.shape[1]
 
 
-def _unit(vectors: Tensor) -> Tensor:
-    """Vectors (..., 3), not zero, at unit length."""
-    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp(min=1e-12)
+def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """(k, n), (k, n) angles of rays (k, n, 3) around axes (k, 3), radians, and the sines of their angles to these."""
+    least = torch.nn.functional.one_hot(axes.abs().argmin(-1), 3).to(axes.dtype)
+    across = torch.nn.functional.normalize(torch.linalg.cross(axes, least), dim=-1)
+    other = torch.linalg.cross(torch.nn.functional.normalize(axes, dim=-1), across)
+    x, y = (rays @ torch.stack((across, other), dim=-1)).unbind(-1)
+    return torch.atan2(y, x), torch.hypot(x, y) / torch.linalg.vector_norm(rays, dim=-1)
 
 
 def has_consistent_scale(
