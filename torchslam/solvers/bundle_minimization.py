@@ -73,10 +73,12 @@ class BundleMinimization:
         iterations: int,
         tolerance: float,
         progress: Progress | None,
+        check: bool = True,
     ) -> None:
         self.camera, self.kernel, self.free_camera = camera, kernel, free_camera is not False
         self.directions = free_camera if isinstance(free_camera, Tensor) else None
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
+        self.check = check
         self._last: tuple[Tensor, Layout] | None = None
 
     def minimize(self, inputs: Tensors) -> Found:
@@ -85,9 +87,9 @@ class BundleMinimization:
         layout = bundle.layout
         model, convergence = minimize(bundle, bundle.start, self.iterations, self.tolerance, self.progress)
         with torch.no_grad():
-            success = (
-                bundle.solvable[0] & bundle.factorized(model).reduced.definite & given.finite_frames.all()
-            )
+            success = bundle.solvable[0] & given.finite_frames.all()
+            if self.check:
+                success = success & bundle.factorized(model).reduced.definite
         moved_frames = torch.zeros_like(given.free_frames)
         moved_frames[layout.free_frames] = True
         used = torch.zeros_like(given.counted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -113,11 +114,18 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleModel:
-    """The local model of the cost (1,) at an estimate."""
+    """The local model of the cost (1,) at an estimate; its equations are made when they are asked for.
+
+    Where a minimisation ends nobody asks, and they are most of the work.
+    """
 
     estimate: Estimate
     cost: Tensor
-    equations: NormalEquations
+    assembled: Callable[[], NormalEquations]
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        return self.assembled()
 
 
 class Bundle:
@@ -142,9 +150,12 @@ class Bundle:
     def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
         R_cw, rays_w, points_c = self._seen(estimate)
         lin = linearize(self._observations(estimate), points_c, self.free_camera)
-        expansion = gauss_newton_expansion(lin, self._in_world(lin.J.movedim(0, -1), R_cw), near)
-        equations = assemble(self.layout.structure, expansion, rays_w, self.layout.free_points, exact=False)
-        return BundleModel(estimate, lin.cost.sum()[None], equations)
+
+        def assembled() -> NormalEquations:
+            expansion = gauss_newton_expansion(lin, self._in_world(lin.J.movedim(0, -1), R_cw), near)
+            return assemble(self.layout.structure, expansion, rays_w, self.layout.free_points, exact=False)
+
+        return BundleModel(estimate, lin.cost.sum()[None], assembled)
 
     def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
         equations, estimate = model.equations, model.estimate
