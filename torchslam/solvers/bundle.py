@@ -101,6 +101,7 @@ def bundle_adjust(
     iterations: int = 20,
     tolerance: float = 1e-8,
     progress: Progress | None = None,
+    check: bool = True,
 ) -> BundleSolution:
     """Minimise robust reprojection errors over poses, points and, if `free_camera`, the camera's parameters.
 
@@ -111,6 +112,7 @@ def bundle_adjust(
               `implicit.Backward`. The gradient ends at the start values of what moves.
     tolerance: stop where a step promises to lower the cost by less than this share of it
     progress: called with the number of each iteration and the most there are; what it raises is raised here
+    check:    find out whether all that moves is determined; else `success` is for the start alone, a tenth is saved
 
     Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
     positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
@@ -121,7 +123,9 @@ def bundle_adjust(
     counted, finite_frames, inputs = _sanitized(problem, scale)
     free_frames = ~_as_mask(problem.fixed_frames, len(problem.T_cw), problem.T_cw.device)
     free_points = ~_as_mask(problem.fixed_points, len(problem.points_w), problem.T_cw.device)
-    minimization = BundleMinimization(problem.camera, kernel, free_camera, iterations, tolerance, progress)
+    minimization = BundleMinimization(
+        problem.camera, kernel, free_camera, iterations, tolerance, progress, check
+    )
     indices = problem.frame_index, problem.point_index
     tensors = Given(*inputs, counted, finite_frames, *indices, free_frames, free_points)
     if backward == "unroll":

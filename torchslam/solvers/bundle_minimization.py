@@ -73,10 +73,12 @@ class BundleMinimization:
         iterations: int,
         tolerance: float,
         progress: Progress | None,
+        check: bool = True,
     ) -> None:
         self.camera, self.kernel, self.free_camera = camera, kernel, free_camera is not False
         self.directions = free_camera if isinstance(free_camera, Tensor) else None
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
+        self.check = check
         self._last: tuple[Tensor, Layout] | None = None
 
     def minimize(self, inputs: Tensors) -> Found:
@@ -85,9 +87,9 @@ class BundleMinimization:
         layout = bundle.layout
         model, convergence = minimize(bundle, bundle.start, self.iterations, self.tolerance, self.progress)
         with torch.no_grad():
-            success = (
-                bundle.solvable[0] & bundle.factorized(model).reduced.definite & given.finite_frames.all()
-            )
+            success = bundle.solvable[0] & given.finite_frames.all()
+            if self.check:
+                success = success & bundle.factorized(model).reduced.definite
         moved_frames = torch.zeros_like(given.free_frames)
         moved_frames[layout.free_frames] = True
         used = torch.zeros_like(given.counted)
@@ -112,14 +114,14 @@ class BundleMinimization:
         bundle = self._bundle(Given(*inputs))
         layout = bundle.layout
         with torch.no_grad():
-            exact = bundle.exact_factorized(self._ordered(found, layout))
+            solver = bundle.exact_solver(self._ordered(found, layout))
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = right
             tangent = Tangent(
                 frames.index_select(0, layout.free_frames), points.index_select(0, layout.point_order), camera
             )
-            solved = exact.solve(tangent)
+            solved = solver(tangent)
             spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, solved.frames)
             vector = spread, solved.points.index_select(0, layout.point_rank), solved.camera
             return tuple(torch.where(found.success, part, 0.0) for part in vector)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -10,10 +12,9 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
-from torchslam.solvers.assembly import assemble
+from torchslam.solvers.assembly import assemble, product
 from torchslam.solvers.residuals import (
     Expansion,
-    Linearization,
     Observations,
     exact_expansion,
     gauss_newton_expansion,
@@ -26,6 +27,7 @@ from torchslam.solvers.schur import (
     Marginals,
     NormalEquations,
     Structure,
+    Tangent,
     build_structure,
 )
 from torchslam.solvers.tangent import retract
@@ -112,11 +114,18 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleModel:
-    """The local model of the cost (1,) at an estimate."""
+    """The local model of the cost (1,) at an estimate; its equations are made when they are asked for.
+
+    Where a minimisation ends nobody asks, and they are most of the work.
+    """
 
     estimate: Estimate
     cost: Tensor
-    equations: NormalEquations
+    assembled: Callable[[], NormalEquations]
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        return self.assembled()
 
 
 class Bundle:
@@ -128,12 +137,6 @@ class Bundle:
         """free_camera: whether all parameters (K,) move, or the directions (K, n) in which they do."""
         self.layout, self.free_camera = layout, free_camera is not False
         self.directions = free_camera if isinstance(free_camera, Tensor) else None
-        self.columns: Tensor | None = (
-            None  # (3 + K, 3 + n) from the point and the directions to the parameters
-        )
-        if self.directions is not None:
-            eye = torch.eye(3, dtype=self.directions.dtype, device=self.directions.device)
-            self.columns = torch.block_diag(eye, self.directions)
         self.observations = Observations(
             inputs.pixels.index_select(0, layout.observations),
             inputs.weights.index_select(0, layout.observations),
@@ -145,11 +148,14 @@ class Bundle:
         self.solvable = torch.tensor([len(layout.observations) > 0], device=inputs.pixels.device)
 
     def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
-        lin, points_c, R_cw = self._linearize(estimate)
-        expansion = gauss_newton_expansion(lin, near)
-        layout = self.layout
-        equations = assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=False)
-        return BundleModel(estimate, lin.cost.sum()[None], equations)
+        R_cw, rays_w, points_c = self._seen(estimate)
+        lin = linearize(self._observations(estimate), points_c, self.free_camera)
+
+        def assembled() -> NormalEquations:
+            expansion = gauss_newton_expansion(lin, self._in_world(lin.J.movedim(0, -1), R_cw), near)
+            return assemble(self.layout.structure, expansion, rays_w, self.layout.free_points, exact=False)
+
+        return BundleModel(estimate, lin.cost.sum()[None], assembled)
 
     def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
         equations, estimate = model.equations, model.estimate
@@ -157,7 +163,8 @@ class Bundle:
         step = factorized.solve(equations.gradient)
         decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
-        moved = retract(estimate.T_cw.index_select(0, frames), -step.frames)
+        T_free = estimate.T_cw.index_select(0, frames)
+        moved = retract(T_free, -_turned(T_free[:, :3, :3], step.frames[..., None])[..., 0])
         params = estimate.params - self._along(step.camera) if self.free_camera else estimate.params
         return (
             Estimate(estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params),
@@ -172,11 +179,14 @@ class Bundle:
         return new if bool(accept) else old
 
     def factorized(self, model: BundleModel) -> FactorizedEquations:
-        """The undamped equations of a model at a minimum, ready to be solved."""
+        """The undamped equations of a model at a minimum, ready to be solved; frames in the axes of the world."""
         return model.equations.factorized(gauge=self._gauge(model.estimate.T_cw))
 
     def _gauge(self, T_cw: Tensor) -> Tensor | None:
-        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is."""
+        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is.
+
+        In the axes of the world, as are all vectors of the equations.
+        """
         layout = self.layout
         is_anchor = torch.zeros(len(T_cw), dtype=torch.bool, device=T_cw.device)
         is_anchor[layout.frame_index] = True
@@ -189,11 +199,12 @@ class Bundle:
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
         scaling = torch.nn.functional.pad(transform(T_free, origin[None]).squeeze(-2), (0, 3))[..., None]
         motions = scaling if len(anchors) else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
+        motions = _turned(T_free[:, :3, :3].mT, motions)
         return torch.linalg.qr(motions.flatten(0, 1)).Q.view_as(motions)
 
     def marginals(self, estimate: Estimate) -> Marginals:
         """Covariances (F, 6, 6), (P, 3, 3), (K, K) in the order of the problem, zero for what does not move."""
-        lin, _, _ = self._linearize(estimate)
+        lin = linearize(self._observations(estimate), self._seen(estimate)[2], self.free_camera)
         model = self.evaluate(estimate, torch.zeros_like(self.solvable))
         layout, structure = self.layout, self.layout.structure
         num_parameters = (
@@ -201,21 +212,41 @@ class Bundle:
         )
         factor = variance_factor(self.observations, lin, num_parameters)
         free, points, camera = self.factorized(model).marginals()
+        R_cw = estimate.T_cw[layout.free_frames, :3, :3]
+        free = _turned(R_cw, _turned(R_cw, free).mT)
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         return Marginals(factor * frames, factor * points[layout.point_rank], factor * camera)
 
-    def exact_factorized(self, estimate: Estimate) -> FactorizedEquations:
-        """The exact Hessian at a minimum, ready to be solved."""
-        return self._exact_equations(estimate).factorized(gauge=self._gauge(estimate.T_cw))
+    def exact_solver(self, estimate: Estimate) -> Callable[[Tangent], Tangent]:
+        """The function v -> H^-1 v with the exact Hessian at a minimum."""
+        factorized = self._exact_equations(estimate).factorized(gauge=self._gauge(estimate.T_cw))
+        R_cw = estimate.T_cw[self.layout.free_frames, :3, :3]
 
-    def _linearize(self, estimate: Estimate) -> tuple[Linearization, Tensor, Tensor]:
-        """Errors, points in the camera frame (O', 3) and rotations (O', 3, 3) of the observing frames."""
-        T_cw = estimate.T_cw.index_select(0, self.layout.frame_index)
-        points_w = estimate.points_w.index_select(0, self.layout.point_index)
-        R_cw = T_cw[:, :3, :3]
-        points_c = (R_cw @ points_w[..., None]).squeeze(-1) + T_cw[:, :3, 3]
-        lin = linearize(self._observations(estimate), points_c, self.free_camera)
-        return lin if self.columns is None else lin._replace(J=lin.J @ self.columns), points_c, R_cw
+        def solve(right: Tangent) -> Tangent:
+            turned = right._replace(frames=_turned(R_cw.mT, right.frames[..., None])[..., 0])
+            solved = factorized.solve(turned)
+            return solved._replace(frames=_turned(R_cw, solved.frames[..., None])[..., 0])
+
+        return solve
+
+    def _seen(self, estimate: Estimate) -> tuple[Tensor, Tensor, Tensor]:
+        """Per observation the rotation (3, 3, O') of its frame, and the ray to its point: (3, O') in the axes of the
+        world and (O', 3) in those of the camera."""
+        R_cw = estimate.T_cw[:, :3, :3]
+        centres_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
+        frames = torch.cat((R_cw.flatten(1), centres_w[..., 0]), dim=-1)
+        rows = frames.index_select(0, self.layout.frame_index).mT.contiguous()
+        R_cw = rows[:9].unflatten(0, (3, 3))
+        rays_w = estimate.points_w.index_select(0, self.layout.point_index).mT - rows[9:]
+        return R_cw, rays_w, product(R_cw, rays_w[:, None])[:, 0].mT
+
+    def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
+        """Derivatives (m, 3 + K, O') in points_c and the camera, as such in points_w and what moves of the camera."""
+        points = product(rows[:, :3], R_cw)
+        if not self.free_camera:
+            return points
+        camera = rows[:, 3:] if self.directions is None else self.directions.mT @ rows[:, 3:]
+        return torch.cat((points, camera), dim=1)
 
     def _observations(self, estimate: Estimate) -> Observations:
         if not self.free_camera:
@@ -224,10 +255,13 @@ class Bundle:
         return self.observations.replaced((pixels, weights, estimate.params, scale))
 
     def _exact_equations(self, estimate: Estimate) -> NormalEquations:
-        _, points_c, R_cw = self._linearize(estimate)
-        expansion = exact_expansion(self._observations(estimate), points_c, self.free_camera)
-        if self.columns is not None:
-            gradient, hessian = expansion
-            expansion = Expansion(gradient @ self.columns, self.columns.mT @ hessian @ self.columns)
-        layout = self.layout
-        return assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
+        R_cw, rays_w, points_c = self._seen(estimate)
+        gradient, hessian = exact_expansion(self._observations(estimate), points_c, self.free_camera)
+        half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
+        expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
+        return assemble(self.layout.structure, expansion, rays_w, self.layout.free_points, exact=True)
+
+
+def _turned(R: Tensor, values: Tensor) -> Tensor:
+    """Both halves of tangent vectors (F, 6, n) turned by R (F, 3, 3)."""
+    return (R[:, None] @ values.unflatten(1, (2, 3))).flatten(1, 2)

@@ -181,16 +181,20 @@ class History:
         is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
         is_seen[point_ids] = True
         rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
-        own = {name: self.observations[name][rows] for name in ("row", "keypoints", "pixels", "scales")}
         keyframes = slam_map.keyframes
+
+        def with_own(values: Tensor, name: str) -> Tensor:
+            """A column at a time: the observations are most of what a long run holds in memory."""
+            return torch.cat([values, self.observations[name][rows]])
+
         return RunGraph(
             timestamps=torch.cat([keyframes["timestamp"], self.frames["timestamp"][between]]),
             T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
             points_w=slam_map.positions_w[point_ids],
-            frame_index=torch.cat([seen.keyframe_index, slot[own["row"]]]),
+            frame_index=torch.cat([seen.keyframe_index, slot[self.observations["row"][rows]]]),
             point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
-            pixels=torch.cat([seen.pixels, own["pixels"]]),
-            weights=torch.cat([seen.scales, own["scales"]]) ** -2,
+            pixels=with_own(seen.pixels, "pixels"),
+            weights=with_own(seen.scales, "scales") ** -2,
             camera=camera,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
@@ -198,7 +202,7 @@ class History:
             world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
             sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
             point_ids=point_ids,
-            keypoint_index=torch.cat([seen.keypoint_index, own["keypoints"]]),
+            keypoint_index=with_own(seen.keypoint_index, "keypoints"),
         )
 
     def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
