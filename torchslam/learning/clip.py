@@ -24,6 +24,8 @@ from torchslam.solvers.graph import GraphSolution, solve
 from torchslam.values import Features, Frame
 from torchslam.world.history import RunGraph
 
+OnFailure = Literal["raise", "skip"] | float
+
 
 @dataclass(frozen=True)
 class ClipGraph:
@@ -87,12 +89,19 @@ def clip_loss(
     poses: ClipPoses,
     T_cw_groundtruth: Tensor,
     error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
-    on_failure: Literal["raise", "skip"] | float = "raise",
+    on_failure: OnFailure = "raise",
 ) -> ClipLoss:
-    """The mean over the clips of an error, and what became of the clips that have none.
+    """The mean over the clips of an error against the true poses, see `clip_mean`.
 
     T_cw_groundtruth: as `poses.T_cw`
-    error:      function of poses, true poses and mask, each with the dimensions of `poses`, to () or (B,)
+    error: function of poses, true poses and mask, each with the dimensions of `poses`, to () or (B,)
+    """
+    return clip_mean(poses, error(poses.T_cw, T_cw_groundtruth, poses.posed), on_failure)
+
+
+def clip_mean(poses: ClipPoses, errors: Tensor, on_failure: OnFailure = "raise") -> ClipLoss:
+    """The mean over the clips of their errors, () or (B,), and what became of the clips that have none.
+
     on_failure: "raise" raises ClipError with the reasons; "skip" leaves failed clips out, and raises ClipError if none
                 is left; with a number each of them costs that much, without gradient. A failed clip never counts as one
                 without error: a front end could learn to fail.
@@ -103,7 +112,7 @@ def clip_loss(
     if reasons and (on_failure == "raise" or (on_failure == "skip" and len(reasons) == len(poses.reason))):
         raise ClipError(f"{len(reasons)} of {len(poses.reason)} clips failed; {'; '.join(reasons)}")
     price = 0.0 if isinstance(on_failure, str) else float(on_failure)
-    errors = torch.where(poses.success, error(poses.T_cw, T_cw_groundtruth, poses.posed), price)
+    errors = torch.where(poses.success, errors, price)
     counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success
     return ClipLoss(errors.sum() / counted.sum(), poses.failures)
 
