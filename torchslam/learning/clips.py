@@ -48,20 +48,34 @@ class Clip:
     number: Tensor
 
     @classmethod
-    def of(cls, sequence: Sequence, start: int, frames: int, stride: int, number: int = 0) -> Clip:
-        """The frames `start`, `start + stride`, ... of a sequence. Raises SequenceError where it has not so many."""
+    def of(
+        cls,
+        sequence: Sequence,
+        start: int,
+        frames: int,
+        stride: int,
+        number: int = 0,
+        supervised: bool = False,
+    ) -> Clip:
+        """The frames `start`, `start + stride`, ... of a sequence.
+
+        Raises SequenceError where it has not so many or, if `supervised`, has no true pose of one of them.
+        """
         indices = range(start, start + frames * stride, stride)
         if indices[-1] >= len(sequence):
             raise SequenceError(
                 f"{sequence.name}: {frames} frames from {start}, {stride} apart, lie not within its {len(sequence)}"
             )
         found = [sequence[index] for index in indices]
+        known = torch.tensor([frame.T_cw_groundtruth is not None for frame in found])
+        if supervised and not known.all():
+            raise SequenceError(f"{sequence.name}: a frame of the clip from {start} on has no true pose")
         eye = torch.eye(4, dtype=torch.float64)
         poses = [eye if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth for frame in found]
         return cls(
             torch.cat([frame.image for frame in found]),
             torch.stack(poses),
-            torch.tensor([frame.T_cw_groundtruth is not None for frame in found]),
+            known,
             sequence.camera,
             torch.tensor(number),
         )
@@ -99,6 +113,11 @@ def stack_cameras(cameras: Several[Camera]) -> Camera:
     if len(models) > 1:
         raise ValueError(f"cameras of the models {', '.join(sorted(models))} cannot be in one batch")
     return cameras[0].with_params(torch.stack([camera.params for camera in cameras]))
+
+
+def frames_in(seconds: float, sequence: Sequence) -> int:
+    """Frames that make up a time, at least one."""
+    return max(1, round(seconds * sequence.frame_rate))
 
 
 class Clips(Dataset[Clip]):
