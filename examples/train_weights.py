@@ -20,9 +20,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from torchslam import ORB, ClipSLAM, Features, clip_loss, open_sequence
-from torchslam.learning.clips import Batches, Clips, Looking, collate
-from torchslam.learning.losses import relative_ate
-from torchslam.learning.training import Log, Training
+from torchslam.learning import Batches, Clips, Log, Looking, Training, collate, relative_ate
 
 FAILED = 0.1  # what a clip without poses costs, as a share of its path
 

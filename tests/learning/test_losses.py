@@ -306,3 +306,54 @@ def test_the_clips_of_a_batch_are_judged_alone_and_failures_have_their_price() -
     truth = clip_of(walk)[1][None]
     whole = clip_loss(good, truth, relative_ate)
     torch.testing.assert_close(whole.loss, relative_ate(good.T_cw, truth)[0])
+
+
+def every_loss(like: Tensor) -> dict[str, Tensor]:
+    """Of the same noisy problem, where `like` is and in its dtype."""
+    T_cw, pixels = scene()
+    pixels = (pixels + normal(*pixels.shape)).to(like)
+    truth = (se3_exp(normal(2, 3, 6, seed=4, scale=0.1)) @ T_cw).to(like)
+    T_cw, camera = T_cw.to(like), CAMERA.with_params(CAMERA.params.to(like))
+    covariance = torch.eye(6, dtype=like.dtype, device=like.device).expand(2, 3, 6, 6)
+    T_21 = T_cw[:, 1] @ se3_inverse(T_cw[:, 0])
+    return {
+        "path_length": path_length(T_cw),
+        "relative_ate": relative_ate(T_cw, truth),
+        "pose_errors": pose_errors(T_cw, truth),
+        "motion_difference": motion_difference(T_21, truth[:, 1]),
+        "pose_nll": pose_nll(T_cw, truth, 0.1 * covariance),
+        "epipolar_loss": epipolar_loss(T_21, *pixels[..., :2, :].unbind(-2), camera, camera),
+        "reprojection_loss": reprojection_loss(T_cw, pixels, camera),
+    }
+
+
+def test_losses_are_where_and_as_precise_as_what_they_are_given(
+    device: torch.device, dtype: torch.dtype
+) -> None:
+    expected = every_loss(torch.zeros(1, dtype=torch.float64))
+    for name, loss in every_loss(torch.zeros(1, dtype=dtype, device=device)).items():
+        assert loss.dtype == dtype, name
+        assert loss.device.type == device.type, name
+        torch.testing.assert_close(loss.cpu().double(), expected[name], rtol=1e-3, atol=1e-4)
+
+
+def test_autocast_changes_no_bit() -> None:
+    T_cw, pixels = (x.float() for x in scene())
+    pixels, truth, camera = pixels + normal(*pixels.shape).float(), T_cw.roll(1, 1), CAMERA.to(torch.float32)
+    covariance = torch.eye(6).expand(2, 3, 6, 6)
+
+    def losses() -> list[Tensor]:
+        return [
+            path_length(T_cw),
+            relative_ate(T_cw, truth),
+            pose_errors(T_cw, truth),
+            motion_difference(T_cw, truth),
+            pose_nll(T_cw, truth, covariance),
+            epipolar_loss(truth[:, 0], *pixels[..., :2, :].unbind(-2), camera, camera),
+            reprojection_loss(T_cw, pixels, camera),
+        ]
+
+    plain = losses()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = losses()
+    assert all(torch.equal(*pair) for pair in zip(plain, cast, strict=True))
