@@ -20,7 +20,16 @@ from torchslam.errors import SequenceError
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 from torchslam.learning import clips as clips_module
-from torchslam.learning.clips import Batches, Clip, Clips, Looking, collate, parallax, stack_cameras
+from torchslam.learning.clips import (
+    Batches,
+    Clip,
+    Clips,
+    Looking,
+    collate,
+    frames_in,
+    parallax,
+    stack_cameras,
+)
 
 RADIAL = Camera.radial_tangential(400.0, 400.0, 159.5, 119.5, 0.1, 0.0, 0.0, 0.0, size=(320, 240))
 FISHEYE = Camera.fisheye(400.0, 400.0, 159.5, 119.5, 0.1, 0.0, 0.0, 0.0, size=(320, 240))
@@ -131,7 +140,7 @@ def test_the_same_seed_gives_the_same_clips(monkeypatch: pytest.MonkeyPatch) -> 
     assert first != other
 
 
-def test_a_clip_has_the_frames_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clip_has_the_frames_it_says() -> None:
     walk = Told(arc(20))
     clip = Clip.of(walk, 2, frames=5, stride=3, number=7)
     assert clip.images.shape == (5, 1, 240, 320)
@@ -145,6 +154,18 @@ def test_a_clip_has_the_frames_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
     blind = Clip.of(Told(arc(20), has_truth=False), 2, frames=5, stride=3)
     assert not blind.known.any()
     assert torch.equal(blind.T_cw, torch.eye(4, dtype=torch.float64).expand(5, 4, 4))
+    with pytest.raises(SequenceError, match="the clip from 2 on has no true pose"):
+        Clip.of(Told(arc(20), has_truth=False), 2, frames=5, stride=3, supervised=True)
+
+
+def test_frames_in_a_time_are_at_least_one() -> None:
+    assert [frames_in(seconds, Walk(arc(4))) for seconds in (0.01, 0.1, 0.34)] == [1, 1, 3]  # at 10 Hz
+
+
+def test_images_go_to_a_device_and_geometry_stays(device: torch.device) -> None:
+    clip = Clip.of(Walk(arc(4)), 0, frames=2, stride=1).to(device)
+    assert clip.images.device.type == device.type
+    assert clip.T_cw.device.type == clip.camera.params.device.type == "cpu"
 
 
 def test_a_batch_has_a_camera_for_each_clip() -> None:
