@@ -77,6 +77,20 @@ def test_a_step_is_clipped_scheduled_and_told() -> None:
     assert len(told) == 8
 
 
+def test_another_schedule_and_another_norm() -> None:
+    module = nn.Linear(3, 1)
+    optimizer = torch.optim.SGD(module.parameters(), 0.5)
+    schedule = torch.optim.lr_scheduler.StepLR(optimizer, 2, gamma=0.1)
+    one = Training(module, optimizer, 4, schedule=schedule, max_norm=0.2)
+    lengths = []
+    for _ in one:
+        before = torch.cat([parameter.detach().flatten() for parameter in module.parameters()])
+        one.descend(1e3 * loss_of(one))
+        after = torch.cat([parameter.detach().flatten() for parameter in module.parameters()])
+        lengths.append(float((after - before).norm()))
+    assert lengths == pytest.approx([0.1, 0.1, 0.01, 0.01], rel=1e-3)
+
+
 def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
     one = training()
     before = [parameter.clone() for parameter in one.module.parameters()]

@@ -129,7 +129,7 @@ class ClipSLAM(nn.Module):
             optimizer.step()
 
     A call looks and poses. Where keypoints only move or are weighed anew while they learn, look once and keep what was
-    seen; then a step takes a few hundredths of a second without the front end:
+    seen; then a step takes about a tenth of a second without the front end:
 
         graph = clip_slam.look(images, camera)
         ...

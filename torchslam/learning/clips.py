@@ -17,6 +17,7 @@ from torchslam.errors import SequenceError
 from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse
 from torchslam.learning.clip import ClipGraph, ClipSLAM
+from torchslam.learning.training import seed_of
 from torchslam.values import Features
 
 MIN_MATCHES = 50
@@ -25,9 +26,6 @@ MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""
 _KEYPOINTS = 500  # of the images that clips are chosen by
-_MANY_EPOCHS = (
-    1_000_003  # a prime: seeds of epochs, of which torch takes 32 bits, do not meet those of other seeds soon
-)
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,8 @@ class Clips(Dataset[Clip]):
 
     A clip begins at a frame drawn at random. Its frames are 1, 2, 4, ... apart: by the least such stride with which
     matches between its first and its last frame have a parallax of `min_parallax` in the median. A start for which
-    there is none before fewer than `MIN_MATCHES` match is left out. The same arguments give the same clips.
+    there is none before fewer than `MIN_MATCHES` match is left out. The same arguments give the same clips. Raises
+    CalibrationError for a sequence without a camera, FrameError where an image to choose by cannot be read.
 
     frames:       of a clip
     per_sequence: at most so many clips of each sequence, beginning at different frames
@@ -197,7 +196,7 @@ class Batches(Sampler[list[int]]):
             for place in range(begin, begin + self.batch):
                 if place // self.length != epoch:
                     epoch = place // self.length
-                    generator = torch.Generator().manual_seed((self.seed * _MANY_EPOCHS + epoch) % 2**32)
+                    generator = torch.Generator().manual_seed(seed_of(self.seed, epoch))
                     order = torch.randperm(self.length, generator=generator)
                 rows.append(int(order[place % self.length]))
             yield rows

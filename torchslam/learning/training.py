@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import CosineAnnealingLR
+from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 
 from torchslam.errors import ResultsError
 from torchslam.whole_file import write_whole
@@ -24,11 +24,11 @@ Log = Callable[[str, float, int], None]
 MAX_NORM = 1.0
 """Of the gradient: one step through a badly determined pose must not undo a hundred others."""
 
-_MANY_STEPS = 1_000_003  # a prime: of the seeds of steps torch takes 32 bits
+_MANY = 1_000_003  # a prime: seeds of steps and epochs, of which torch takes 32 bits, do not soon meet those of others
 
 
 class Training:
-    """A number of steps of an optimiser, with a cosine schedule and clipped gradients, that can be stopped and resumed.
+    """A number of steps of an optimiser, with a schedule and clipped gradients, that can be stopped and resumed.
 
         training = Training(module, torch.optim.Adam(module.parameters(), 1e-3), steps=1000, log=writer.add_scalar)
         training.resume("checkpoint.pt")
@@ -42,26 +42,35 @@ class Training:
     Of several processes each has a Training of its own, with the same `generator`; one of them saves.
 
     module:    what learns: the module itself, not its DistributedDataParallel
+    schedule:  of the learning rate; along a cosine to zero at the last step if None
+    max_norm:  of the gradient, longer ones are shortened
     step:      how many steps have been made
     losses:    of each of them
     generator: of random numbers, seeded with `seed`
     """
 
     def __init__(
-        self, module: nn.Module, optimizer: Optimizer, steps: int, seed: int = 0, log: Log | None = None
+        self,
+        module: nn.Module,
+        optimizer: Optimizer,
+        steps: int,
+        seed: int = 0,
+        log: Log | None = None,
+        schedule: LRScheduler | None = None,
+        max_norm: float = MAX_NORM,
     ) -> None:
         self.module, self.optimizer, self.steps, self.log = module, optimizer, steps, log
-        self._seed = seed
+        self._seed, self._max_norm = seed, max_norm
         self.step = 0
         self.losses: list[float] = []
         self.generator = torch.Generator().manual_seed(seed)
-        self._schedule = CosineAnnealingLR(optimizer, steps)
+        self._schedule = CosineAnnealingLR(optimizer, steps) if schedule is None else schedule
 
     def __iter__(self) -> Iterator[int]:
         """The steps that are left; the caller makes each of them, by `descend` or by `update`."""
         rank, ranks = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         while self.step < self.steps:
-            torch.manual_seed((self._seed * _MANY_STEPS + self.step * ranks + rank) % 2**32)
+            torch.manual_seed(seed_of(self._seed, self.step * ranks + rank))
             yield self.step
 
     def descend(self, loss: Tensor) -> None:
@@ -76,7 +85,7 @@ class Training:
         Raises RuntimeError, the parameters being as they were, where a gradient is not finite.
         """
         parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
-        norm = float(clip_grad_norm_(parameters, MAX_NORM, error_if_nonfinite=True))
+        norm = float(clip_grad_norm_(parameters, self._max_norm, error_if_nonfinite=True))
         if self.log is not None:
             self.log("loss", loss, self.step)
             self.log("gradient_norm", norm, self.step)
@@ -127,6 +136,11 @@ class Training:
         if state["steps"] != self.steps:
             raise ResultsError(f"{path} is of a training of {state['steps']} steps, not {self.steps}")
         return state
+
+
+def seed_of(seed: int, number: int) -> int:
+    """The seed of a step or an epoch, of what has a seed itself."""
+    return (seed * _MANY + number) % 2**32
 
 
 def _plain(state: Any) -> Any:
