@@ -227,6 +227,11 @@ def test_clips_are_looked_at_once_and_by_who_looked_first() -> None:
         assert run is not None
         assert before.runs[0] is not None
         assert torch.equal(run.pixels, before.runs[0].pixels)
+    focal = walk.camera.with_params(1.01 * walk.camera.params)
+    mixed = looking(
+        collate([Clip.of(walk, 0, FRAMES, 1, 3), Clip.of(walk.with_camera(focal), 0, FRAMES, 1, 4)])
+    )
+    assert torch.equal(mixed.cameras[1].params, focal.params)
     again = looking(collate([Clip.of(walk, 0, FRAMES, 1, 5)]))
     assert again.runs[0] is graphs.runs[1]
     assert torch.equal(clip_slam(batch.images, batch.camera, graphs).posed, torch.ones(2, FRAMES).bool())

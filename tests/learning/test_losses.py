@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -200,6 +201,9 @@ def test_tracks_bear_their_best_errors() -> None:
     assert float(loss) == pytest.approx(0.5, abs=1e-3)
     assert reprojection_loss(T_cw, pixels, camera, torch.tensor([[True, False]])).isnan()
     assert reprojection_loss(T_cw, pixels.flip(-2), camera).isnan()  # they meet behind
+    beyond = rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, -20.0]).double())
+    three = torch.cat([T_cw, beyond[None]])  # 8 away is the point: the third view has passed it
+    assert reprojection_loss(three, torch.cat([pixels, pixels[:, :1]], 1), camera).isnan()
 
 
 @pytest.mark.parametrize(
@@ -288,6 +292,28 @@ def test_a_clip_can_be_judged_by_its_own_observations() -> None:
     assert values == sorted(values, reverse=True)
     # Two coordinates of 0.1 px each, less what points and poses take up of it.
     assert 0.5 * 0.02 < values[-1] < 0.02
+
+
+def test_what_did_not_move_does_not_judge_a_clip() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    poses = ClipSLAM(BentEyes(walk, bend=0.02))(clip_of(walk)[0], walk.camera)
+    (graph,), (solution,) = poses.graphs, poses.solutions
+    assert graph is not None
+    assert solution is not None
+    lost, stuck = torch.zeros_like(solution.success), torch.zeros_like(solution.moved_points)
+    lost[2], stuck[::3] = True, True
+    spoilt = replace(
+        solution,
+        T_cw=torch.where(lost[:, None, None], torch.eye(4).double(), solution.T_cw),
+        points_w=torch.where(stuck[:, None], solution.points_w + 0.5, solution.points_w),
+        success=~lost,
+        moved_points=~stuck,
+    )
+    kept = ~lost[graph.frame_index] & ~stuck[graph.point_index]
+    columns = ("frame_index", "point_index", "pixels", "weights", "keypoint_index")
+    part = replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
+    expected = clip_reprojection(replace(poses, graphs=(part,)))
+    torch.testing.assert_close(clip_reprojection(replace(poses, solutions=(spoilt,))), expected)
 
 
 def test_the_clips_of_a_batch_are_judged_alone_and_failures_have_their_price() -> None:
