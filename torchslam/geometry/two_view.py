@@ -6,7 +6,7 @@ match would have to move in both images together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
@@ -29,9 +29,9 @@ from torchslam.geometry.ransac import (
     gather_rows,
     pad_groups,
     sample_minimal,
-    truncated_rows,
     truncated_score,
 )
+from torchslam.geometry.robust import Kernel, robustify
 
 _CANDIDATES = 4  # essential matrices of each round that are optimised
 _FEW_CANDIDATES = 2  # homographies and rotations
@@ -55,14 +55,25 @@ class TwoViews:
 
     @staticmethod
     def of(
-        pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera, threshold: float, mask: Tensor
+        pixels_1: Tensor,
+        pixels_2: Tensor,
+        camera_1: Camera,
+        camera_2: Camera,
+        threshold: float,
+        mask: Tensor,
+        weights: Tensor | None,
     ) -> TwoViews:
         x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
         scale_1, scale_2 = (
             camera.pixel_scale(x).prod(-1).sqrt() / threshold
             for camera, x in ((camera_1, x_1), (camera_2, x_2))
         )
-        return TwoViews(x_1, x_2, scale_1, scale_2, mask)
+        views = TwoViews(x_1, x_2, scale_1, scale_2, mask)
+        return views if weights is None else views.in_units(torch.where(mask, weights, 1.0).rsqrt())
+
+    def in_units(self, thresholds: Tensor) -> TwoViews:
+        """The same with thresholds so many times as large. (B, N) or (B, 1)."""
+        return replace(self, scale_1=self.scale_1 / thresholds, scale_2=self.scale_2 / thresholds)
 
     def select(self, rows: Tensor) -> TwoViews:
         """Some of the problems."""
@@ -169,19 +180,35 @@ def _retract_essential(state: State, step: Tensor) -> State:
 
 
 def fit_essential(
-    views: TwoViews, R: Tensor, t: Tensor, iterations: int, width: float = 1.0
+    views: TwoViews,
+    R: Tensor,
+    t: Tensor,
+    iterations: int,
+    scales: Tensor,
+    kernel: Kernel = "truncated",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their truncated costs (B, K)."""
+    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
+
+    scales: (B,) of the kernel, in thresholds
+    """
 
     def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _fit_essential_part(iterations, width, *part)
+        return _fit_essential_part(iterations, kernel, *part)
 
-    R, t, cost = in_parts(fit, t.shape[1] * 6 * views.mask.shape[1], R, t, *views.epipolar, views.mask)
+    numbers = t.shape[1] * 6 * views.mask.shape[1]
+    R, t, cost = in_parts(fit, numbers, R, t, *views.epipolar, views.mask, scales)
     return R, t, cost
 
 
 def _fit_essential_part(
-    iterations: int, width: float, R: Tensor, t: Tensor, constraint: Tensor, variance: Tensor, mask: Tensor
+    iterations: int,
+    kernel: Kernel,
+    R: Tensor,
+    t: Tensor,
+    constraint: Tensor,
+    variance: Tensor,
+    mask: Tensor,
+    scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     B, K = t.shape[:2]
     left_table, variance_table = _essential_tables(R.dtype, R.device)
@@ -198,8 +225,10 @@ def _fit_essential_part(
         rows = value.mul_(inverse)
         residual = rows[:, :, -1:]
         rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
-        used, cost = truncated_rows(residual.squeeze(2).square(), mask, width)
-        rows = rows.mul_(used[:, :, None]).view(B * K, 6, constraint.shape[-1])
+        robust = robustify(residual.squeeze(2).square(), kernel, scales[:, None, None])
+        cost = torch.where(mask[:, None], robust.rho, 0.0).sum(-1)
+        weight = torch.where(mask[:, None], robust.weight, 0.0).sqrt_()
+        rows = rows.mul_(weight[:, :, None]).view(B * K, 6, constraint.shape[-1])
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
@@ -236,7 +265,7 @@ def propose_essential(
         valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
     )
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
-    R, t, cost = fit_essential(views, R, t, _ITERATIONS)
+    R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(B))
     (R, t), cost = best_of((R, t), cost)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)

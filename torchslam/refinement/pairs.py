@@ -112,6 +112,8 @@ def _verified(
         mask=mask,
         seed=seed,
         max_samples=_MAX_SAMPLES,
+        kernel="truncated",
+        min_samples=64,
     )
     pairs = []
     for row, (one, other, at_1, at_2) in enumerate(found):
