@@ -11,6 +11,7 @@ from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant
 from torchslam.geometry.two_view import (
     TwoViews,
+    ahead_and_parallax,
     best_of,
     fit_homography,
     fit_rotation,
@@ -18,6 +19,7 @@ from torchslam.geometry.two_view import (
     propose_rotation,
     sampson_squared,
     transfer_squared,
+    twisted,
 )
 
 MODELS = ("essential", "homography", "rotation")
@@ -134,27 +136,15 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
     return spread
 
 
-def _twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The four poses of one essential matrix. (B, 3, 3), (B, 3) -> (B, 4, 3, 3), (B, 4, 3)."""
-    turn = 2 * t[..., :, None] * t[..., None, :] - torch.eye(3, dtype=t.dtype, device=t.device)
-    return torch.stack((R, R, turn @ R, turn @ R), dim=1), torch.stack((t, -t, t, -t), dim=1)
-
-
 def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:
     """Of the poses with the essential matrix of R (B, 3, 3), t (B, 3), that with most inliers in front of both cameras.
 
     A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
     """
-    R, t = _twisted(R, t)
-    ray_1 = views.h_1[:, None] @ R.mT
-    ray_2 = views.h_2[:, None].expand_as(ray_1)
-    normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
-    t_rows = t[:, :, None].expand_as(ray_1)
-    depth_1 = -(torch.linalg.cross(t_rows, ray_2, dim=-1) * normal).sum(-1)
-    depth_2 = -(torch.linalg.cross(t_rows, ray_1, dim=-1) * normal).sum(-1)
-    parallax = normal.norm(dim=-1) * torch.minimum(views.scale_1, views.scale_2)[:, None]
+    R, t = twisted(R, t)
+    is_ahead, parallax = ahead_and_parallax(views, R, t)
     weight = torch.where(inliers[:, None], parallax.clamp_max(1.0), 0.0)
-    ahead = torch.where((depth_1 > 0) & (depth_2 > 0), weight, 0.0).sum(-1)
+    ahead = torch.where(is_ahead, weight, 0.0).sum(-1)
     best = ahead.argmax(-1)
     index = torch.arange(len(best), device=best.device)
     return R[index, best], t[index, best]

@@ -53,13 +53,14 @@ _LEAST_NOISE = 1 / 64  # thresholds; of exact matches
 class RelativePose:
     """Relative poses of B pairs of views.
 
-    T_21:      (B, 4, 4) from camera 1 to camera 2, translation of length one; zero for "rotation"; the identity
-               where nothing was found
+    T_21:      (B, 4, 4) from camera 1 to camera 2, translation of length one; zero for "rotation". The likeliest
+               also where there is no `success`; the identity for fewer than six matches
     inliers:   (B, N) matches within the threshold of the chosen model
     success:   (B,) rotation and direction are determined: no accident, no pure rotation, no ambiguous plane
     model:     per pair "essential", "homography" (the scene is a plane, as far as one can tell) or "rotation"
     ambiguous: (B,) the matches lie on a plane and two motions explain them; T_21 is the likelier
-    score_essential, score_homography, score_rotation: (B,) sum over the matches of 1 - min((error / threshold)^2, 1)
+    score_essential, score_homography, score_rotation: (B,) sum over the matches of 1 - min((error / threshold)^2, 1);
+               zero for models that were not asked for
     """
 
     T_21: Tensor
@@ -87,7 +88,7 @@ def estimate_relative_pose(
     model: Model = "auto",
     kernel: Kernel = "cauchy",
     weights: Tensor | None = None,
-    min_samples: int = 256,
+    min_samples: int = 512,
 ) -> RelativePose:
     """Relative poses of B pairs of views by RANSAC over five-point essential matrices, with model selection.
 
@@ -99,9 +100,11 @@ def estimate_relative_pose(
                or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement, over all matches, of the essential matrix. Its scale, and what contradicts a
                model, then go by the noise that the matches show, so that the threshold only has to tell wrong ones
-               from right ones. "truncated": both go by the threshold
+               from right ones; in the search, matches behind a camera count as wrong. "truncated": both go by the
+               threshold, and the search does not ask where matches lie
     weights:   (B, N) information of the matches, in which squared errors count; the threshold of a match is
-               `threshold / sqrt(weight)`. Zero or NaN is no match
+               `threshold / sqrt(weight)`. Zero, infinity or NaN is no match
+    min_samples, max_samples: of five matches, that are tried at least and at most
     The same arguments and seed give the same result. Too few matches and pure noise give `success` False for that
     pair. Raises ValueError for wrong shapes, and for an unknown model or kernel.
 
@@ -224,7 +227,7 @@ def _fit_motion(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """R (B, 3, 3) and t (B, 3) of essential matrices, and the unit (B,), in thresholds, that they are fitted in."""
     R, t = search(
-        lambda rows, count: propose_essential(views.select(rows), count, generator),
+        lambda rows, count: propose_essential(views.select(rows), count, generator, kernel != "truncated"),
         views.mask.sum(-1),
         5,
         effort.confidence,
