@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -98,10 +98,10 @@ def estimate_relative_pose(
     model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
                that it explains contradict the simpler one, more of them than accident would bring; a pure rotation
                or a plane with two valid motions give `success` False. "essential" asks no such thing
-    kernel:    of the final refinement, over all matches, of the essential matrix. Its scale, and what contradicts a
-               model, then go by the noise that the matches show, so that the threshold only has to tell wrong ones
-               from right ones; in the search, matches behind a camera count as wrong. "truncated": both go by the
-               threshold, and the search does not ask where matches lie
+    kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
+               what contradicts a model, then go by the noise that the matches show, so that the threshold only has to
+               tell wrong ones from right ones; in the search, matches behind a camera count as wrong. "truncated":
+               both go by the threshold, and the search does not ask where matches lie
     weights:   (B, N) information of the matches, in which squared errors count; the threshold of a match is
                `threshold / sqrt(weight)`. Zero, infinity or NaN is no match
     min_samples, max_samples: of five matches, that are tried at least and at most
@@ -186,7 +186,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     """Fit all models, choose one per pair, and take the pose from it."""
     mask, B = views.mask, len(views.mask)
     generator = torch.Generator().manual_seed(effort.seed)
-    R, t, noise = _fit_motion(views, kernel, effort, generator)
+    R, t, noise, near = _fit_motion(views, kernel, effort, generator)
     views = views.in_units(noise[:, None])
     width = FINAL_WIDTH if kernel == "truncated" else NOISE_WIDTH
     if wanted == "essential":
@@ -206,7 +206,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     inliers = (chosen * noise[:, None].square() < 1) & mask
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, chance, 10)
     significant = significant & is_spread(views.in_units(1 / noise[:, None]), inliers)
-    all_count = (model == ESSENTIAL) & (kernel != "truncated")
+    used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
     found = mask.sum(-1) > 5
     return _Found(
@@ -217,15 +217,15 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         significant,
         ambiguous,
         inliers & significant[:, None],
-        ((chosen < width**2) | all_count[:, None]) & mask & significant[:, None],
+        used & significant[:, None],
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
     )
 
 
 def _fit_motion(
     views: TwoViews, kernel: Kernel, effort: _Effort, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """R (B, 3, 3) and t (B, 3) of essential matrices, and the unit (B,), in thresholds, that they are fitted in."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """R (B, 3, 3) and t (B, 3) of essential matrices, their unit (B,), thresholds, and the matches (B, N) fitted."""
     R, t = search(
         lambda rows, count: propose_essential(views.select(rows), count, generator, kernel != "truncated"),
         views.mask.sum(-1),
@@ -237,14 +237,15 @@ def _fit_motion(
     R, t, one = R[:, None], t[:, None], R.new_ones(len(R))
     if kernel == "truncated":
         R, t, _ = fit_essential(views, R, t, FINAL_ITERATIONS, FINAL_WIDTH * one)
-        return R[:, 0], t[:, 0], one
-    variance = noise_variance(sampson_squared(views, R, t)[:, 0], views.mask)
+        return R[:, 0], t[:, 0], one, views.mask & (sampson_squared(views, R, t)[:, 0] < FINAL_WIDTH**2)
+    squared = sampson_squared(views, R, t)[:, 0]
     # A power of two: the level does not change with the matches, and has no gradient, but where it jumps.
-    noise = torch.exp2((0.5 * variance.log2()).ceil()).clamp_min(_LEAST_NOISE)
-    R, t, _ = fit_essential(
-        views.in_units(noise[:, None]), R, t, _KERNEL_ITERATIONS, _KERNEL_WIDTH * one, kernel
-    )
-    return R[:, 0], t[:, 0], noise
+    noise = torch.exp2((0.5 * noise_variance(squared, views.mask).log2()).ceil()).clamp_min(_LEAST_NOISE)
+    views = views.in_units(noise[:, None])
+    # Of many wrong matches, even a kernel leaves the sum of their pulls.
+    near = views.mask & (squared < (NOISE_WIDTH * noise[:, None]) ** 2)
+    R, t, _ = fit_essential(replace(views, mask=near), R, t, _KERNEL_ITERATIONS, _KERNEL_WIDTH * one, kernel)
+    return R[:, 0], t[:, 0], noise, near
 
 
 def _mean_width(mask: Tensor, weights: Tensor | None, dtype: torch.dtype) -> Tensor:
