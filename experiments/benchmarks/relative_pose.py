@@ -42,7 +42,7 @@ HERE = Path(__file__).parent
 # it is good to between frames a second apart.
 SEQUENCES = {"redkitchen": 0.1, "kitti07": 0.5, "machine_hall": 0.03, "fr2_desk_20": 0.05, "shelf_bin": 0.02}
 GAPS_S = (0.2, 0.4, 0.6, 0.8, 1.0)
-THRESHOLDS = (0.5, 1.0, 2.0, 3.0, 4.0)
+THRESHOLDS = (0.5, 1.0, 2.0, 4.0)
 ANGLES = (5, 10, 20)
 MIN_MATCHES = 8
 CONFIDENCE = 0.9999  # of every estimator
@@ -137,8 +137,8 @@ def batched_ms(pairs: list[Pair], threshold: float, model: Model) -> float:
     for _, group in groupby(pairs, lambda pair: pair.sequence):
         members = list(group)
         pixels_1, pixels_2 = (
-            pad_sequence([pair[side] for pair in members], batch_first=True, padding_value=math.nan)
-            for side in (2, 3)
+            pad_sequence(side, batch_first=True, padding_value=math.nan)
+            for side in ([pair.pixels_1 for pair in members], [pair.pixels_2 for pair in members])
         )
         camera = members[0].camera
         begin = time.thread_time()
