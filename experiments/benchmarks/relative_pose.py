@@ -38,8 +38,8 @@ from torchslam.geometry.relative_pose import Model
 from torchslam.values import Features
 
 HERE = Path(__file__).parent
-# Sequences with the least baseline in metres whose direction the ground truth tells, to some degrees: ten times what
-# it is good to between frames a second apart.
+# Sequences with the least baseline in metres whose direction the ground truth tells, to some degrees: several times
+# what it is good to.
 SEQUENCES = {"redkitchen": 0.1, "kitti07": 0.5, "machine_hall": 0.03, "fr2_desk_20": 0.05, "shelf_bin": 0.02}
 GAPS_S = (0.2, 0.4, 0.6, 0.8, 1.0)
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0)

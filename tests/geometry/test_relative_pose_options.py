@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchslam.geometry import RelativePose, estimate_relative_pose
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import TwoViews, _best_in_front, twisted
+from torchslam.geometry.two_view import TwoViews, best_in_front, twisted
 
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
@@ -202,7 +202,7 @@ def test_points_behind_a_camera_do_not_count() -> None:
     R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3] / scene.T_21[:, :3, 3].norm()
     wrong = twisted(R, t)
     for row in range(4):
-        R_best, t_best, cost = _best_in_front(views, wrong[0][:, row : row + 1], wrong[1][:, row : row + 1])
+        R_best, t_best, cost = best_in_front(views, wrong[0][:, row : row + 1], wrong[1][:, row : row + 1])
         torch.testing.assert_close(R_best[:, 0], R)
         torch.testing.assert_close(t_best[:, 0], t)
         assert float(cost) < 1e-6
@@ -216,7 +216,7 @@ def test_points_behind_a_camera_do_not_count() -> None:
         views.scale_2,
         views.mask,
     )
-    assert float(_best_in_front(level, *sideways)[2]) == pytest.approx(100, abs=1e-6)
+    assert float(best_in_front(level, *sideways)[2]) == pytest.approx(100, abs=1e-6)
 
 
 def test_wrong_options_are_named() -> None:

@@ -272,7 +272,7 @@ def propose_essential(
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
     R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(B))
     if in_front:
-        R, t, cost = _best_in_front(views, R, t)
+        R, t, cost = best_in_front(views, R, t)
     (R, t), cost = best_of((R, t), cost)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
@@ -296,7 +296,7 @@ def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, T
     return (depth_1 > 0) & (depth_2 > 0), parallax
 
 
-def _best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of the four poses of each essential matrix (B, K) the one of least truncated cost, and that cost (B, K).
 
     Matches behind a camera count as wrong, but where their parallax is within the threshold.
