@@ -118,6 +118,8 @@ def _verified(
         mask=mask,
         seed=config.seed,
         max_samples=_MAX_SAMPLES,
+        kernel="truncated",
+        min_samples=64,
     )
     pairs = []
     for row, (one, other, at_1, at_2) in enumerate(found):

@@ -1,0 +1,83 @@
+"""Robust kernels: how much a residual costs once it is larger than noise explains.
+
+A kernel is a function rho of the squared whitened residual s = weight * |r|^2 with rho(0) = 0 and rho'(0) = 1, so
+that every kernel agrees with least squares for small residuals. `scale` is the residual, in whitened units, at which
+they begin to part. The cost of a problem is half the sum of rho. Sources: Black and Rangarajan, "On the unification
+of line processes, outlier rejection, and robust statistics", 1996; Barron, "A general and adaptive robust loss
+function", 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
+
+
+class Robustified(NamedTuple):
+    """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
+
+    rho:       the cost, twice the share of the residual in the objective
+    weight:    rho', the weight of the residual in iteratively reweighted least squares, in [0, 1]
+    curvature: rho'', never positive
+    """
+
+    rho: Tensor
+    weight: Tensor
+    curvature: Tensor
+
+
+def _none(s: Tensor, scale: Tensor) -> Robustified:
+    return Robustified(s, torch.ones_like(s), torch.zeros_like(s))
+
+
+def _huber(s: Tensor, scale: Tensor) -> Robustified:
+    c2 = scale * scale
+    inside = s <= c2
+    root = torch.where(inside, c2, s).sqrt()
+    weight = torch.where(inside, 1.0, scale / root)
+    rho = torch.where(inside, s, 2 * scale * root - c2)
+    return Robustified(rho, weight, torch.where(inside, 0.0, -0.5 * weight / root.square()))
+
+
+def _cauchy(s: Tensor, scale: Tensor) -> Robustified:
+    c2 = scale * scale
+    u = s / c2
+    weight = 1 / (1 + u)
+    return Robustified(c2 * torch.log1p(u), weight, -weight * weight / c2)
+
+
+def _geman_mcclure(s: Tensor, scale: Tensor) -> Robustified:
+    c2 = scale * scale
+    shrink = c2 / (c2 + s)
+    weight = shrink * shrink
+    return Robustified(s * shrink, weight, -2 * weight * shrink / c2)
+
+
+def _truncated(s: Tensor, scale: Tensor) -> Robustified:
+    inside = s <= scale * scale
+    return Robustified(torch.minimum(s, scale * scale), inside.to(s.dtype), torch.zeros_like(s))
+
+
+_KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
+    "none": _none,
+    "huber": _huber,
+    "cauchy": _cauchy,
+    "geman_mcclure": _geman_mcclure,
+    "truncated": _truncated,
+}
+
+
+def robustify(squared: Tensor, kernel: Kernel, scale: Tensor) -> Robustified:
+    """rho, rho' and rho'' of squared whitened residuals.
+
+    squared: (...) not negative; scale: broadcastable to it, positive. Differentiable to both, except on the
+    boundary of "huber" (rho'') and "truncated". Raises ValueError for an unknown kernel.
+    """
+    if kernel not in _KERNELS:
+        raise ValueError(f"unknown kernel {kernel!r}; known are {', '.join(get_args(Kernel))}")
+    return _KERNELS[kernel](squared, scale)
