@@ -114,6 +114,8 @@ class PatchesConfig(Settings, section="patches"):
     count: int = setting(300, low=20)  # patches that are followed
     min_similarity: float = setting(0.8, low=0, high=1)  # normalised cross-correlation with the earlier frame
     min_share: float = setting(0.6, above=0, high=1)  # of the patches, that must agree with the pose
+    # median squared error of the pose, as a multiple of that of the frame that they are from
+    max_error_growth: float = setting(2.5, above=0)
     max_frames: int = setting(5, low=1)  # followed one after the other
     # of the overlap at which a frame becomes a keyframe: patches are lost sooner than matches
     overlap_share: float = setting(0.8, above=0)

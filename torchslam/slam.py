@@ -227,12 +227,13 @@ class SLAM:
         return not followed.why_not and self.world is not None and followed.anchor in self.anchors
 
     def _go_along(self, frame: Frame, followed: Followed) -> StepResult:
-        """Take over where patches were followed to; nothing is mapped, and no point is vouched for."""
+        """Take over where patches were followed to; nothing is mapped."""
         world = self.world
         assert world is not None
         self.last_frame = frame.index, frame.timestamp
         with self.clock("patches"):
             view, tracked = self.anchors.place(world, frame, self.session.number, followed)
+            self.tracker.see(world.map, tracked)
             world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return self._result(view, "", world, tracked)
 

@@ -25,15 +25,21 @@ from torchslam.values import Anchor, Followed, Frame
 ATTEMPTS = 2  # a pose from some of the patches leads to the others
 NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
 LEAST = 20  # patches that a pose needs
+LEAST_ERROR = 0.05  # squared, in units of the variance of a keypoint: what the alignment of a patch adds
 
 
 @dataclass(frozen=True)
 class Held:
-    """An anchor with its patches; unwarp: (n, 2, 2) from displacements in its image to those at the points' depth."""
+    """An anchor with its patches.
+
+    unwarp: (n, 2, 2) from displacements in its image to those at the points' depth
+    error:  median squared error of its keypoints, in units of their variance
+    """
 
     anchor: Anchor
     patches: Patches
     unwarp: Tensor
+    error: float
 
 
 class Scout:
@@ -89,7 +95,8 @@ class Scout:
         inverse, failed = torch.linalg.inv_ex(J[..., :2])
         unwarp = torch.where((failed == 0)[:, None, None], inverse, 0.0)
         patches = cut(self._pyramids[anchor.index], self._reduced(anchor.pixels))
-        self._held = Held(anchor, patches, unwarp)
+        errors = squared_reprojection_errors(anchor.points_a, anchor.pixels, self.camera) / anchor.scales**2
+        self._held = Held(anchor, patches, unwarp, float(errors.median()))
         T_ab = self._poses.get(anchor.index)
         eye = torch.eye(4, dtype=anchor.points_a.dtype, device=anchor.points_a.device)
         later = {index: T for index, T in self._poses.items() if index > anchor.index}
@@ -126,7 +133,7 @@ class Scout:
                 rows = torch.nonzero(agrees)[:, 0]
                 return Followed(
                     anchor=anchor.index,
-                    why_not=self._why_not(anchor, index, T_ca, len(rows)),
+                    why_not=self._why_not(held, index, T_ca, rows, pixels),
                     T_ca=T_ca,
                     rows=rows,
                     pixels=pixels[rows],
@@ -182,8 +189,14 @@ class Scout:
                 break
         return refined, mask
 
-    def _why_not(self, anchor: Anchor, index: int, T_ca: Tensor, count: int) -> str:
-        """Why a frame with a pose should be found by its features all the same: it may be worth keeping."""
+    def _why_not(self, held: Held, index: int, T_ca: Tensor, rows: Tensor, pixels: Tensor) -> str:
+        """Why a frame with a pose should be found by its features all the same: it may be wrong, or worth keeping."""
+        anchor = held.anchor
+        points_c = transform(T_ca, anchor.points_a[rows])
+        errors = squared_reprojection_errors(points_c, pixels[rows], self.camera) / anchor.scales[rows] ** 2
+        worse = float(errors.median()) / max(held.error, LEAST_ERROR)
+        if worse > self.settings.max_error_growth:
+            return f"patches miss the map by {worse**0.5:.1f} times what they did"
         around = [anchor.T_ka] + [self._poses[other][None] for other in self._found if other in self._poses]
         depth = transform(T_ca, anchor.points_a)[:, 2].median()
         moved, turned = apart(T_ca, torch.cat(around), depth)
@@ -194,7 +207,7 @@ class Scout:
         last = max([anchor.index, *self._found])
         if index - last > self.settings.max_frames:
             return f"{self.settings.max_frames} frames were followed without features"
-        overlap = anchor.overlap * count / len(anchor.points_a)
+        overlap = anchor.overlap * len(rows) / len(anchor.points_a)
         if not self._found and overlap < self.settings.overlap_share * self.keyframes.min_overlap:
             return f"sees {overlap:.0%} of the points of its reference keyframe"
         return ""

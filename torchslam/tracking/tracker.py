@@ -267,6 +267,12 @@ class Tracker:
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
 
+    def see(self, slam_map: Map, tracked: Tracked) -> None:
+        """A frame that was not asked for all that it should see: what it saw was there to be seen."""
+        if self.counts:
+            slam_map.points["times_visible"][tracked.point_ids] += 1
+        self.vouch(slam_map, tracked)
+
     def vouch(self, slam_map: Map, tracked: Tracked) -> None:
         """A frame is believed: it speaks for the points that it saw."""
         if self.counts:
