@@ -85,10 +85,13 @@ class BagSequence(Sequence):
         self._position = 0
         self._stream: Iterator[Any] = iter(())
         self._rewind()
-        samples = [self._read(message) for message in sorted(self._messages)[:SAMPLES]]
-        self._bits = bit_depth(samples)
+        self._bits, size = 8, None
+        for message in sorted(self._messages)[:SAMPLES]:
+            image = self._read(message)
+            self._bits = max(self._bits, bit_depth([image]))
+            size = size or (image.shape[1], image.shape[0])
+        assert size is not None  # a topic has images
         camera = topic.calibration if camera is None else camera
-        size = (samples[0].shape[1], samples[0].shape[0])
         left_out = len(order) - len(self._messages)
         super().__init__(
             path.stem,
