@@ -1,6 +1,5 @@
 """The errors that torchslam raises on purpose. A message says what is wrong, where, and what to do."""
 
-
 LONGEST = 2000
 """Characters of a message: what a file holds in place of a number may be of any length."""
 

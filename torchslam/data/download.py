@@ -1,7 +1,7 @@
 """Public sequences from their servers: fetched with resume, unpacked without trust, put in place at once.
 
-Neither the server nor the archive decides how much that takes: both have limits, and an archive that cannot be unpacked,
-or is not the one that was wanted, is deleted, so that the next try fetches it again.
+Neither the server nor the archive decides how much that takes: both have limits. An archive that cannot be unpacked, or
+is not the one that was wanted, is deleted, so that the next try fetches it again.
 
 Source of the archives: https://www.eth3d.net/slam_datasets
 """
