@@ -65,7 +65,7 @@ class SimulatedConfig(Settings, section="simulated"):
     dropout: float = setting(0.0, "share of the visible points that a frame misses", low=0, high=1)
     scales: bool = setting(
         False,
-        "points have a size: keypoints have scales by their depth, and noise that grows with them; else all scales are one",
+        "points have a size: keypoints have scales by their depth, and noise that grows with them",
     )
 
 

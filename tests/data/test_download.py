@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from torchslam.data import open_sequence
 from torchslam.data import download as downloads
+from torchslam.data import open_sequence
 from torchslam.data.download import download, unpack
 from torchslam.errors import DownloadError, SequenceError
 
@@ -168,24 +168,35 @@ def test_leftovers_longer_than_the_file_are_thrown_away(
 def test_checksum(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     digest = hashlib.sha256(archive).hexdigest()
-    for wrong, message in (("0" * 64, f"has the SHA-256 {digest}, not 0{{64}}; it was deleted"), ("12", "64 hexa")):
+    for wrong, message in (
+        ("0" * 64, f"has the SHA-256 {digest}, not 0{{64}}; it was deleted"),
+        ("12", "64 hexa"),
+    ):
         with pytest.raises(DownloadError, match=message):
             download("eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=wrong)
         assert list((tmp_path / "data").iterdir()) == []
-    assert download("eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=digest.upper()).is_dir()
+    assert download(
+        "eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=digest.upper()
+    ).is_dir()
 
 
-def test_a_body_has_an_end(server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_has_an_end(
+    server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server.files["/plant_1_mono.zip"] = archive
     monkeypatch.setattr(downloads, "MAX_BYTES", len(archive) - 1)
     for length in (None, "-3", "many", "9" * 5000):  # as the server says it: wrongly, or not at all
         server.length = length
-        with pytest.raises(DownloadError, match=f"more than {len(archive) - 1} bytes, the most that is fetched"):
+        with pytest.raises(
+            DownloadError, match=f"more than {len(archive) - 1} bytes, the most that is fetched"
+        ):
             download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
         assert not (tmp_path / "data" / "plant_1").exists()
 
 
-def test_a_body_that_drips(server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_that_drips(
+    server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server.files["/plant_1_mono.zip"] = archive
     server.length, server.pause = None, 0.02
     monkeypatch.setattr(downloads, "TIMEOUT", 0.1)
@@ -201,7 +212,9 @@ def test_what_unpacks_to_far_more_than_it_is(
     monkeypatch.setattr(downloads, "SMALL", 1 << 20)
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", method) as file:
         file.writestr("0.png", bytes(4 << 20))
-    with pytest.raises(DownloadError, match=r"bomb\.zip: \d+ bytes that unpack to 4194304: more than 100 times"):
+    with pytest.raises(
+        DownloadError, match=r"bomb\.zip: \d+ bytes that unpack to 4194304: more than 100 times"
+    ):
         unpack(tmp_path / "bomb.zip", tmp_path / "target")
     assert [path.name for path in tmp_path.iterdir()] == ["bomb.zip"]
     with pytest.raises(SequenceError, match="more than 100 times"):

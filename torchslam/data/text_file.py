@@ -12,6 +12,8 @@ from torchslam.errors import TorchslamError
 
 MAX_BYTES = 1 << 27
 """A text file above this size is not read: lists and poses of a million frames are smaller."""
+MAX_DIGITS = 19
+"""Of a whole number: nanoseconds since 1970 have 19, until 2286."""
 MAX_LINE = 1 << 16
 """Characters of a line of numbers."""
 
@@ -54,6 +56,11 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
             raise error(f"{where}: `{word}` is not a finite number")
         numbers.append(number)
     return numbers
+
+
+def parse_count(text: str) -> int | None:
+    """A whole number from 0 on, of at most 19 digits; None for anything else."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
 
 
 def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:
