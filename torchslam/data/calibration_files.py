@@ -19,7 +19,7 @@ from torchslam.errors import CalibrationError
 from torchslam.regular_file import JSON_BYTES, parse_json
 
 HALF_PIXEL = 0.5
-MAX_BYTES = 1 << 20
+MAX_BYTES = 1 << 18
 LARGEST = 1e12  # numbers in JSON have any number of digits
 FISHEYES = ("equidistant", "fisheye", "kannala", "opencv_fisheye")
 BROWN = ("plumb_bob", "radtan", "radial-tangential", "radial_tangential", "rational_polynomial", "none", "")

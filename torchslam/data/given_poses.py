@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections import Counter
 from dataclasses import dataclass
@@ -88,7 +89,7 @@ def read_poses(path: str | Path) -> GivenPoses:
     Raises TrajectoryError or CalibrationError naming the file.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
         if (path / TRANSFORMS).is_file():
             return _read_transforms(path / TRANSFORMS)
         for name in ("images.bin", "images.txt"):

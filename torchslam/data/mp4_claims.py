@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
+DEPTH = 8  # moov, trak, mdia, minf, stbl are five
 MAX_BOXES = 1_000_000
 RUNS_AT_ONCE = 1 << 16
 
@@ -21,11 +22,16 @@ def claimed_samples(path: Path) -> int:
     """The most samples that a table in the file speaks of; 0 where there is none. Raises OSError."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
-        return max((_samples(file, *box) for box in _boxes(file, 0, size, [MAX_BOXES])), default=0)
+        return max((_samples(file, *box) for box in _boxes(file, 0, size, [MAX_BOXES], DEPTH)), default=0)
 
 
-def _boxes(file: BinaryIO, start: int, end: int, left: list[int]) -> Iterator[tuple[bytes, int, int]]:
-    """Name, and where the content begins and ends, of every box; those in containers too. left: how many more."""
+def _boxes(
+    file: BinaryIO, start: int, end: int, left: list[int], depth: int
+) -> Iterator[tuple[bytes, int, int]]:
+    """Name, and where the content begins and ends, of every box; those in containers too.
+
+    left: how many more; depth: how many containers in each other
+    """
     while start + HEADER <= end and left[0] > 0:
         left[0] -= 1
         file.seek(start)
@@ -37,8 +43,8 @@ def _boxes(file: BinaryIO, start: int, end: int, left: list[int]) -> Iterator[tu
         # 0: to the end; a size that is too large is cut, as FFmpeg cuts it
         stop = end if size == 0 else min(end, start + max(size, inside))
         yield kind, start + inside, stop
-        if kind in CONTAINERS:
-            yield from _boxes(file, start + inside, stop, left)
+        if kind in CONTAINERS and depth > 0:
+            yield from _boxes(file, start + inside, stop, left, depth - 1)
         start = stop
 
 
