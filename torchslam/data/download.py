@@ -26,6 +26,7 @@ from tqdm import tqdm
 from torchslam import regular_file
 from torchslam.data.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
+from torchslam.progress_line import stream
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
@@ -209,6 +210,7 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
             unit_scale=True,
             desc=url.rsplit("/", 1)[-1],
             disable=not progress,
+            **stream(),
         )
         with bar, part.open("ab" if resumed else "wb") as file:
             since, waited = 0, time.monotonic()

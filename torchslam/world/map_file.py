@@ -202,10 +202,10 @@ def _numbers(about: dict[str, Any]) -> tuple[list[int], int, int]:
     """The numbers of the worlds, how many ever began, and how many sessions there were."""
     numbers, begun, sessions = about["worlds"], about["begun"], about["sessions"]
     whole = [*numbers, begun, sessions]
-    if not all(isinstance(number, int) and not isinstance(number, bool) for number in whole):
-        raise ValueError(f"worlds {numbers}, begun {begun}, sessions {sessions}: must be whole numbers")
-    if not all(0 <= number < MOST for number in whole):
-        raise ValueError(f"worlds {numbers}, begun {begun}, sessions {sessions}: must be from 0 to {MOST}")
+    if not all(type(number) is int and 0 <= number < MOST for number in whole):
+        raise ValueError(
+            f"worlds {numbers}, begun {begun}, sessions {sessions}: must be numbers from 0 to {MOST}"
+        )
     if len(set(numbers)) != len(numbers) or max(numbers, default=-1) >= begun:
         raise ValueError(f"worlds {numbers} of {begun} that began: numbers must differ and lie below")
     return numbers, begun, sessions
