@@ -81,8 +81,9 @@ def test_json_that_python_does_not_read(text: str) -> None:
 
 def test_a_message_is_one_line() -> None:
     assert str(TorchslamError("a\nb\x1b[1m\ud800\u2028é")) == "a\\nb\\x1b[1m\\ud800\\u2028é"
-    text = str(TorchslamError("start" + "x" * 10_000_000 + "end"))
-    assert text.startswith("start")
-    assert text.endswith("end")
-    assert " [...] " in text
-    assert len(text) < LONGEST + 10
+    for filling in ("x", "\n", "\ud800"):
+        text = str(TorchslamError("start" + filling * 10_000_000 + "end"))
+        assert text.startswith("start")
+        assert text.endswith("end")
+        assert " [...] " in text
+        assert len(text) < LONGEST + 10

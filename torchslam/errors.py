@@ -12,10 +12,12 @@ class TorchslamError(Exception):
     """
 
     def __str__(self) -> str:
-        text = super().__str__()
-        if len(text) > LONGEST:
-            text = f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
-        return text if text.isprintable() else "".join(map(_shown, text))
+        text = _shortened(super().__str__())
+        return text if text.isprintable() else _shortened("".join(map(_shown, text)))
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
 
 def _shown(character: str) -> str:

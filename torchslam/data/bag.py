@@ -226,6 +226,8 @@ def _connection(reader: AnyReader, topic: str) -> Connection:
 
 def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
     """The topic to be read. Raises SequenceError where there is none, or several and none is named."""
+    if not all(isinstance(each.topic, str) for each in reader.connections):
+        raise SequenceError(f"{path}: cannot be read: topics without a name")
     images = [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
     topics = list(dict.fromkeys(each.topic for each in images if "depth" not in each.topic.lower()))
     if wanted is not None:
