@@ -82,6 +82,7 @@ def test_an_integer_serves_as_a_float() -> None:
         pytest.param("a" + 20_000 * ".a" + "=1", "40003 characters, more than the 4096", id="too many dots"),
         pytest.param("seed=" + 3000 * "[" + 3000 * "]", "6005 characters", id="too deep"),
         pytest.param("seed=" + 1500 * "[" + 1500 * "]", "seed must be of type int", id="deep"),
+        pytest.param("seed=" + 1000 * "9", "seed must be at least 0 and at most", id="many digits"),
         pytest.param("seed=" + 5000 * "9", "5005 characters, more than the 4096", id="too many digits"),
         ("seed", "section.key=value"),
     ],

@@ -49,7 +49,8 @@ class Allowed:
         if isinstance(value, bool):
             return True
         if isinstance(value, int | float):
-            is_inside = math.isfinite(value) and self.low <= value <= self.high and value > self.above
+            is_finite = isinstance(value, int) or math.isfinite(value)  # isfinite makes floats of integers
+            is_inside = is_finite and self.low <= value <= self.high and value > self.above
             return is_inside or value == self.also
         return not self.choices or value in self.choices
 

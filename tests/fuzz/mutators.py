@@ -336,6 +336,8 @@ BOXES = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 def change_boxes(content: bytes, rng: random.Random) -> bytes:
     """A box of an MP4 that says something else, or that is gone."""
     spots = list(_boxes(content, 0, len(content)))
+    if not spots:
+        return _flip(content, rng)
     at, size = rng.choice(spots)
     kind = rng.random()
     if kind < 0.1:
