@@ -36,7 +36,7 @@ from torchslam.export.colours import paint
 from torchslam.export.recording import import_rerun
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
-from torchslam.output.report import metrics, summary, table
+from torchslam.output.report import doubts, metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.output.view import VIEW, write_view
 from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
@@ -190,6 +190,8 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     written |= {"video": plan.output / VIDEO} if plan.video else {}
     words = summary(figures) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
+    for doubt in doubts(figures):
+        print(f"torchslam: warning: {doubt}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status

@@ -15,7 +15,8 @@ from torchslam.world.schema import Schema
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; no columns at all where a table is empty."""
 
-FINITE = ("T_cw", "T_cr", "positions_w", "timestamp")  # what everything else is computed from
+# What everything else is computed from.
+FINITE = ("T_cw", "T_cr", "positions_w", "timestamp", "keypoints", "scales", "pixels", "reach")
 
 
 def check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
