@@ -183,7 +183,7 @@ class PatchesConfig(Settings, section="patches"):
     )
     min_share: float = setting(0.6, "of the patches, that must agree with the pose", above=0, high=1)
     max_error_growth: float = setting(
-        2.5, "median squared error, as a multiple of that in the earlier frame", above=0, high=1e6
+        1.3, "median squared error, as a multiple of that in the earlier frame", above=0, high=1e6
     )
     max_frames: int = setting(5, "followed one after the other", low=1, high=MOST)
     overlap_share: float = setting(
