@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -127,6 +128,16 @@ class Camera:
     def with_params(self, params: Tensor) -> Camera:
         """The same model and size with other parameters."""
         return replace(self, params=params)
+
+    def __getitem__(self, index: Any) -> Camera:
+        """Of many cameras (..., P) some, as indexing a tensor of their leading dimensions does."""
+        if self.params.ndim == 1:
+            raise IndexError("this is one camera: its parameters have no leading dimension")
+        index = index if isinstance(index, tuple) else (index,)
+        chosen = self.with_params(self.params[(*index, ..., slice(None))])
+        if self.model != "pinhole":  # found once for each camera, not for each time that it is chosen
+            chosen.__dict__["limit"] = self.limit[index]
+        return chosen
 
     def to(self, target: torch.device | torch.dtype | str) -> Camera:
         """The same camera on another device or in another dtype."""

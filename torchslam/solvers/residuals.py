@@ -11,7 +11,7 @@ an error of the image's diagonal and pulls nowhere: no step gains by pushing a p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -82,6 +82,25 @@ def linearize(observations: Observations, points_c: Tensor, free_camera: bool = 
     return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
 
 
+def linearize_each(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
+    """`linearize` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
+    if observations.camera.params.ndim == 1:
+        return linearize(observations, points_c, free_camera)
+    lin = linearize(_apart(observations), points_c[:, None], free_camera)
+    return Linearization(*(part.squeeze(1) for part in lin))
+
+
+def _apart(observations: Observations) -> Observations:
+    """Observations (N,) as a batch of one each; their scale is a scalar or (N,)."""
+    scale = observations.scale
+    return replace(
+        observations,
+        pixels=observations.pixels[:, None],
+        weights=observations.weights[:, None],
+        scale=scale[:, None] if scale.ndim else scale,
+    )
+
+
 class Weighed(NamedTuple):
     """`cost`, `weight` and `bend` of a `Linearization`, all (..., N)."""
 
@@ -132,11 +151,15 @@ def pull(linearization: Linearization, J: Tensor, near: Tensor | None) -> Tensor
     """
     residual, weight, bend = linearization.residual, linearization.weight, linearization.bend
     if near is not None:
-        squared = residual.square().sum(-1)
-        flat = -weight / torch.where(squared > 0, squared, 1.0)
-        bend = torch.maximum(bend, flat) * near
+        bend = flat_along(weight, bend, residual.square().sum(-1), near)
     along = (residual[..., None, :] @ J) * (bend[..., None] * residual)[..., None]
     return weight[..., None, None] * J + along
+
+
+def flat_along(weight: Tensor, bend: Tensor, squared: Tensor, near: Tensor) -> Tensor:
+    """The bend (..., N) that `pull` takes for residuals of these squares, px^2."""
+    flat = -weight / torch.where(squared > 0, squared, 1.0)
+    return torch.maximum(bend, flat) * near
 
 
 class Expansion(NamedTuple):
@@ -147,6 +170,11 @@ class Expansion(NamedTuple):
 
     gradient: Tensor
     hessian: Tensor
+
+    def along(self, columns: Tensor) -> Expansion:
+        """The expansion in the coefficients of columns (..., D, n)."""
+        gradient = (self.gradient[..., None, :] @ columns).squeeze(-2)
+        return Expansion(gradient, columns.mT @ self.hessian @ columns)
 
 
 def gauss_newton_expansion(lin: Linearization, near: Tensor) -> Expansion:
@@ -164,6 +192,16 @@ def exact_expansion(observations: Observations, points_c: Tensor, free_camera: b
     hessian = lin.J.mT @ pull(lin, lin.J, near=None)
     hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
     return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
+
+
+def exact_expansion_of_each(
+    observations: Observations, points_c: Tensor, free_camera: bool = False
+) -> Expansion:
+    """`exact_expansion` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
+    if observations.camera.params.ndim == 1:
+        return exact_expansion(observations, points_c, free_camera)
+    expansion = exact_expansion(_apart(observations), points_c[:, None], free_camera)
+    return Expansion(*(part.squeeze(1) for part in expansion))
 
 
 def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_camera: bool) -> Tensor:
@@ -185,7 +223,9 @@ def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_ca
     return torch.cat(rows, dim=-1).movedim(0, -2)
 
 
-def variance_factor(observations: Observations, linearization: Linearization, num_parameters: int) -> Tensor:
+def variance_factor(
+    observations: Observations, linearization: Linearization, num_parameters: int | Tensor
+) -> Tensor:
     """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate. -> (...).
 
     From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, psi = rho' r,
