@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torchslam.solvers.bundle_problem import Given, flat_rows
 from torchslam.solvers.folding import Tensors
 from torchslam.solvers.grid_layout import GridLayout, build_grid_layout, fits_grids, grid_data
 from torchslam.solvers.implicit import Ndims
-from torchslam.solvers.levenberg import Progress, minimize
+from torchslam.solvers.levenberg import LeastSquares, M, Progress, X, minimize
 from torchslam.solvers.residuals import Observations, linearize_each
 from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
@@ -54,6 +54,33 @@ class Part(NamedTuple):
     layout: Layout | GridLayout
 
 
+class Bundles(LeastSquares[X, M], Protocol[X, M]):
+    """What solves elements, `Bundle` one and `GridBundle` many, in a way and an order of its own."""
+
+    @property
+    def start(self) -> X: ...
+
+    def definite(self, model: M) -> Tensor:
+        """(B,) whether all that moves is determined, up to the gauge."""
+        ...
+
+    def ordered(self, estimate: Estimate) -> X:
+        """The estimate (B, ...) in the order of the problems as this one has it."""
+        ...
+
+    def in_order(self, estimate: X) -> Estimate:
+        """The way back."""
+        ...
+
+    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+        """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
+        ...
+
+    def marginals(self, estimate: Estimate) -> Marginals:
+        """Covariances in the order of the problems."""
+        ...
+
+
 class BundleMinimization:
     """Bundle adjustments of inputs `Given`; vectors are frames (B, F, 6), points (B, P, 3) and cameras (B, C n): along
     the directions (K, n) in which each may move, none where they are fixed."""
@@ -76,11 +103,7 @@ class BundleMinimization:
         progress: Progress | None,
     ) -> None:
         self.camera, self.kernel = camera, kernel
-        self.some_stay = isinstance(free_camera, Tensor)
-        self.directions: Tensor | None = free_camera if isinstance(free_camera, Tensor) else None
-        if free_camera is True:
-            like = camera.params
-            self.directions = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+        self.free_camera = free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
         self._last: tuple[Tensor, Moving, list[Part]] | None = None
 
@@ -142,17 +165,18 @@ class BundleMinimization:
             self.kernel,
             given.scale[:, None].expand_as(given.weights).flatten(),
         )
-        lin = linearize_each(observed, points_c, self.directions is not None)
+        is_free = self.free_camera is not False
+        lin = linearize_each(observed, points_c, is_free)
         velocity = move(points_c, frames.flatten(0, 1).index_select(0, in_frames))
         moving = points.flatten(0, 1).index_select(0, in_points)[..., None]
         velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
-        if self.directions is not None:
-            turning = self._along(camera, at.params.shape[1]).flatten(0, 1)
+        if is_free:
+            turning = self._along(camera, at.params).flatten(0, 1)
             turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
             velocity = torch.cat((velocity, turning), dim=-1)
         slope = (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
         terms = prior_terms(
-            given.inputs, at.T_cw, at.params, found.moved_frames, self.directions, exact=False
+            given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
         )
         if terms is None:
             return slope
@@ -161,27 +185,39 @@ class BundleMinimization:
     def moved(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
         T_cw, points_w, params, *rest = found
-        params = params + self._along(camera, params.shape[1])
+        params = params + self._along(camera, params)
         return retract(T_cw, frames), points_w + points, params, *rest
 
     def push(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
-        along = self._along(camera, found[2].shape[1])
-        return push(found[0], frames), points, torch.zeros_like(found[2]) + along
+        return push(found[0], frames), points, self._along(camera, found[2])
 
     def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
         frames, points, params = gradient
-        camera = params[..., :0] if self.directions is None else params @ self.directions
+        directions = self._directions(params)
+        camera = params[..., :0] if directions is None else params @ directions
         return pull_back(found[0], frames), points, camera.flatten(1)
 
-    def _along(self, step: Tensor, num_cameras: int) -> Tensor | float:
-        """(B, C, K) how a step (B, C n) changes the cameras' parameters."""
-        return 0.0 if self.directions is None else step.unflatten(1, (num_cameras, -1)) @ self.directions.mT
+    def _directions(self, params: Tensor) -> Tensor | None:
+        """(K, n) along which parameters (..., K) may move; None where they do not."""
+        if isinstance(self.free_camera, Tensor):
+            return self.free_camera
+        size = params.shape[-1]
+        return torch.eye(size, dtype=params.dtype, device=params.device) if self.free_camera else None
+
+    def _along(self, step: Tensor, params: Tensor) -> Tensor:
+        """How a step (B, C n) changes the cameras' parameters (B, C, K)."""
+        directions = self._directions(params)
+        if directions is None:
+            return torch.zeros_like(params)
+        return step.unflatten(1, (params.shape[1], directions.shape[1])) @ directions.mT
 
     def at_minimum(self, found: Found, given: Given) -> Estimate:
         """The minima where things moved, the inputs, with their derivatives, where they did not."""
-        params = given.params if self.directions is None else found.params
-        if self.some_stay:  # what does not move of the parameters reaches them unchanged
+        params = given.params if self.free_camera is False else found.params
+        if isinstance(
+            self.free_camera, Tensor
+        ):  # what does not move of the parameters reaches them unchanged
             params = params + (given.params - given.params.detach())
         return Estimate(
             torch.where(found.moved_frames[..., None, None], found.T_cw, given.T_cw),
@@ -211,15 +247,16 @@ class BundleMinimization:
         told, before = self.progress, self.iterations * part.rows.start
         return None if told is None else lambda now, most: told(before + now, most * len(given.T_cw))
 
-    def _bundles(self, given: Given) -> list[tuple[Part, Bundle | GridBundle]]:
+    def _bundles(self, given: Given) -> list[tuple[Part, Bundles[Any, Any]]]:
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
-    def _bundle(self, given: Given, part: Part) -> Bundle | GridBundle:
+    def _bundle(self, given: Given, part: Part) -> Bundles[Any, Any]:
         given, layout = given.part(part.rows), part.layout
+        directions = self._directions(given.params)
         if isinstance(layout, GridLayout):
-            return GridBundle(grid_data(layout, given), self.camera, self.kernel, self.directions)
+            return GridBundle(grid_data(layout, given), self.camera, self.kernel, directions)
         one = Given(*(tensor[0] for tensor in given))
-        return Bundle(layout, one.inputs, self.camera, self.kernel, self.directions, given.camera_of[0])
+        return Bundle(layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0])
 
     def _laid_out(self, given: Given) -> tuple[Moving, list[Part]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""

@@ -153,8 +153,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
     is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
     seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, weights.shape)
     counted = asked & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
-    wanted = torch.zeros_like(is_finite).flatten()
-    wanted = wanted.index_fill(0, flat_rows(frame_index, num_frames)[asked.flatten()], True)
+    wanted = torch.zeros_like(frame_index[:, :1]).expand(batch, num_frames)
+    wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
     return Given(
         torch.where(is_finite[..., None, None], T_cw, eye),
@@ -165,7 +165,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
         torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
         *priors,
         counted,
-        (is_finite | ~wanted.view_as(is_finite)).all(-1),
+        (is_finite | ~wanted).all(-1),
         frame_index,
         point_index,
         camera_index,

@@ -43,8 +43,10 @@ X = TypeVar("X")
 class LeastSquares(Protocol[X, M]):
     """What the loop asks of a problem with estimate X and local models M."""
 
-    solvable: Tensor
-    """(B,) bool, which elements to minimise; the others stay at their start."""
+    @property
+    def solvable(self) -> Tensor:
+        """(B,) bool, which elements to minimise; the others stay at their start."""
+        ...
 
     def evaluate(self, estimate: X, near: Tensor) -> M:
         """The cost and its quadratic model at an estimate. near: (B,) bool, the optimum is close."""

@@ -1,4 +1,4 @@
-"""Gaussian priors: half of e^T information e; of poses e = (t, log R) of T_cw @ T_prior^-1, of cameras e = params - mean."""
+"""Gaussian priors: half of e^T information e; e = (t, log R) of T_cw @ T_prior^-1 for poses."""
 
 from __future__ import annotations
 
