@@ -3,12 +3,13 @@
 from torchslam.solvers.bundle import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.solvers.pose import RefinedPose, refine_pose
 from torchslam.solvers.pose_graph import PoseGraph, PoseGraphSolution, pose_graph_optimize
-from torchslam.solvers.prior import PosePrior
+from torchslam.solvers.prior import CameraPrior, PosePrior
 from torchslam.solvers.schur import Marginals
 
 __all__ = [
     "BundleProblem",
     "BundleSolution",
+    "CameraPrior",
     "Marginals",
     "PoseGraph",
     "PoseGraphSolution",
