@@ -56,12 +56,13 @@ def assemble_grid(
     across = (R_wc @ upper[:, :, :, 3:].reshape(batch, R_wc.shape[-1], -1)).view(batch, 3, dims - 3, count)
 
     # Pose against point: G^T C R.
-    rotated, near = rotated[:, :leading], points_c[:, :leading]
-    turned = _cross(near[..., None, :], rotated)
+    rotated, near, R_cw = rotated[:, :leading], points_c[:, :leading], R_cw[:, :leading]
+    coupling = torch.stack((*rotated.unbind(2), *_cross(near[..., None, :], rotated)), dim=2)
+    sums = _sum_by_frame(slope[:, :leading], upper[:, :leading, :, 3:], coupling, near, R_cw, exact)
     if exact:
-        turned = turned - _cross(slope[:, :leading, :, None], R_cw[:, :leading, :, :, None])
-    coupling = torch.cat((rotated, turned), dim=2)
-    gradient, frames, frames_camera = _sum_by_frame(slope[:, :leading], upper[:, :leading], near, exact)
+        bend = torch.stack(_cross(slope[:, :leading, :, None], R_cw[..., None]), dim=2)
+        coupling = coupling - torch.nn.functional.pad(bend, (0, 0, 0, 0, 3, 0))
+    gradient, frames, frames_camera = sums
     if not free.all():  # what only fills up stays where it is
         gradient = torch.where(free[..., None], gradient, 0.0)
         eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
@@ -84,43 +85,36 @@ def assemble_grid(
     return GridEquations(gradient, points_gradient, reduced, points, coupling)
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
+def _cross(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """a x b along dimension 2."""
     (a0, a1, a2), (b0, b1, b2) = a.unbind(2), b.unbind(2)
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), dim=2)
+    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
 
 
 def _sum_by_frame(
-    slope: Tensor, upper: Tensor, points_c: Tensor, exact: bool
+    slope: Tensor, across: Tensor, coupling: Tensor, points_c: Tensor, R_cw: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """G^T q (B, F, 6), G^T C G (B, F, 6, 6) and G^T C_camera (B, F, 6, K) summed over the points, G = [I, -p^].
 
-    They are sums of q and C times the monomials of p up to the second degree.
+    They are sums of q, C_camera and G^T C R (B, F, 6, 3, P) times 1 and p.
     """
-    dims, cross = upper.shape[3], _CROSS.to(points_c.dtype).to(points_c.device)
-    ones = torch.ones_like(points_c[:, :, :1])
-    squares = (points_c[:, :, :, None] * points_c[:, :, None]).flatten(2, 3)
-    monomials = torch.cat((ones, points_c, squares), dim=2).mT
-    sums = (upper.flatten(2, 3) @ monomials).unflatten(2, (3, dims))  # (B, F, 3, D, 13)
-    pushed = slope @ monomials[..., :4]  # (B, F, 3, 4)
-    zeroth, first, second = sums[..., 0], sums[..., 1:4], sums[..., :3, 4:].unflatten(-1, (3, 3))
-    lower = torch.einsum("bmj,xfjkm->xfbk", cross, first)
-    corner = torch.einsum("bmj,clk,xfjkml->xfbc", cross, cross, second)
+    num_camera, cross = across.shape[3], _CROSS.to(points_c.dtype).to(points_c.device)
+    affine = torch.cat((torch.ones_like(points_c[:, :, :1]), points_c), dim=2).mT
+    pushed = slope @ affine  # (B, F, 3, 4)
     outer = pushed[..., 1:]
     torque = torch.einsum("bmj,xfjm->xfb", cross, outer)
+    moments = R_cw[:, :, None] @ (coupling.flatten(2, 3) @ affine).unflatten(
+        2, (6, 3)
+    )  # (B, F, 6, 3, 4): of G^T C
+    frames = torch.cat((moments[..., 0], torch.einsum("clk,xfakl->xfac", cross, moments[..., 1:])), dim=-1)
     if exact:
-        trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
-        corner = corner + 0.5 * (outer + outer.mT) - trace * eye
-    frames = torch.cat(
-        (
-            torch.cat((zeroth[..., :3], lower[..., :3].mT), dim=-1),
-            torch.cat((lower[..., :3], corner), dim=-1),
-        ),
-        dim=-2,
-    )
-    across = torch.cat((zeroth[..., 3:], lower[..., 3:]), dim=-2)
-    return torch.cat((pushed[..., 0], torque), dim=-1), frames, across
+        trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        bend = 0.5 * (outer + outer.mT) - trace * eye
+        frames = frames + torch.nn.functional.pad(bend, (3, 0, 3, 0))
+    sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, F, 3, K, 4)
+    turned = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
+    return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], turned), dim=-2)
 
 
 class FactorizedGrid(NamedTuple):
