@@ -161,11 +161,15 @@ def windows() -> list[str]:
         pixels = problem.pixels.clone().requires_grad_()
         loss_of(bundle_adjust(replace(problem, pixels=pixels), scale=2.45)).backward()
 
+    def each(task: Callable[[BundleProblem], Any]) -> None:
+        for problem in problems:
+            task(problem)
+
     together, loop, step_together, step_loop = milliseconds(
         solve(batch),
-        lambda: [solve(problem)() for problem in problems] and None,
+        lambda: each(lambda problem: solve(problem)()),
         lambda: step(batch),
-        lambda: [step(problem) for problem in problems] and None,
+        lambda: each(step),
         repeats=5,
     )
     header = [f"{WINDOWS} windows", "one after the other, ms", "in one call, ms", "throughput"]

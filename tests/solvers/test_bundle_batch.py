@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torch.func import vmap
 
 from torchslam.geometry import se3_exp
 from torchslam.solvers import BundleProblem, CameraPrior, PosePrior, bundle_adjust
@@ -276,3 +277,28 @@ def test_a_wrong_batch_is_named(bundle_scene):
         bundle_adjust(replace(batch, camera=batch.camera.with_params(torch.ones(3, 4).double())))
     with pytest.raises(ValueError, match="camera_index must have one row per frame, 5"):
         bundle_adjust(replace(problems[0], camera_index=torch.zeros(4, dtype=torch.int64)))
+    with pytest.raises(ValueError, match="a batch must have a problem"):
+        bundle_adjust(replace(batch, T_cw=batch.T_cw[:0]))
+
+
+def test_vmap_over_batches(bundle_scene):
+    batch = batch_of([bundle_scene(seed=seed).problem for seed in (0, 1)])
+    pixels = torch.stack([batch.pixels, batch.pixels + 0.3])
+
+    def points(pixels: Tensor) -> Tensor:
+        return bundle_adjust(replace(batch, pixels=pixels)).points_w
+
+    expected = torch.stack([points(pixels[0]), points(pixels[1])])
+    torch.testing.assert_close(vmap(points)(pixels), expected, **EQUAL)
+
+
+def test_autocast_changes_no_bit_of_a_batch(bundle_scene):
+    batch = batch_of([bundle_scene(seed=seed).problem for seed in (0, 1)])
+    batch = replace(
+        batch, points_w=batch.points_w.float(), T_cw=batch.T_cw.float(), pixels=batch.pixels.float()
+    )
+    batch = replace(batch, camera=batch.camera.to(torch.float32))
+    expected = bundle_adjust(batch)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = bundle_adjust(batch)
+    assert torch.equal(found.points_w, expected.points_w)

@@ -23,8 +23,8 @@ from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
 from torchslam.solvers.tangent import move, pull_back, push, retract
 
-# Of all grids that are solved at once: what they need stays in the processor's cache.
-_CELLS_AT_ONCE = 1 << 14
+# Of all grids that are solved at once: what they need stays in the processor's cache, or keeps an accelerator busy.
+_CELLS_AT_ONCE, _CELLS_ON_DEVICE = 1 << 14, 1 << 20
 
 
 class Found(NamedTuple):
@@ -272,7 +272,8 @@ def _parts(given: Given, moving: Moving) -> list[Part]:
     use_grids = batch > 1 and fits_grids(given, moving)
     size = 1
     if use_grids:
-        size = max(1, _CELLS_AT_ONCE // (moving.frames.shape[1] * moving.points.shape[1]))
+        cells = _CELLS_AT_ONCE if given.T_cw.device.type == "cpu" else _CELLS_ON_DEVICE
+        size = max(1, cells // (moving.frames.shape[1] * moving.points.shape[1]))
     parts = []
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))

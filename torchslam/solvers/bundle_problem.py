@@ -132,6 +132,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
     Raises ValueError for shapes, dtypes and indices that do not fit.
     """
     T_cw = problem.T_cw if problem.is_batch else problem.T_cw[None]
+    if not len(T_cw):
+        raise ValueError("a batch must have a problem")
     points_w, pixels, weights, asked = _rows(problem, T_cw)
     params, camera_index = _cameras(problem, T_cw)
     priors = _priors(problem, T_cw, params)
