@@ -20,7 +20,7 @@ INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
 INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 
-.PHONY: help demo test mutation lint types format benchmarks profile clean distclean
+.PHONY: help demo test fuzz mutation lint types format benchmarks profile clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -31,6 +31,9 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB
+	$(BIN)/python -m tests.fuzz
 
 mutation: $(INSTALLED_MUTATION)  ## small changes to the system layer: how many of them do its tests notice?
 	$(BIN)/python -m tests.mutation --sample $(SAMPLE) --seed $(SEED)

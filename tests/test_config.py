@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import math
+import os
+import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +23,7 @@ from torchslam.config import (
     to_toml,
 )
 from torchslam.errors import ConfigError
-from torchslam.settings import Allowed, Settings, setting
+from torchslam.settings import MAX_BYTES, Allowed, Settings, explained, setting
 
 SECTIONS = {
     f.name: type(getattr(Config(), f.name)) for f in fields(Config) if f.name not in ("seed", "scale")
@@ -66,9 +69,21 @@ def test_an_integer_serves_as_a_float() -> None:
         ("features=3", "is a section"),
         ("matching.ratio=nan", "matching.ratio must be above 0 and at most 1, not nan"),
         ("matching.ratio=-0.5", "matching.ratio must be above 0 and at most 1, not -0.5"),
-        ("tracking.radius_px=inf", "tracking.radius_px must be above 0 and finite, not inf"),
-        ("bundle.window=0", "--set bundle.window=0: bundle.window must be at least 2 and finite, not 0"),
-        pytest.param("seed=" + 5000 * "9", "must be of type int", id="too many digits"),
+        ("tracking.radius_px=inf", "tracking.radius_px must be above 0 and at most 10000, not inf"),
+        (
+            "bundle.window=0",
+            "--set bundle.window=0: bundle.window must be at least 2 and at most 1000000, not 0",
+        ),
+        ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 100000, not 0"),
+        ("features.image_pixels=1", "features.image_pixels must be 0 or at least 1024 and at most"),
+        ("seed=18446744073709551616", "seed must be at least 0 and at most 9223372036854775807"),
+        ("tracking.threshold_px=0", "tracking.threshold_px must be above 0 and at most 10000, not 0"),
+        ("tracking.radius_px=1e300", "tracking.radius_px must be above 0 and at most 10000, not 1e\\+300"),
+        pytest.param("a" + 20_000 * ".a" + "=1", "40003 characters, more than the 4096", id="too many dots"),
+        pytest.param("seed=" + 3000 * "[" + 3000 * "]", "6005 characters", id="too deep"),
+        pytest.param("seed=" + 1500 * "[" + 1500 * "]", "seed must be of type int", id="deep"),
+        pytest.param("seed=" + 1000 * "9", "seed must be at least 0 and at most", id="many digits"),
+        pytest.param("seed=" + 5000 * "9", "5005 characters, more than the 4096", id="too many digits"),
         ("seed", "section.key=value"),
     ],
 )
@@ -112,6 +127,59 @@ def test_every_section_is_written_out() -> None:
         assert section.name in text
 
 
+def test_what_is_explained_reads_back(tmp_path: Path) -> None:
+    config = load_config(None, ["seed=7", "features.image_pixels=0", "matching.ratio=0.7"])
+    text = explained(config)
+    (tmp_path / "c.toml").write_text(text)
+    assert load_config(tmp_path / "c.toml") == config
+    assert len((tmp_path / "c.toml").read_bytes()) < MAX_BYTES / 2
+    assert (
+        """
+# that much larger images are reduced to before anything is looked for; 0: all are taken as they are
+#   0 or at least 1024 and at most 67108864; default 307200
+image_pixels = 0
+"""
+        in text
+    )
+    assert "#   default true\nenabled = true" in text
+
+
+@pytest.mark.parametrize("kind", [Config, *SECTIONS.values()], ids=lambda kind: kind.__name__)
+def test_every_setting_says_what_it_is_and_has_an_end(kind: type[Settings]) -> None:
+    for declared in fields(kind):
+        if declared.type in ("int", "float"):
+            assert declared.metadata["allowed"].high < math.inf, declared.name
+            assert declared.default in declared.metadata["allowed"]
+        if declared.type in ("int", "float", "bool", "str"):
+            assert declared.metadata["about"], declared.name
+
+
+def test_what_grows_stays_in_its_range() -> None:
+    config = load_config(None, ["tracking.threshold_px=9000"]).for_size((4000, 3000))
+    assert config.tracking.threshold_px == 10_000
+
+
+def test_files_that_take_time(tmp_path: Path) -> None:
+    file = tmp_path / "hostile.toml"
+    for text, message in (
+        ("a" + ".a" * 20_000 + " = 1", "a line of 40005 characters, more than the 4096"),
+        (
+            "seed = " + "9" * 4000 + "\n# " + "#\n" * 40_000,
+            "has 84010 bytes, more than the 65536 of a configuration",
+        ),
+        ("seed = " + "[\n" * 3000 + "]\n" * 3000, "not valid TOML|type int"),
+        ("a" + ".a" * 2000 + " = 1", "unknown key 'a'"),
+    ):
+        file.write_text(text)
+        start = time.process_time()
+        with pytest.raises(ConfigError, match=rf"hostile\.toml.*{message}"):
+            load_config(file)
+        assert time.process_time() - start < 1
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ConfigError, match="pipe cannot be read: not a regular file"):
+        load_config(tmp_path / "pipe")
+
+
 def test_choices_have_one_source() -> None:
     assert CHOICES == {
         "scale": ("unit", "groundtruth"),
@@ -145,7 +213,10 @@ def test_choices_have_one_source() -> None:
             lambda: FeaturesConfig(weights="\udcff"),
             "^features.weights must be text that can be written as UTF-8",
         ),
-        (lambda: MatchingConfig(max_distance=10**400), "^matching.max_distance must be above 0 and finite"),
+        (
+            lambda: MatchingConfig(max_distance=10**400),
+            "^matching.max_distance must be above 0 and at most 4096",
+        ),
     ],
 )
 def test_a_wrong_value_in_python_is_named(build: Any, message: str) -> None:

@@ -37,6 +37,7 @@ GROWING = {
 def test_only_much_larger_images_are_reduced(size: tuple[int, int], factor: float) -> None:
     assert FeaturesConfig().reduction(size) == pytest.approx(factor, rel=1e-5)
     assert FeaturesConfig(image_pixels=0).reduction(size) == 1
+    assert FeaturesConfig(kind="simulated").reduction(size) == 1
     assert FeaturesConfig(image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         triangulate,
         umeyama,
     )
-    from torchslam.learning.clip import ClipPoses, ClipSLAM, clip_loss
+    from torchslam.learning.clip import ClipGraph, ClipPoses, ClipSLAM, clip_loss
     from torchslam.run import Run
     from torchslam.slam import SLAM
     from torchslam.solvers import BundleProblem, bundle_adjust, minimize, refine_pose
@@ -38,6 +38,7 @@ __all__ = [
     "SLAM",
     "BundleProblem",
     "Camera",
+    "ClipGraph",
     "ClipPoses",
     "ClipSLAM",
     "Config",
@@ -76,7 +77,7 @@ HOMES = {
     "torchslam.evaluation": "evaluate",
     "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_projected",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
-    "torchslam.learning.clip": "ClipPoses ClipSLAM clip_loss",
+    "torchslam.learning.clip": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.run": "Run",
     "torchslam.slam": "SLAM",
     "torchslam.solvers": "BundleProblem bundle_adjust minimize refine_pose",

@@ -6,18 +6,11 @@ while this one tracks and maps.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
-import signal
 import traceback
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import Any
 
 import torch
 
@@ -26,8 +19,10 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import TorchslamError
 from torchslam.front_end import check_size, image_extractor
 from torchslam.geometry import Camera
+from torchslam.parcel import as_arrays, from_arrays
 from torchslam.stopwatch import Stopwatch
-from torchslam.values import Features, Frame
+from torchslam.values import Frame
+from torchslam.worker import READY, Worker
 
 AHEAD = 4
 """Frames that a process is asked for before their turn: about as many as it reads while a keyframe is mapped."""
@@ -70,11 +65,12 @@ class Ahead:
         # Not by multiprocessing's own pickling, which would move tensors to shared memory.
         self._task = pickle.dumps((sequence, camera, config, torch.get_num_threads()))
         self._workers: list[Worker] = []
+        self._busy: set[Worker] = set()  # those that have the task
         self._asked: dict[int, Worker] = {}
         self._next: int | None = None  # first frame of which nobody was asked yet
 
     def __enter__(self) -> Ahead:
-        self._workers = [Worker(self._task) for _ in range(self._count)]
+        self._workers = [Worker(_work) for _ in range(self._count)]
         return self
 
     def __exit__(
@@ -89,11 +85,11 @@ class Ahead:
         worker = self._asked.pop(index, None)
         if worker is not None:
             with self._clock("features"):
-                answer = worker.answer()
+                answer = worker.receive()
             if isinstance(answer, BaseException):
                 raise answer
             if answer is not None:
-                return _unpacked(answer)
+                return from_arrays(answer)
         return self._sequence[index]
 
     def _ask(self, index: int) -> None:
@@ -101,81 +97,17 @@ class Ahead:
         until = min(index + 1 + AHEAD * self._count, len(self._sequence))
         for later in range(max(index + 1, self._next or 0), until):
             worker = self._workers[later % self._count]
-            if worker.ask(later):
+            if worker not in self._busy and worker.is_there() and worker.send(self._task):
+                self._busy.add(worker)
+            if worker in self._busy and worker.send(pickle.dumps(later)):
                 self._asked[later] = worker
         self._next = until
-
-
-class Worker:
-    """A process that finds the features of the frames that it is asked for."""
-
-    def __init__(self, task: bytes) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(theirs,), name="torchslam ahead", daemon=True)
-        self._task = (
-            task  # no argument: `start` would wait for ever for a process that dies before it reads it
-        )
-        self._is_ready = self._has_ended = False
-        with _without_interrupts():
-            self._process.start()
-        theirs.close()  # so that its end is noticed
-
-    def ask(self, index: int) -> bool:
-        """Ask for a frame; whether there is somebody to answer."""
-        try:
-            if not self._is_ready and not self._has_ended and self._ours.poll():
-                self._is_ready = self._ours.recv_bytes() == b""
-                self._ours.send_bytes(self._task)
-            if self._is_ready:
-                self._ours.send_bytes(pickle.dumps(index))
-        except (EOFError, OSError):
-            self._lose()
-        return self._is_ready
-
-    def answer(self) -> Any:
-        """What came of the frame asked for first, packed, or the error; None where the process has ended."""
-        try:
-            return pickle.loads(self._ours.recv_bytes())
-        except (EOFError, OSError):
-            self._lose()
-            return None
-
-    def end(self) -> None:
-        """Let the process go; it holds nothing that would be lost."""
-        self._ours.close()
-        self._process.terminate()
-        self._process.join()
-
-    def _lose(self) -> None:
-        """The process was ended by somebody else."""
-        if not self._has_ended:
-            self._process.join()
-            status = self._process.exitcode
-            warnings.warn(
-                f"a process that reads ahead has ended ({status}): going on without it", stacklevel=2
-            )
-        self._is_ready, self._has_ended = False, True
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that are started in here are not ended by Ctrl-C, which is for this one to see to; none is lost."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # it would let signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(connection: Connection) -> None:
     """A process: say that there is somebody, take the task, then answer until the one that asks has gone."""
     try:
-        connection.send_bytes(b"")
+        connection.send_bytes(READY)
         sequence, camera, config, threads = pickle.loads(connection.recv_bytes())
         torch.set_num_threads(threads)
         extract = image_extractor(config)
@@ -185,7 +117,7 @@ def _work(connection: Connection) -> None:
                 with torch.inference_mode():
                     frame = sequence[index]
                     check_size(frame, camera)
-                    answer: object = _packed(frame, extract(frame))
+                    answer: object = as_arrays(frame, None, extract(frame))
             except Exception as error:  # an error is an answer too, and raised where it was asked for
                 if not isinstance(error, TorchslamError):
                     error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
@@ -193,24 +125,3 @@ def _work(connection: Connection) -> None:
             connection.send_bytes(pickle.dumps(answer))
     except (EOFError, OSError):
         return
-
-
-def _packed(frame: Frame, features: Features) -> dict[str, Any]:
-    """A frame with features, without its image, as arrays: tensors are slow to pickle."""
-    truth = None if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth.numpy()
-    columns = [getattr(features, name).numpy() for name in Features.__dataclass_fields__]
-    return {"frame": (frame.index, frame.timestamp, frame.name), "truth": truth, "features": columns}
-
-
-def _unpacked(packed: dict[str, Any]) -> Frame:
-    """What `_packed` packed."""
-    (index, timestamp, name), truth = packed["frame"], packed["truth"]
-    features = Features(*map(torch.from_numpy, packed["features"]))
-    return Frame(
-        index,
-        timestamp,
-        torch.zeros(1, 1, 0, 0),
-        name,
-        None if truth is None else torch.from_numpy(truth),
-        features=features,
-    )

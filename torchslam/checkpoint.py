@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,15 @@ def read_checkpoint(
     try:
         so_far = Progressed(run["next"], _results(own, run, device), run["skipped"])
         _go_on(slam, saved, own, run, device)
-    except (KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
+    except (
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        OverflowError,
+        RuntimeError,
+    ) as error:
         raise ResultsError(f"{path}: {UNKNOWN}: {error}") from None
     return slam, so_far
 
@@ -107,6 +116,7 @@ def _go_on(
         name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
     }
     world.track = track = Track(**run["track"], **columns)
+    _check_track(track)
     for rows, count in (
         (track.seen_last, len(world.map.points)),
         (track.local_points, len(world.map.points)),
@@ -122,6 +132,19 @@ def _go_on(
     slam.enter(session, world, (int(index), float(timestamp)))
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
+
+
+def _check_track(track: Track) -> None:
+    """Raises ValueError, or TypeError for what is no tensor, where it is not the way of a camera."""
+    for T in (track.T_cr, track.velocity):
+        if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
+            raise ValueError("where the camera was is no pose")
+    for rows in (track.seen_last, track.local_keyframes, track.local_points):
+        if rows.ndim != 1 or rows.dtype != torch.int64:
+            raise ValueError("where the camera was does not name rows")
+    counts, shares = (track.reference, track.reference_size), (track.error, track.explained)
+    if not all(type(count) is int for count in counts) or not all(map(math.isfinite, shares)):
+        raise ValueError(f"where the camera was: {counts}, {shares}")
 
 
 def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:

@@ -1,4 +1,4 @@
-"""The command line: `torchslam run | refine | demo | eval | plot | export | info | download`.
+"""The command line: `torchslam run | refine | demo | eval | plot | export | info | config | download`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
 130 and 143 ended by Ctrl-C and by SIGTERM.
@@ -39,6 +39,10 @@ COMMANDS = {
         "give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
     ),
     "info": ("info", "say what would be read from a sequence: frames, size, rate, calibration, ground truth"),
+    "config": (
+        "config",
+        "print every setting with what it is, its range and its default, as TOML that --config reads",
+    ),
     "download": (
         "download",
         "fetch a public sequence: with a progress bar, taking up a transfer that broke off",

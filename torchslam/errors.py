@@ -1,8 +1,27 @@
 """The errors that torchslam raises on purpose. A message says what is wrong, where, and what to do."""
 
+LONGEST = 2000
+"""Characters of a message: what a file holds in place of a number may be of any length."""
+
 
 class TorchslamError(Exception):
-    """Base of every error that torchslam raises on purpose."""
+    """Base of every error that torchslam raises on purpose.
+
+    As text it is one line that can be shown: what a file or its name holds of control characters is escaped, and the
+    middle of a message that is too long left out.
+    """
+
+    def __str__(self) -> str:
+        text = _shortened(super().__str__())
+        return text if text.isprintable() else _shortened("".join(map(_shown, text)))
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
+
+
+def _shown(character: str) -> str:
+    return character if character.isprintable() else character.encode("unicode_escape").decode()
 
 
 class ConfigError(TorchslamError):

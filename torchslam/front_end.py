@@ -33,18 +33,21 @@ def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extra
         wanted = None if frame.mask is None else frame.mask.to(device)
         height, width = image.shape[-2:]
         factor = settings.reduction((width, height))
-        size = max(1, round(height / factor)), max(1, round(width / factor))
-        features = module(*_reduced(image, wanted, size))
+        image, wanted = reduced(image, wanted, factor)
+        features = module(image, wanted)
         if factor > 1:
-            features = _enlarged(features, (width / size[1], height / size[0]), factor)
+            ratio = width / image.shape[-1], height / image.shape[-2]
+            features = _enlarged(features, ratio, factor)
         # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
         return features if wanted is None else only_where(features, wanted)
 
     return extract
 
 
-def _reduced(image: Tensor, wanted: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
-    """An image and the mask of it at (height, width)."""
+def reduced(image: Tensor, wanted: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
+    """An image and the mask of it, less wide and high by a factor."""
+    height, width = image.shape[-2:]
+    size = max(1, round(height / factor)), max(1, round(width / factor))
     if image.shape[-2:] == size:
         return image, wanted
     if wanted is not None:

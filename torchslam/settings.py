@@ -17,9 +17,16 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from torchslam.errors import ConfigError
+from torchslam.regular_file import read_text
 
 Value = TypeVar("Value", bool, int, float, str)
 Section = TypeVar("Section", bound="Settings")
+MAX_BYTES = 1 << 16
+"""Of a file of settings: all of them with all that there is to say of them are a quarter of that."""
+SHOWN = 200
+"""Characters of a value in a message."""
+MAX_LINE = 1 << 12
+"""Characters of a line: the time that a key of many parts takes grows with the square of their number."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,7 @@ class Allowed:
 
     low, high: the range of a number, both ends in it
     above:     a lower end that is not in the range
+    also:      a number outside of the range that means something else
     choices:   of a string; empty for any
     """
 
@@ -35,35 +43,43 @@ class Allowed:
     high: float = math.inf
     above: float = -math.inf
     choices: tuple[str, ...] = ()
+    also: float | None = None
 
     def __contains__(self, value: object) -> bool:
         if isinstance(value, bool):
             return True
         if isinstance(value, int | float):
-            return math.isfinite(value) and self.low <= value <= self.high and value > self.above
+            is_finite = isinstance(value, int) or math.isfinite(value)  # isfinite makes floats of integers
+            is_inside = is_finite and self.low <= value <= self.high and value > self.above
+            return is_inside or value == self.also
         return not self.choices or value in self.choices
 
     def __str__(self) -> str:
         if self.choices:
             return f"one of {', '.join(self.choices)}"
         start = f"at least {self.low}" if self.above < self.low else f"above {self.above}"
-        return f"{start} and {'finite' if self.high == math.inf else f'at most {self.high}'}"
+        also = "" if self.also is None else f"{self.also} or "
+        return f"{also}{start} and {'finite' if self.high == math.inf else f'at most {self.high}'}"
 
 
 def setting(
     default: Value,
+    about: str = "",
     *,
     low: float = 0,
     high: float = math.inf,
     above: float = -math.inf,
     choices: tuple[str, ...] = (),
+    also: float | None = None,
     grows: bool = False,
 ) -> Value:
     """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number.
 
+    about: what it is, in words, for `explained`
     grows: whether it is a length in the image, for `enlarged`
     """
-    return field(default=default, metadata={"allowed": Allowed(low, high, above, choices), "grows": grows})
+    allowed = Allowed(low, high, above, choices, also)
+    return field(default=default, metadata={"allowed": allowed, "about": about, "grows": grows})
 
 
 @dataclass(frozen=True)
@@ -99,18 +115,22 @@ def merged(config: Section, path: Path | str | None = None, overrides: Iterable[
     if path is not None:
         config = _merge(config, _read_toml(Path(path)), str(path), type(config))
     for override in overrides:
-        config = _merge(config, _parse_override(override), f"--set {override}", type(config))
+        config = _merge(config, _parse_override(override), f"--set {_short(override)}", type(config))
     return config
 
 
 def enlarged(config: Section, factor: float) -> Section:
-    """The configuration with every setting that `grows` multiplied by a factor."""
+    """The configuration with every setting that `grows` multiplied by a factor, as far as its range allows."""
     changes: dict[str, Any] = {}
     for name in _declared(type(config)):
         value = getattr(config, name)
         if isinstance(value, Settings):
             changes[name] = enlarged(value, factor)
-    changes |= {f.name: factor * getattr(config, f.name) for f in fields(config) if f.metadata.get("grows")}
+    changes |= {
+        f.name: min(factor * getattr(config, f.name), f.metadata["allowed"].high)
+        for f in fields(config)
+        if f.metadata.get("grows")
+    }
     return replace(config, **changes)
 
 
@@ -122,6 +142,29 @@ def to_toml(config: Settings) -> str:
     for name, section in sections.items():
         lines += ["", f"[{name}]", to_toml(section).rstrip("\n")]
     return "\n".join(lines) + "\n"
+
+
+def explained(config: Settings) -> str:
+    """The configuration as TOML, above every value what it is, what it may be and what it is by default."""
+    lines, inner = [], []
+    for declared in fields(config):
+        value, about = getattr(config, declared.name), declared.metadata.get("about", "")
+        if isinstance(value, Settings):
+            words = (type(value).__doc__ or "").strip().splitlines()
+            # A dataclass without a docstring has its signature in place of one.
+            inner += [
+                "",
+                *(f"# {line.strip()}" for line in words[:1] if "(" not in line),
+                f"[{declared.name}]",
+            ]
+            inner.append(explained(value).rstrip("\n"))
+            continue
+        allowed = _declared(type(config))[declared.name][1]
+        is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
+        limits = "" if is_free else f"{allowed}; "
+        lines += [f"# {about}", f"#   {limits}default {_toml_value(declared.default)}"]
+        lines.append(f"{declared.name} = {_toml_value(value)}")
+    return "\n".join(lines + inner) + "\n"
 
 
 def _declared(kind: type[Settings]) -> dict[str, tuple[type, Allowed]]:
@@ -147,12 +190,23 @@ def _checked(name: str, value: Any, kind: type, allowed: Allowed) -> Any:
         except OverflowError:
             number = math.inf
     if type(number) is not kind:
-        raise ConfigError(f"{name} must be of type {kind.__name__}, not {value!r}")
+        raise ConfigError(f"{name} must be of type {kind.__name__}, not {_shown(value)}")
     if number not in allowed:
-        raise ConfigError(f"{name} must be {allowed}, not {value!r}")
+        raise ConfigError(f"{name} must be {allowed}, not {_shown(value)}")
     if kind is str and not _is_unicode(value):
         raise ConfigError(f"{name} must be text that can be written as UTF-8, not {value!r}")
     return number
+
+
+def _shown(value: object) -> str:
+    try:
+        return _short(repr(value))
+    except (ValueError, RecursionError):  # an integer of thousands of digits, tables in tables
+        return f"this {type(value).__name__}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
 
 
 def _is_unicode(text: str) -> bool:
@@ -172,12 +226,18 @@ def _toml_value(value: object) -> str:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = read_text(path, MAX_BYTES, "a configuration")
+        longest = max(map(len, text.splitlines()), default=0)
+        if longest > MAX_LINE:
+            raise ConfigError(
+                f"{path}: a line of {longest} characters, more than the {MAX_LINE} that are read"
+            )
+        return tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(f"configuration file {path} does not exist") from None
     except OSError as error:
         raise ConfigError(f"configuration file {path} cannot be read: {error.strerror}") from None
-    except ValueError as error:  # of the syntax, the encoding, or a number with thousands of digits
+    except (ValueError, RecursionError) as error:  # of syntax, encoding, a number with thousands of digits
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
 
 
@@ -185,16 +245,19 @@ def _parse_override(text: str) -> dict[str, Any]:
     key, separator, value = text.partition("=")
     if not separator or not key.strip():
         raise ConfigError(
-            f"--set {text!r}: write it as section.key=value, for example --set features.num_keypoints=2000"
+            f"--set {_shown(text)}: write it as section.key=value, for example --set features.num_keypoints=2000"
+        )
+    if len(text) > MAX_LINE:
+        raise ConfigError(
+            f"--set {_short(text)}: {len(text)} characters, more than the {MAX_LINE} that are read"
         )
     parsed: Any
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-    except ValueError:
+    except (ValueError, RecursionError):
         parsed = value.strip()  # a bare word is a string
-    for part in reversed(key.strip().split(".")):
-        parsed = {part: parsed}
-    return parsed
+    section, _, name = key.strip().rpartition(".")
+    return {section: {name: parsed}} if section else {name: parsed}
 
 
 def _merge(config: Section, values: Mapping[str, Any], source: str, root: type[Settings]) -> Section:

@@ -2,6 +2,7 @@
 
 frame -> features -> follow the world at hand (track, judge) -> keyframe? -> map -> seen before? -> StepResult
                   -> or find one: a known place, or the beginning of a new world
+      -> or only patches of an earlier frame, where these will do (configured) -> StepResult
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.front_end import Extractor, check_order, check_size, image_extractor
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, se3_inverse
 from torchslam.loops.memory import Memory
 from torchslam.mapping.culling import drop_covered
 from torchslam.mapping.founding import Founder
@@ -27,6 +28,7 @@ from torchslam.mapping.mapper import Mapper
 from torchslam.run import Run, run_sequence
 from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.anchors import Anchors
 from torchslam.tracking.backwards import track_back
 from torchslam.tracking.foreign import Foreign
 from torchslam.tracking.independent_motion import NOTHING
@@ -34,10 +36,11 @@ from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Relocalizer
+from torchslam.tracking.scout import Scout
 from torchslam.tracking.tracker import Tracker
 from torchslam.tracking.waiting import Waiting
 from torchslam.tracking.youth import Youth
-from torchslam.values import Frame, Start, State, StepResult, Tracked, Trajectory, View
+from torchslam.values import Anchor, Followed, Frame, Start, State, StepResult, Tracked, Trajectory, View
 from torchslam.world.history import History
 from torchslam.world.map import Map
 from torchslam.world.map_check import why_not_alike
@@ -54,6 +57,9 @@ class SLAM:
 
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
     `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
+
+    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones; set it
+    to 0 for an extractor of one's own that does not reduce them.
     """
 
     def __init__(
@@ -114,7 +120,13 @@ class SLAM:
         self.last_frame = last_frame
         self.memory = Memory(self.camera, self.scaled, self.worlds)
         self.foreign = Foreign(self.camera, self.scaled)
+        self.scout = Scout(self.camera, self.scaled)
+        # the last frame that was found by its features, and what the next ones can be followed from
+        self.news: tuple[int, Anchor | None] = (-1, None)
         self.waiting = Waiting(self.config.initialization.max_waiting)
+        # frames that are looked at while one is mapped may refer to as many anchors
+        patches = self.config.patches
+        self.anchors = Anchors(self.camera, patches.count, patches.delay + 2)
         self._seek()
         self.world: World | None = world  # the one that is followed
         if world is not None:
@@ -133,8 +145,22 @@ class SLAM:
 
         Raises FrameError for an image of another size and for a frame that does not come after the last one.
         """
+        self._check(frame)
+        followed, scouts = frame.followed, self.config.patches.enabled and frame.followed is None
+        scouts = scouts and frame.features is None and self._image_extractor is not None
+        if scouts:
+            with self.clock("patches"):
+                followed = self.scout.follow(frame)
+        if followed is not None and self.will_do(followed):
+            return self._go_along(frame, followed)
         view = self._look(frame)
-        return self._find(view) if self.world is None else self._follow(self.world, view)
+        self.news = view.index, None
+        result = self._find(view) if self.world is None else self._follow(self.world, view, followed)
+        if self.news[1] is None:
+            self.anchors.clear()
+        if scouts:
+            self.scout.learn(*self.news)
+        return result
 
     def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
         """Process an image of one's own loop: the frame after the last one.
@@ -167,14 +193,17 @@ class SLAM:
         world = self.world or self.worlds.main(self.session.number)
         return History() if world is None else world.history
 
-    def _look(self, frame: Frame) -> View:
+    def _check(self, frame: Frame) -> None:
         if self.extractor is None:
             raise ConfigError(
                 "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
             )
         check_order(frame, self.last_frame)
-        if self._image_extractor is not None and frame.features is None:
+        if self._image_extractor is not None and frame.features is None and frame.followed is None:
             check_size(frame, self.camera)
+
+    def _look(self, frame: Frame) -> View:
+        assert self.extractor is not None  # as `_check` saw to
         with self.clock("features"):
             features = self.extractor(frame) if frame.features is None else frame.features
             view = View.of(frame, features, self.camera.params)
@@ -191,11 +220,34 @@ class SLAM:
             if wrong:
                 raise ConfigError(f"the map was made with another front end: {wrong}")
 
+    # --- between frames with features ------------------------------------------------------------------------
+
+    def will_do(self, followed: Followed) -> bool:
+        """Whether a frame that was followed by patches needs no features."""
+        return not followed.why_not and self.world is not None and followed.anchor in self.anchors
+
+    def _go_along(self, frame: Frame, followed: Followed) -> StepResult:
+        """Take over where patches were followed to; nothing is mapped."""
+        world = self.world
+        assert world is not None
+        self.last_frame = frame.index, frame.timestamp
+        with self.clock("patches"):
+            view, tracked = self.anchors.place(world, frame, self.session.number, followed)
+            self.tracker.see(world.map, tracked)
+            world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        return self._result(view, "", world, tracked)
+
     # --- following a world -----------------------------------------------------------------------------------
 
-    def _follow(self, world: World, view: View) -> StepResult:
-        """Track the frame; what is doubtful is held back until later frames confirm it."""
+    def _follow(self, world: World, view: View, followed: Followed | None = None) -> StepResult:
+        """Track the frame; what is doubtful is held back until later frames confirm it.
+
+        followed: what its patches said, which is where it is looked for
+        """
         with self.clock("tracking"):
+            T_cw = None if followed is None else self.anchors.pose(world, followed)
+            if T_cw is not None:
+                world.track.velocity = T_cw @ se3_inverse(world.T_cw)
             expected = None if world.track.velocity is None else self.tracker.predict(world)
             tracked = self.tracker.track(world, view)
         if tracked is None:
@@ -204,7 +256,7 @@ class SLAM:
         moves = self.foreign.moves(tracked) if not doubt else NOTHING
         if doubt or moves.is_doubt or self.probation:
             return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
-        self.state = State.TRACKING
+        self.state, recalls = State.TRACKING, len(self.memory.recalls)
         why = self._take(world, view, tracked)
         is_keyframe = bool(why)
         if is_keyframe:
@@ -221,6 +273,8 @@ class SLAM:
                 return self._result(view, STARTED_ANEW, self.world, is_keyframe=True)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
+        if self.config.patches.enabled and self.youth is None and len(self.memory.recalls) == recalls:
+            self.news = view.index, self.anchors.add(world, view, tracked)
         return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
 
     def _take(self, world: World, view: View, tracked: Tracked) -> str:
@@ -253,6 +307,7 @@ class SLAM:
         renumbering = self.mapper.tidy(world)
         if renumbering is not None:
             self.memory.remove(keys[renumbering.keyframes < 0])
+            self.anchors.renumber(renumbering)
 
     def _hold(self, world: World, view: View, tracked: Tracked, doubt: str) -> StepResult:
         """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""

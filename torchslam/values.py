@@ -24,6 +24,7 @@ class Frame:
                by scale from ground truth and by evaluation.
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
     features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
+    followed:  what following its image by patches gave, where that was tried already
     """
 
     index: int
@@ -33,6 +34,7 @@ class Frame:
     T_cw_groundtruth: Tensor | None = None
     mask: Tensor | None = None
     features: Features | None = None
+    followed: Followed | None = None
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,11 @@ class View:
         )
 
     @property
+    def has_features(self) -> bool:
+        """Whether its keypoints are those of a front end; else they are where patches were followed to."""
+        return self.descriptors.shape[-1] > 0
+
+    @property
     def scale_range(self) -> tuple[float, float]:
         """The finest and the coarsest scale among the keypoints; the same for a detector with a single scale."""
         used = self.scales[self.mask]
@@ -176,6 +183,49 @@ class Tracked:
     @property
     def inliers(self) -> int:
         return len(self.point_ids)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A frame found by its features, from which the next ones can be followed without any: what its camera sees.
+
+    index:     of the frame
+    points_a:  (n, 3) in its camera; pixels: (n, 2) its keypoints there; scales: (n,) of these
+    senior:    (n,) bool, which points many frames have found
+    T_ka:      (k, 4, 4) to the keyframes around it
+    velocity:  (4, 4) last motion of the camera, T_a_previous
+    overlap:   share of the points of its reference keyframe that it sees
+    """
+
+    index: int
+    points_a: Tensor
+    pixels: Tensor
+    scales: Tensor
+    senior: Tensor
+    T_ka: Tensor
+    velocity: Tensor
+    overlap: float
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What following a frame from an anchor gave.
+
+    anchor:     index of the anchor's frame; -1 where there was none to follow from
+    why_not:    why the frame should be found by its features, in words; empty where this pose will do
+    T_ca:       (4, 4) pose of the frame in the anchor's camera; None where it was lost
+    rows:       (m,) points of the anchor that agree with the pose; pixels: (m, 2) where they are
+    expected:   how many points of the anchor should be in the image
+    covariance: (6, 6) of the left perturbation of T_ca
+    """
+
+    anchor: int
+    why_not: str
+    T_ca: Tensor | None = None
+    rows: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    pixels: Tensor = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.float64))
+    expected: int = 0
+    covariance: Tensor = field(default_factory=lambda: torch.zeros(6, 6, dtype=torch.float64))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from experiments.common import table
 from experiments.learn_features.front_end import SubPixel
 from experiments.learn_features.run import HERE, KEYPOINTS, WEIGHTS, prepared
 from experiments.learn_features.tracks import Tracks, residuals
-from experiments.learn_features.training import Settings, moved, pose_loss, reprojection_loss, train
+from experiments.learn_features.training import Settings, moved, pose_loss, track_loss, train
 from torchslam import XFeat
 
 CHOSEN = Settings()
@@ -23,7 +23,7 @@ VARIANTS = {
     "reach 2 px": (replace(CHOSEN, reach=2.0), pose_loss),
     "64 tracks of a problem instead of 16": (replace(CHOSEN, tracks=64), pose_loss),
     "300 steps": (replace(CHOSEN, steps=300), pose_loss),
-    "taught by reprojection error": (CHOSEN, reprojection_loss),
+    "taught by reprojection error": (CHOSEN, track_loss),
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from experiments.common import sequences, table
-from experiments.learn_features.clips import Clip, errors_of, step_of
+from experiments.learn_features.clips import clip_from, position_error
 from experiments.learn_features.front_end import Remembering, SubPixel
 from experiments.learn_features.report import ratio
-from experiments.learn_features.run import CLIP_FRAMES, HERE, KEYPOINTS, TRAINING, WEIGHTS, Part
+from experiments.learn_features.run import HERE, KEYPOINTS, TRAINING, WEIGHTS, Part
 from experiments.learn_features.training import Settings
 from torchslam import ClipSLAM, Features, XFeat
 
@@ -58,10 +57,9 @@ def positions_of(candidates: dict[str, nn.Module], part: Part, device: torch.dev
     """(C,) ATE as a share of the path of every clip, NaN where too few frames are posed."""
     positions: dict[str, list[float]] = {label: [] for label in candidates}
     for start in part.clips:
-        clip = Clip.of(part.sequence, start, CLIP_FRAMES, step_of(part.sequence), device)
+        clip = clip_from(part.sequence, start, device)
         for label, front_end in candidates.items():
-            errors = errors_of(ClipSLAM(front_end), clip)
-            positions[label].append(float(errors.position) if errors.enough else math.nan)
+            positions[label].append(position_error(ClipSLAM(front_end), clip))
     return {label: torch.tensor(found) for label, found in positions.items()}
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchslam import Camera, Features, estimate_relative_pose, match
 from torchslam.data.sequence import Sequence
-from torchslam.geometry import RelativePose, se3_inverse, so3_log
+from torchslam.geometry import RelativePose, se3_inverse
+from torchslam.learning.clips import Clip, frames_in
+from torchslam.learning.losses import motion_difference
 
 APART_S = 0.3
 THRESHOLD_PX = 1.5
@@ -26,11 +27,8 @@ class Pair:
 
     @classmethod
     def of(cls, sequence: Sequence, start: int, device: torch.device) -> Pair:
-        first, second = sequence[start], sequence[start + frames_apart(sequence)]
-        if first.T_cw_groundtruth is None or second.T_cw_groundtruth is None:
-            raise ValueError(f"{sequence.name}: the pair from frame {start} has no true motion")
-        images = torch.cat([first.image, second.image]).to(device)
-        return cls(images, second.T_cw_groundtruth @ se3_inverse(first.T_cw_groundtruth), sequence.camera)
+        clip = Clip.of(sequence, start, 2, frames_in(APART_S, sequence), supervised=True).to(device)
+        return cls(clip.images, clip.T_cw[1] @ se3_inverse(clip.T_cw[0]), clip.camera)
 
 
 @dataclass(frozen=True)
@@ -59,19 +57,14 @@ class PairErrors:
         return PairErrors(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(PairErrors)))
 
 
-def frames_apart(sequence: Sequence) -> int:
-    """Frames that make up APART_S."""
-    return max(1, round(APART_S * sequence.frame_rate))
-
-
 @torch.no_grad()
 def pair_errors(features: Features, pair: Pair) -> PairErrors:
     """Relative pose by five-point RANSAC from the features of both images, against the true one; P = 1."""
     pixels_1, pixels_2 = matched(features)
     whole = motion_of(pixels_1, pixels_2, pair.camera)
     even, odd = (motion_of(pixels_1[half::2], pixels_2[half::2], pair.camera) for half in (0, 1))
-    against_truth = apart(whole.T_21[0], pair.T_21).norm(dim=-1) + _failed(whole)
-    halves = apart(even.T_21[0], odd.T_21[0]).norm(dim=-1) + _failed(even) + _failed(odd)
+    against_truth = motion_difference(whole.T_21[0], pair.T_21).norm(dim=-1) + _failed(whole)
+    halves = motion_difference(even.T_21[0], odd.T_21[0]).norm(dim=-1) + _failed(even) + _failed(odd)
     inliers = whole.inliers.sum(-1).to(against_truth.dtype)
     (rotation, direction), (rotation_halves, direction_halves) = against_truth.split(1), halves.split(1)
     return PairErrors(rotation, direction, rotation_halves, direction_halves, inliers)
@@ -88,14 +81,6 @@ def matched(features: Features) -> tuple[Tensor, Tensor]:
 def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
     """The motion that matches (M, 2) tell."""
     return estimate_relative_pose(pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX)
-
-
-def apart(T_21: Tensor, T_21_other: Tensor) -> Tensor:
-    """(2, 3) rotation vectors that turn the other motion's rotation, and direction of translation, to the first's."""
-    t, t_other = (F.normalize(T[:3, 3], dim=0) for T in (T_21, T_21_other))
-    axis = torch.linalg.cross(t_other, t, dim=0)
-    turn = F.normalize(axis, dim=0) * torch.atan2(axis.norm(), t_other @ t)
-    return torch.stack([so3_log(T_21[:3, :3] @ T_21_other[:3, :3].mT), turn])
 
 
 def _failed(motion: RelativePose) -> float:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from experiments.common import table
-from experiments.learn_features.clips import Errors
 from experiments.learn_features.pairs import PairErrors
 
 BLOCK = 5  # neighbouring pairs that are drawn together: they see much of the same
@@ -19,15 +18,14 @@ ERRORS = ("rotation error", "direction error", "rotation between halves", "direc
 
 @dataclass(frozen=True)
 class Result:
-    """What a front end is worth on one part of a sequence."""
+    """What a front end is worth on one part of a sequence.
+
+    pairs:     errors of pairs
+    positions: (C,) ATE of clips as a share of the path, NaN where too few frames are posed
+    """
 
     pairs: PairErrors
-    clips: list[Errors]
-
-    @property
-    def positions(self) -> Tensor:
-        """(C,) ATE as a share of the path, NaN where too few frames are posed."""
-        return torch.tensor([float(clip.position) if clip.enough else torch.nan for clip in self.clips])
+    positions: Tensor
 
 
 Results = dict[str, dict[str, Result]]  # by front end and part
@@ -71,7 +69,7 @@ def ratios(before: dict[str, Result], after: dict[str, Result]) -> str:
         logs = (after[name].pairs.angles / before[name].pairs.angles).log()
         for error, row in zip(ERRORS, logs, strict=True):
             columns[error][name] = row
-        if after[name].clips:
+        if len(after[name].positions):
             columns["ATE / path"][name] = (after[name].positions / before[name].positions).log()
     rows = []
     for error, parts in columns.items():

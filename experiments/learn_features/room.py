@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from experiments.common import table
-from experiments.learn_features.pairs import Pair, apart, matched, motion_of
+from experiments.learn_features.pairs import Pair, matched, motion_of
 from experiments.learn_features.tracks import MAX_ERROR
 from torchslam.geometry import correct_matches, essential_from_pose
+from torchslam.learning.losses import motion_difference
 
 NOISES_PX = (0.0, 0.25, 0.5, 1.0)
 
@@ -54,9 +55,9 @@ def room(front_end: nn.Module, other: nn.Module, pairs: list[Pair]) -> str:
 
 
 def error_of(pixels_1: Tensor, pixels_2: Tensor, pair: Pair) -> Tensor:
-    """(2, 3) errors of rotation and direction as `apart` has them; NaN where no motion fits."""
+    """(2, 3) errors of rotation and direction as `motion_difference` has them; NaN where no motion fits."""
     motion = motion_of(pixels_1, pixels_2, pair.camera)
-    return apart(motion.T_21[0], pair.T_21) + (0.0 if motion.success[0] else torch.nan)
+    return motion_difference(motion.T_21[0], pair.T_21) + (0.0 if motion.success[0] else torch.nan)
 
 
 def exact_matches(pixels_1: Tensor, pixels_2: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,9 +11,9 @@ import torch
 from torch import nn
 
 from experiments.common import sequences, table, write_between
-from experiments.learn_features.clips import Clip, errors_of, step_of
+from experiments.learn_features.clips import FRAMES, STEP_S, clip_from, position_error
 from experiments.learn_features.front_end import Remembering, SubPixel
-from experiments.learn_features.pairs import Pair, PairErrors, frames_apart, pair_errors
+from experiments.learn_features.pairs import APART_S, Pair, PairErrors, pair_errors
 from experiments.learn_features.picture import draw
 from experiments.learn_features.report import Result, Results, medians, ratio, ratios
 from experiments.learn_features.room import room
@@ -21,6 +21,7 @@ from experiments.learn_features.tracks import Tracks, residuals
 from experiments.learn_features.training import Settings, moved, train
 from torchslam import ORB, ClipSLAM, XFeat
 from torchslam.data.sequence import Sequence
+from torchslam.learning.clips import frames_in
 
 HERE = Path(__file__).parent
 WEIGHTS = Path(__file__).parents[3] / "shared" / "weights" / "xfeat.safetensors"
@@ -36,7 +37,6 @@ UNSEEN = {
 }
 CONTROL = {"synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3": (0.0, 1.0)}  # with exact poses
 KEYPOINTS = 600
-CLIP_FRAMES = 8
 BLOCK_TRACKS = 200  # for intervals: tracks of neighbouring problems are mostly the same
 BEFORE, AFTER = "XFeat", "XFeat, trained"
 SMALL = Settings()
@@ -54,8 +54,8 @@ class Part:
     @classmethod
     def of(cls, sequence: Sequence, share: tuple[float, float], pairs: int, clips: int) -> Part:
         frames = part_of(sequence, share)
-        last_pair = frames.stop - frames_apart(sequence) - 1
-        last_clip = frames.stop - CLIP_FRAMES * step_of(sequence)
+        last_pair = frames.stop - frames_in(APART_S, sequence) - 1
+        last_clip = frames.stop - FRAMES * frames_in(STEP_S, sequence)
         return cls(sequence, spread(pairs, frames.start, last_pair), spread(clips, frames.start, last_clip))
 
 
@@ -78,12 +78,10 @@ def measure(candidates: Mapping[str, nn.Module], parts: dict[str, Part], device:
             pair = Pair.of(part.sequence, start, device)
             for label, front_end in candidates.items():
                 rows[label].append(pair_errors(front_end(pair.images).to("cpu"), pair))
-        clips = [
-            Clip.of(part.sequence, start, CLIP_FRAMES, step_of(part.sequence), device) for start in part.clips
-        ]
+        clips = [clip_from(part.sequence, start, device) for start in part.clips]
         for label, front_end in candidates.items():
-            found = [errors_of(ClipSLAM(front_end), clip) for clip in clips]
-            results[label][name] = Result(PairErrors.cat(rows[label]), found)
+            found = [position_error(ClipSLAM(front_end), clip) for clip in clips]
+            results[label][name] = Result(PairErrors.cat(rows[label]), torch.tensor(found))
         print(f"measured {name}", flush=True)
     return results
 

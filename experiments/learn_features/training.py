@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from experiments.learn_features.front_end import REACH, SubPixel
 from experiments.learn_features.tracks import MIN_PARALLAX, MIN_VIEWS, Tracks, straightened
-from torchslam.geometry import Camera, se3_inverse, se3_log, triangulate_many
+from torchslam.geometry import Camera, se3_inverse, triangulate_many
+from torchslam.learning.losses import pose_errors, reprojection_loss
+from torchslam.learning.training import Training
 from torchslam.solvers import refine_pose
 
 UNIT = 3e-3  # of the errors, radians and shares of the median depth: about their median
@@ -71,7 +74,7 @@ def drawn_pixels(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tens
     return straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
 
 
-def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
+def localisation_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
     """Errors (B, 2) of position, as a share of the median depth, and rotation, radians; (B,) whether there is a pose.
 
     Points are triangulated with the true poses of the other views; the world is the true camera of the localised one,
@@ -83,8 +86,9 @@ def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tenso
     T_vq = T_cw[:, others] @ se3_inverse(T_cw[:, drawn.query])[:, None]
     points = triangulate_many(T_vq, pixels[:, :, others], pinhole, drawn.seen[..., others])
     mask = drawn.seen[..., drawn.query] & points.mask & (points.angles > MIN_PARALLAX)
+    start = torch.eye(4, dtype=pixels.dtype).expand(len(pixels), 4, 4)
     refined = refine_pose(
-        torch.eye(4, dtype=pixels.dtype).expand(len(pixels), 4, 4),
+        start,
         points.points_w,
         pixels[:, :, drawn.query],
         pinhole,
@@ -93,53 +97,43 @@ def pose_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tenso
         iterations=8,
         tolerance=1e-6,
     )
-    xi = se3_log(refined.T_cw)
     depths = points.points_w[..., 2].detach().masked_fill(~mask, torch.nan).nanmedian(-1).values
     success = refined.success & (mask.sum(-1) >= MIN_TRACKS) & (depths > 0)
-    lengths = (xi.unflatten(-1, (2, 3)).square().sum(-1) + 1e-16).sqrt()
     scales = torch.stack([torch.where(success, depths, 1.0), torch.ones_like(depths)], -1)
-    return lengths / scales, success
+    return pose_errors(refined.T_cw, start) / scales, success
 
 
 def pose_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
     """() the mean over problems of what grows like the logarithm of both errors, so that a few hopeless do not rule."""
-    errors, success = pose_errors(front_end, tracks, drawn)
+    errors, success = localisation_errors(front_end, tracks, drawn)
     each = (errors / UNIT).log1p().sum(-1)
     return torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
 
 
-def reprojection_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
+def track_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
     """() how far tracks are from the points they make, all poses being the true ones: a teacher to compare with.
 
-    The mean over tracks of log(1 + squared pixels).
+    The mean over problems and their tracks of log(1 + half the squared pixels).
     """
     pixels, pinhole = drawn_pixels(front_end, tracks, drawn)
-    points = triangulate_many(tracks.T_cw[drawn.frames], pixels, pinhole, drawn.seen)
-    squared = torch.where(drawn.seen & points.errors.isfinite(), points.errors, 0.0).square()
-    used = points.mask & (drawn.seen.sum(-1) >= MIN_VIEWS)
-    return torch.where(used, (squared.sum(-1) / 2).log1p(), 0.0).sum() / used.sum().clamp_min(1)
+    seen = drawn.seen & (drawn.seen.sum(-1, keepdim=True) >= MIN_VIEWS)
+    # Of a scale c the kernel is c^2 log(1 + s / c^2).
+    losses = reprojection_loss(tracks.T_cw[drawn.frames], pixels, pinhole, seen, scale=math.sqrt(2))
+    return 0.5 * losses.nanmean()
 
 
 def train(
     front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0, teacher: Teacher = pose_loss
 ) -> list[float]:
     """Lower the loss of what is drawn anew in every step; the loss of each."""
-    parameters = list(front_end.network.parameters())
-    optimizer = torch.optim.Adam(parameters, settings.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
-    generator = torch.Generator().manual_seed(seed)
-    losses = []
-    for step in range(settings.steps):
-        loss = teacher(front_end, tracks, draw(tracks, settings, generator))
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(parameters, 1.0)
-        optimizer.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if (step + 1) % 250 == 0:
-            print(f"{step + 1:5d}  mean loss of the last 250 {sum(losses[-250:]) / 250:.3f}", flush=True)
-    return losses
+    optimizer = torch.optim.Adam(front_end.network.parameters(), settings.learning_rate)
+    training = Training(front_end.network, optimizer, settings.steps, seed)
+    for _ in training:
+        training.descend(teacher(front_end, tracks, draw(tracks, settings, training.generator)))
+        if training.step % 250 == 0:
+            mean = sum(training.losses[-250:]) / 250
+            print(f"{training.step:5d}  mean loss of the last 250 {mean:.3f}", flush=True)
+    return training.losses
 
 
 @torch.no_grad()

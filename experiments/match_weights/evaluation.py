@@ -11,22 +11,13 @@ from torch import Tensor
 from experiments.match_weights.problems import RANSAC_PX, Problems
 from experiments.match_weights.weighting import MatchWeights, propagated_variances, refine, refine_learned
 from torchslam.geometry import transform
-from torchslam.solvers.robust import Kernel
+from torchslam.geometry.robust import Kernel
+from torchslam.learning.losses import pose_errors
 
 KERNELS: tuple[Kernel, ...] = ("huber", "cauchy", "geman_mcclure", "truncated")
 SCALES = (1.0, 2.0, 4.0)
 ORACLE_PX = 1.5  # of the keypoint's level
 _CHUNK = 64
-
-
-def pose_errors(T: Tensor, T_true: Tensor) -> Tensor:
-    """(P, 2) distance of the camera centres in metres and angle in radians; gradients are zero at zero."""
-    difference = T @ torch.linalg.inv(T_true)
-    eye = torch.eye(4, dtype=T.dtype, device=T.device)
-    squared = (difference - eye)[:, :3].square()
-    # |R - I|_F = 2 sqrt(2) sin(angle / 2)
-    half_sine = (squared[..., :3].sum((-2, -1)) / 8).clamp(1e-20, 1.0).sqrt()
-    return torch.stack([squared[..., 3].sum(-1).clamp_min(1e-20).sqrt(), 2 * half_sine.asin()], -1)
 
 
 def relative_errors(errors: Tensor, problems: Problems) -> Tensor:

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchslam.data.sequence import Sequence
 from torchslam.features import ORB, hamming, match
 from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform, triangulate_many
+from torchslam.learning.clips import frames_in
 from torchslam.values import Features
 
 REFERENCES_S = (0.2, 0.4)  # seconds before the base frame that points are triangulated with
@@ -169,10 +170,9 @@ class _Landmarks:
 
 def make_problems(sequence: Sequence, part: range, T_cw: Tensor) -> Problems:
     """The problems of a sequence with all their frames in a part of it; T_cw (frames, 4, 4), NaN where unknown."""
-    rate = sequence.frame_rate
-    back = [max(1, round(s * rate)) for s in REFERENCES_S]
-    ahead = [max(1, round(s * rate)) for s in QUERIES_S]
-    step = max(1, round(rate / BASES_PER_SECOND))
+    back = [frames_in(seconds, sequence) for seconds in REFERENCES_S]
+    ahead = [frames_in(seconds, sequence) for seconds in QUERIES_S]
+    step = frames_in(1 / BASES_PER_SECOND, sequence)
     frames = _Frames(sequence, T_cw)
     problems: list[Problems | None] = []
     for base, direction in itertools.product(part[::step], (1, -1)):

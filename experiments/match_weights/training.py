@@ -12,9 +12,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from experiments.match_weights.evaluation import UNIFORM, pose_errors
+from experiments.match_weights.evaluation import UNIFORM
 from experiments.match_weights.problems import Problems
 from experiments.match_weights.weighting import MatchWeights, refine, refine_learned
+from torchslam.learning.losses import pose_errors
+from torchslam.learning.training import Training
 
 SHARDS = 2  # of a batch; the number of processes divides it
 _CHUNK = 64
@@ -68,10 +70,9 @@ def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> l
     units = expected_errors(problems)
     parameters = list(network.parameters())
     optimizer = torch.optim.AdamW(parameters, settings.learning_rate, weight_decay=settings.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
-    generator = torch.Generator().manual_seed(settings.seed)
-    history = []
-    for _ in range(settings.steps):
+    training = Training(network, optimizer, settings.steps, settings.seed)
+    generator = training.generator
+    for _ in training:
         part = torch.randint(len(parts), (settings.batch,), generator=generator)
         rows = first[part] + (torch.rand(settings.batch, generator=generator) * sizes[part]).long()
         keys = torch.rand(settings.batch, problems.mask.shape[1], generator=generator)
@@ -83,14 +84,11 @@ def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> l
             for some, key in shards[rank * SHARDS // ranks : (rank + 1) * SHARDS // ranks]
         ]
         mean = _gathered(torch.stack(mine), ranks).sum(0) / settings.batch
-        history.append(float(mean[-1]))
         numbers = [parameter.numel() for parameter in parameters]
         for parameter, gradient in zip(parameters, mean[:-1].split(numbers), strict=True):
             parameter.grad = gradient.view_as(parameter).clone()
-        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
-        optimizer.step()
-        schedule.step()
-    return history
+        training.update(float(mean[-1]))
+    return training.losses
 
 
 def _gradient(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:

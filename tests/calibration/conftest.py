@@ -27,8 +27,9 @@ def simulated(truth: Camera) -> Callable[..., ObservationGraph]:
         points: int = 80,
         seed: int = 0,
         twists: Tensor | None = None,
+        depth: float = 1.0,
     ) -> ObservationGraph:
-        """Keyframes around a cloud of points, seen by the camera, and started at the truth."""
+        """Keyframes around a cloud of points, seen by the camera, and started at the truth; of depth 0 it is a wall."""
         generator = torch.Generator().manual_seed(seed)
 
         def normal(*shape: int) -> Tensor:
@@ -39,7 +40,9 @@ def simulated(truth: Camera) -> Callable[..., ObservationGraph]:
             twists[:, 0] += torch.linspace(-1.5, 1.5, frames, dtype=torch.float64)
             twists[:, 4] += torch.linspace(0.3, -0.3, frames, dtype=torch.float64)
         T_cw = se3_exp(twists)
-        points_w = torch.stack((1.5 * normal(points), normal(points), 5 + normal(points).clamp(-2, 2)), -1)
+        points_w = torch.stack(
+            (1.5 * normal(points), normal(points), 5 + depth * normal(points).clamp(-2, 2)), -1
+        )
         frame_index, point_index = torch.ones(frames, points).nonzero().unbind(-1)
         pixels, valid = camera.project(transform(T_cw[frame_index], points_w[point_index][:, None]))
         seen = (valid & camera.in_image(pixels))[:, 0]

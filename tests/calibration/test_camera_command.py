@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,20 @@ def test_images_without_a_calibration(
     )
     assert json.loads((results / "metrics.json").read_text())["camera"] == ""
     assert not (results / "calibration.txt").exists()
+
+
+def test_a_given_camera_that_is_wrong(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The summary names the better focal length, on the way to the true one of 500 px, and what helps."""
+    camera = "400,400,319.5,239.5"
+    assert main(["run", str(folder), "-o", str(tmp_path / "results"), "--camera", camera, *FAST]) == 0
+    said = json.loads((tmp_path / "results" / "metrics.json").read_text())["camera"]
+    assert said in capsys.readouterr().out
+    found = re.match(r"the images agree better with a focal length of (\d+) px or more than with 400;", said)
+    assert found is not None
+    assert abs(float(found[1]) - 500) < 50
+    assert said.endswith("--refine-camera looks for a better one")
 
 
 def test_a_calibration_that_is_not_ours_stays(

@@ -38,7 +38,7 @@ def set_durations(path: Path, milliseconds: list[int]) -> None:
             return body[:8] + struct.pack(">I", sum(milliseconds)) + body[12:]
         return body
 
-    path.write_bytes(_edited(path.read_bytes(), edit))
+    path.write_bytes(edited(path.read_bytes(), edit))
 
 
 def set_rotation(path: Path, degrees: int) -> None:
@@ -50,16 +50,16 @@ def set_rotation(path: Path, degrees: int) -> None:
         a, b, c, d = (65536 * value for value in ROTATED[degrees])
         return body[:40] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + body[76:]
 
-    path.write_bytes(_edited(path.read_bytes(), edit))
+    path.write_bytes(edited(path.read_bytes(), edit))
 
 
-def _edited(data: bytes, edit) -> bytes:
+def edited(data: bytes, edit) -> bytes:
     """The boxes of a file, each through `edit`, with sizes that fit; no data may lie behind the index (moov)."""
     out, position = b"", 0
     while position < len(data):
         size, kind = struct.unpack_from(">I4s", data, position)
         body = data[position + 8 : position + size]
-        body = _edited(body, edit) if kind in CONTAINERS else edit(kind, body)
+        body = edited(body, edit) if kind in CONTAINERS else edit(kind, body)
         out += struct.pack(">I4s", len(body) + 8, kind) + body
         position += size
     return out

@@ -41,7 +41,7 @@ def test_info_without_a_camera(
         write_picture(tmp_path / f"{index}.png", index)
         write_picture(tmp_path / f"._{index}.png", index)
     status, rows, errors = info(capsys, str(tmp_path), "--fps", "10")
-    assert (status, rows["camera"]) == (0, "missing: --camera gives it")
+    assert (status, rows["camera"]) == (0, "missing: the images decide, unless --camera says it")
     assert rows["rate"] == "10.00 Hz over 0.20 s"
     assert "left out what are no frames: 3 hidden files" in errors
     assert (

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 import stat
 import threading
+import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,9 +16,10 @@ from pathlib import Path
 
 import pytest
 
+from torchslam.data import download as downloads
 from torchslam.data import open_sequence
 from torchslam.data.download import download, unpack
-from torchslam.errors import DownloadError
+from torchslam.errors import DownloadError, SequenceError
 
 
 @dataclass
@@ -24,6 +27,7 @@ class Server:
     """What the server offers, how it misbehaves and what it was asked for.
 
     cut: bytes after which a transfer breaks off; the number of transfers it does so for
+    length: what it says instead of the length; None: nothing; pause: seconds after every byte
     """
 
     url: str = ""
@@ -31,6 +35,8 @@ class Server:
     cut: int | None = None
     cuts_left: int = 0
     ranges: bool = True
+    length: str | None = "true"
+    pause: float = 0.0
     requests: list[str | None] = field(default_factory=list)
 
 
@@ -56,13 +62,19 @@ def server() -> Iterator[Server]:
             self.send_response(206 if start else 200)
             if start:
                 self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
-            self.send_header("Content-Length", str(len(body) - start))
+            if state.length is not None:
+                true = str(len(body) - start)
+                self.send_header("Content-Length", true if state.length == "true" else state.length)
             self.end_headers()
             end = len(body)
             if state.cut is not None and state.cuts_left > 0:
                 state.cuts_left -= 1
                 end = min(end, start + state.cut)
-            self.wfile.write(body[start:end])
+            if not state.pause:
+                self.wfile.write(body[start:end])
+            for byte in body[start:end] if state.pause else ():
+                self.wfile.write(bytes((byte,)))
+                time.sleep(state.pause)
 
         def log_message(self, *args: object) -> None:
             """Keep the test's output clean."""
@@ -153,6 +165,84 @@ def test_leftovers_longer_than_the_file_are_thrown_away(
     assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
 
 
+def test_checksum(server: Server, archive: bytes, tmp_path: Path) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    digest = hashlib.sha256(archive).hexdigest()
+    for wrong, message in (
+        ("0" * 64, f"has the SHA-256 {digest}, not 0{{64}}; it was deleted"),
+        ("12", "64 hexa"),
+    ):
+        with pytest.raises(DownloadError, match=message):
+            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=wrong)
+        assert list((tmp_path / "data").iterdir()) == []
+    assert download(
+        "eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=digest.upper()
+    ).is_dir()
+
+
+def test_a_body_has_an_end(
+    server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    monkeypatch.setattr(downloads, "MAX_BYTES", len(archive) - 1)
+    for length in (None, "-3", "many", "9" * 5000):  # as the server says it: wrongly, or not at all
+        server.length = length
+        with pytest.raises(
+            DownloadError, match=f"more than {len(archive) - 1} bytes, the most that is fetched"
+        ):
+            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+        assert not (tmp_path / "data" / "plant_1").exists()
+
+
+def test_a_body_that_drips(
+    server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    server.length, server.pause = None, 0.02
+    monkeypatch.setattr(downloads, "TIMEOUT", 0.1)
+    monkeypatch.setattr(downloads, "ATTEMPTS", 1)
+    with pytest.raises(DownloadError, match="slower than 4096 bytes a second; run the same command again"):
+        download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_what_unpacks_to_far_more_than_it_is(
+    tmp_path: Path, method: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(downloads, "SMALL", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", method) as file:
+        file.writestr("0.png", bytes(4 << 20))
+    with pytest.raises(
+        DownloadError, match=r"bomb\.zip: \d+ bytes that unpack to 4194304: more than 100 times"
+    ):
+        unpack(tmp_path / "bomb.zip", tmp_path / "target")
+    assert [path.name for path in tmp_path.iterdir()] == ["bomb.zip"]
+    with pytest.raises(SequenceError, match="more than 100 times"):
+        open_sequence(tmp_path / "bomb.zip")
+
+
+def test_a_full_disk_is_not_the_archives_fault(
+    server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.files["/plant_1_mono.zip"] = archive
+    monkeypatch.setattr(downloads, "MARGIN", 1 << 62)
+    with pytest.raises(DownloadError, match="do not fit into"):
+        download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["plant_1_mono.zip"]
+
+
+def test_entries_without_a_name(tmp_path: Path) -> None:
+    content = _entries(**{"good.txt": b"good", "N": b"nameless"})
+    # The length of the name, in the entry and in the directory, becomes 0, and its byte a part of the extra field.
+    for mark, at in ((b"PK\3\4", 26), (b"PK\1\2", 28)):
+        start = content.rindex(mark) + at
+        content = content[:start] + b"\0\0" + content[start + 2 :]
+    (tmp_path / "hostile.zip").write_bytes(content)
+    with pytest.raises(DownloadError, match=r"hostile\.zip"):
+        unpack(tmp_path / "hostile.zip", tmp_path / "target")
+    assert [path.name for path in tmp_path.iterdir()] == ["hostile.zip"]
+
+
 def test_unknown_names(server: Server, tmp_path: Path) -> None:
     with pytest.raises(DownloadError, match="404"):
         download("eth3d/nothing", tmp_path, server.url, progress=False)
@@ -171,10 +261,11 @@ def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path
     damaged[200] ^= 0xFF
     for content in (bytes(damaged), b"<html>sorry</html>"):
         server.files["/plant_1_mono.zip"] = content
-        with pytest.raises(DownloadError, match=r"plant_1_mono\.zip: cannot be unpacked"):
-            download("eth3d/plant_1", tmp_path, server.url, progress=False)
-        assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == []
-        (tmp_path / "plant_1_mono.zip").unlink()
+        with pytest.raises(DownloadError, match=r"plant_1_mono\.zip: not a zip archive.* it was deleted"):
+            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+        assert list((tmp_path / "data").iterdir()) == []
+    server.files["/plant_1_mono.zip"] = archive  # nothing is in the way of a whole one
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path / "data", server.url, progress=False))) == 3
 
 
 @pytest.mark.parametrize(

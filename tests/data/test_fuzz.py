@@ -1,4 +1,7 @@
-"""Whatever a file holds, a reader returns something valid or raises its own error."""
+"""Whatever a file holds, a reader returns something valid or raises its own error, in bounded time and memory.
+
+`make fuzz` tries ten times as many inputs, each in a process with limits.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,11 @@ import json
 from pathlib import Path
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import HealthCheck, given, settings
 
+from tests.fuzz.inputs import clear, numbers, outcome
+from tests.fuzz.readers import readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
 from torchslam.data.eth3d_tum import read_image_list
 from torchslam.data.image_file import read_grey
@@ -90,3 +96,13 @@ def test_images(tmp_path: Path, start: bytes, rest: bytes) -> None:
     (tmp_path / "image").write_bytes(start + rest)
     with contextlib.suppress(FrameError):
         assert read_grey(tmp_path / "image", "here").shape[:2] == (1, 1)
+
+
+@pytest.mark.parametrize("name", readers())
+def test_wrong_inputs_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    """Every tenth one of `python -m tests.fuzz`; `--only NAME:NUMBER` tries a single one."""
+    reader = readers()[name]
+    for number in numbers(reader.inputs, 3_000):
+        found = outcome(reader, number, tmp_path)
+        assert found.verdict in ("read", "refused"), f"{name}:{number}: {found.verdict}: {found.what}"
+    clear(tmp_path)

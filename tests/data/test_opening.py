@@ -135,7 +135,7 @@ def test_an_archive_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.Monkey
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("0.png", b"x" * 1000)
     monkeypatch.setattr(
-        "torchslam.data.archive.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 1 << 30)
+        "torchslam.data.download.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 1 << 30)
     )
     with pytest.raises(SequenceError, match="do not fit into"):
         open_sequence(tmp_path / "a.zip")

@@ -11,17 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from experiments.learn_features.clip_noise import Changed
-from experiments.learn_features.clips import Clip, Errors, step_of
+from experiments.learn_features.clips import FRAMES, STEP_S, clip_from, position_error
 from experiments.learn_features.front_end import NUM_INPUTS, RADIUS, REACH, Remembering, SubPixel, patches
-from experiments.learn_features.pairs import Pair, PairErrors, apart, frames_apart, pair_errors
+from experiments.learn_features.pairs import APART_S, Pair, PairErrors, pair_errors
 from experiments.learn_features.picture import draw
 from experiments.learn_features.report import Result, bootstrap, medians, ratios
 from experiments.learn_features.room import NOISES_PX, room
 from experiments.learn_features.run import Part, spread
 from tests.learning.test_clip import BentEyes
-from tests.walks import Walk, arc
-from torchslam import ORB, Features
-from torchslam.geometry import rigid, so3_exp
+from tests.walks import T_cw, Walk, arc, still
+from torchslam import ORB, ClipSLAM, Features
+from torchslam.evaluation import ate
+from torchslam.learning.clips import frames_in
+from torchslam.learning.losses import path_length
 
 CPU = torch.device("cpu")
 
@@ -39,30 +41,27 @@ class PairEyes(nn.Module):
         return Features(*(getattr(features, c.name)[self.rows] for c in fields(Features)))
 
 
-def errors(position: float, rotation: float, posed: int = 8, seen: int = 800) -> Errors:
-    return Errors(torch.tensor(position), torch.tensor(rotation), posed, seen)
-
-
 def noise_images(seed: int = 0) -> Tensor:
     return torch.rand(1, 1, 96, 128, generator=torch.Generator().manual_seed(seed))
 
 
-def test_a_clip_has_the_frames_it_says() -> None:
-    walk = Walk(arc(20))
-    clip = Clip.of(walk, 2, frames=5, step=3, device=CPU)
-    assert clip.images.shape == (5, 1, 240, 320)
-    for row, index in enumerate((2, 5, 8, 11, 14)):
-        assert torch.equal(clip.T_cw[row], walk[index].T_cw_groundtruth)
-    with pytest.raises(ValueError, match="lacks frames"):
-        Clip.of(walk, 10, frames=5, step=3, device=CPU)
-    assert step_of(walk) == 2
+def test_the_error_of_a_clip_is_a_share_of_its_path_and_nan_without_poses() -> None:
+    walk, standing = Walk(arc(20, length=2.0)), Walk(still(20))
+    clip = clip_from(walk, 2, CPU)
+    assert torch.equal(clip.T_cw, T_cw(walk)[2:18:2])
+    eyes = PairEyes(BentEyes(walk, bend=0.01), list(range(2, 18, 2)))
+    poses = ClipSLAM(eyes)(clip.images, clip.camera)
+    expected = ate(poses.T_cw, clip.T_cw) / path_length(clip.T_cw)
+    assert position_error(ClipSLAM(eyes), clip) == pytest.approx(float(expected.detach()))
+    blind = PairEyes(BentEyes(standing, bend=0.0), list(range(8)))
+    assert math.isnan(position_error(ClipSLAM(blind), clip_from(standing, 0, CPU)))
 
 
 def test_pairs_and_clips_stay_in_their_part() -> None:
     walk = Walk(arc(100))
     part = Part.of(walk, (0.5, 0.9), pairs=200, clips=3)
-    assert part.pairs == list(range(50, 90 - frames_apart(walk)))
-    assert (part.clips[0], part.clips[-1]) == (50, 90 - 8 * step_of(walk))
+    assert part.pairs == list(range(50, 90 - frames_in(APART_S, walk)))
+    assert (part.clips[0], part.clips[-1]) == (50, 90 - FRAMES * frames_in(STEP_S, walk))
     assert spread(3, 4, 5) == [4, 5]
     assert spread(0, 4, 5) == []
 
@@ -117,7 +116,7 @@ def test_a_remembering_front_end_looks_once_at_the_same_images() -> None:
 def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
     walk = Walk(arc(10, length=1.0))
     pair = Pair.of(walk, 2, CPU)
-    eyes = PairEyes(BentEyes(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_apart(walk)])
+    eyes = PairEyes(BentEyes(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_in(APART_S, walk)])
     with torch.no_grad():
         found = pair_errors(eyes(pair.images), pair)
     assert found.inliers[0] > 50
@@ -127,19 +126,9 @@ def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
     assert found.direction_halves[0] < 1e-3
 
 
-def test_apart_is_the_angle_by_which_motions_were_turned() -> None:
-    turn = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
-    T_21 = rigid(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
-    other = rigid(so3_exp(turn), torch.tensor([0.0, math.sin(0.1), math.cos(0.1)], dtype=torch.float64))
-    rotation, direction = apart(other, T_21)
-    torch.testing.assert_close(rotation, turn)
-    torch.testing.assert_close(direction, torch.tensor([-0.1, 0.0, 0.0], dtype=torch.float64))
-    torch.testing.assert_close(apart(T_21, T_21), torch.zeros(2, 3, dtype=torch.float64))
-
-
 def test_less_noise_on_true_matches_means_less_error() -> None:
     walk = Walk(arc(10, length=1.0))
-    apart_frames = frames_apart(walk)
+    apart_frames = frames_in(APART_S, walk)
     pairs, rows = [Pair.of(walk, 2, CPU)], [2, 2 + apart_frames]
     seen = [PairEyes(BentEyes(walk, bend=0.0, noise_px=noise), rows) for noise in (0.5, 1.0)]
     lines = room(*seen, pairs).splitlines()
@@ -149,16 +138,15 @@ def test_less_noise_on_true_matches_means_less_error() -> None:
     assert rotations[4] < rotations[5] < rotations[-1]
 
 
-def result(rotations: list[float], inliers: float, clips: list[Errors]) -> Result:
+def result(rotations: list[float], inliers: float, positions: list[float]) -> Result:
     rotation = torch.tensor(rotations)
     pairs = PairErrors(rotation, 10 * rotation, rotation, rotation, torch.full_like(rotation, inliers))
-    return Result(pairs, clips)
+    return Result(pairs, torch.tensor(positions))
 
 
 def test_the_report_compares_what_both_could_pose() -> None:
-    none = errors(0.5, 0.5, posed=0, seen=0)
-    before = {"walk": result([0.002, 0.004, 0.008], 100, [errors(0.01, 0.002), errors(0.04, 0.008)])}
-    after = {"walk": result([0.001, 0.002, math.nan], 80, [errors(0.02, 0.004), none])}
+    before = {"walk": result([0.002, 0.004, 0.008], 100, [0.01, 0.04])}
+    after = {"walk": result([0.001, 0.002, math.nan], 80, [0.02, math.nan])}
     text = medians({"before": before, "after": after})
     assert "| walk | before | 100 | 4.00 | 2.29 | 4.00 | 0.23 | 2 of 2 | 1.00 % |" in text
     assert "| walk | after | 80 | 1.00 |" in text
@@ -166,7 +154,7 @@ def test_the_report_compares_what_both_could_pose() -> None:
     assert "| rotation error | 0.50 (0.50 to 0.50) | 0.50 (0.50 to 0.50) |" in text
     assert "| ATE / path | 2.00 (2.00 to 2.00) |" in text
     assert "| inliers | 0.800 | 0.800 |" in text
-    assert "ATE" not in ratios(before, {"walk": replace(after["walk"], clips=[])})
+    assert "ATE" not in ratios(before, {"walk": replace(after["walk"], positions=torch.zeros(0))})
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:

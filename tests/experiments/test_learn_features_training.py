@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from experiments.learn_features.front_end import NUM_INPUTS, SubPixel
 from experiments.learn_features.tracks import MIN_VIEWS, VIEWS_S, Tracks, residuals
-from experiments.learn_features.training import Settings, draw, moved, pose_errors, train
+from experiments.learn_features.training import Settings, draw, localisation_errors, moved, train
 from tests.learning.test_clip import BentEyes
 from tests.walks import Walk, arc
 from torchslam import Features
@@ -75,10 +75,10 @@ def test_what_is_drawn_is_seen_where_it_is_localised(tracks: Tracks) -> None:
 def test_exact_tracks_have_no_pose_error_and_disturbed_ones_a_gradient(tracks: Tracks) -> None:
     front_end = SubPixel(nn.Identity())
     drawn = draw(tracks, Settings(problems=4), torch.Generator().manual_seed(0))
-    errors, success = pose_errors(front_end, tracks, drawn)
+    errors, success = localisation_errors(front_end, tracks, drawn)
     assert bool(success.all())
     assert float(errors.detach().max()) < 1e-5
-    errors, success = pose_errors(front_end, disturbed(tracks), drawn)
+    errors, success = localisation_errors(front_end, disturbed(tracks), drawn)
     assert float(errors.detach().min()) > 1e-4
     errors[success].log1p().sum().backward()
     gradient = front_end.network[-1].weight.grad

@@ -19,7 +19,6 @@ from experiments.match_weights.evaluation import (
     Ransac,
     choose,
     median_error,
-    pose_errors,
 )
 from experiments.match_weights.problems import Cues, Problems, with_ransac
 from experiments.match_weights.report import PartResult, error_table
@@ -123,15 +122,6 @@ def test_padding_changes_nothing(problems: Problems) -> None:
     weights = [head(describe(x, x.T_start), propagated_variances(x, x.T_start), x.mask) for x in (one, short)]
     torch.testing.assert_close(weights[0][:, :count], weights[1])
     assert (weights[0][:, count:] == 0).all()
-
-
-def test_errors_of_known_poses(problems: Problems) -> None:
-    xi = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64)
-    turned = pose_errors(se3_exp(xi) @ problems.T_true, problems.T_true)
-    torch.testing.assert_close(turned[:, 1], torch.full_like(turned[:, 1], 0.3))
-    sideways = se3_exp(torch.tensor([0, 0.2, 0, 0, 0, 0.0], dtype=torch.float64))
-    moved = pose_errors(problems.T_true @ sideways, problems.T_true)
-    torch.testing.assert_close(moved[:, 0], torch.full_like(moved[:, 0], 0.2))
 
 
 def test_the_best_setting_is_chosen(problems: Problems) -> None:

@@ -69,6 +69,15 @@ def test_another_sequence_is_refused(seen: Scene, folder: Path) -> None:
         open_images(str(folder), later)
 
 
+def test_images_without_times_have_the_rate_of_the_run(seen: Scene, folder: Path) -> None:
+    images = str(folder / "rgb" / "*.png")
+    np.testing.assert_array_equal(open_images(images, seen, fps=10.0).bgr(3), picture(3, seen.camera))
+    with pytest.raises(ResultsError, match=r"other times"):
+        open_images(images, seen)
+    # thinned frames that begin elsewhere than the sequence does: their own times find them
+    np.testing.assert_array_equal(open_images(str(folder), seen, fps=3.0).bgr(3), picture(3, seen.camera))
+
+
 def test_frames_are_found_by_their_times(seen: Scene, folder: Path) -> None:
     """The run may have begun later in the sequence."""
     part = replace(seen, frame_ids=seen.frame_ids - 2)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchslam.features import hamming, match, match_projected, matching
+from torchslam.features import expand_runs, hamming, match, match_pairs, match_projected, matching
 from torchslam.values import Features, Matches
 
 WIDTH, HEIGHT = 320, 240
@@ -359,3 +359,28 @@ def test_descriptors_of_another_length_are_an_error():
     features = Features(torch.zeros(1, 5, 2), ones, ones, 0 * ones, descriptors, ones > 0)
     with pytest.raises(ValueError, match="unit length"):
         match(features, replace(features, descriptors=1.1 * descriptors))
+
+
+@pytest.mark.parametrize("floats", [None, 16])
+@given(seed=st.integers(0, 1000), share=st.sampled_from([0.0, 0.3, 1.0]))
+@settings(max_examples=15, deadline=None)
+def test_pairs_match_as_all_against_all_where_only_they_are_allowed(
+    floats: int | None, seed: int, share: float
+) -> None:
+    first = features(1, 30, seed, floats)
+    second = disturbed(first, seed + 1)
+    limit = 40 if floats is None else 0.2
+    allowed = torch.rand(30, 30, generator=torch.Generator().manual_seed(seed)) < share
+    allowed &= first.mask[0, :, None] & second.mask[0]
+    wanted = match(first, second, None, max_distance=limit, allowed=allowed[None])
+    rows, columns = match_pairs(
+        first.descriptors[0], second.descriptors[0], *allowed.nonzero(as_tuple=True), limit
+    )
+    assert pairs(wanted) == dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    assert (rows.diff() > 0).all()
+
+
+def test_runs_are_expanded() -> None:
+    run, number = expand_runs(torch.tensor([3, 7, 0]), torch.tensor([5, 7, 3]))
+    assert run.tolist() == [0, 0, 2, 2, 2]
+    assert number.tolist() == [3, 4, 0, 1, 2]

@@ -158,3 +158,11 @@ def test_covariance_is_zero_where_the_views_do_not_determine_a_point(device: tor
     assert (no_parallax == 0).all()
     assert (behind == 0).flatten(1).all(-1).any()
     assert torch.isfinite(behind).all()
+
+
+def test_coordinates_that_are_undistorted_already_give_the_same() -> None:
+    T_cw, pixels, _ = views(RADIAL, noise=1.0)
+    seen = pixels[:, 0], pixels[:, 1]
+    known = RADIAL.normalize(seen[0]), RADIAL.normalize(seen[1])
+    one, two = (triangulate(*T_cw, *seen, RADIAL, RADIAL, normalized=x) for x in (None, known))
+    assert all(torch.equal(part, vars(two)[name]) for name, part in vars(one).items())

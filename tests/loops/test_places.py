@@ -234,3 +234,17 @@ def test_the_true_place_wins_among_rendered_ones() -> None:
         assert len(keys) == 54
         assert int(away[0]) <= 6
         assert float(scores[0]) > 2 * float(scores[away > 40].max())
+
+
+@pytest.mark.parametrize("floats", [False, True])
+def test_a_keyframe_that_is_there_asks_as_its_image_does(floats: bool) -> None:
+    places = Places()
+    for key in range(4):
+        descriptors, mask = image(key % 3, count=100)
+        if floats:
+            descriptors = torch.nn.functional.normalize(descriptors.float() - 127, dim=-1)
+        places.add(key, descriptors, mask)
+        for one, other in zip(places.like(key), places.query(descriptors, mask), strict=True):
+            assert torch.equal(one, other)
+    with pytest.raises(KeyError):
+        places.like(7)

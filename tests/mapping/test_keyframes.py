@@ -11,7 +11,8 @@ from torch import Tensor
 from tests.scene import Scene, pose, sideways, world_in
 from tests.world.simulated import tracked_at
 from torchslam.config import KeyframesConfig, load_config
-from torchslam.mapping.keyframes import apart, why_keyframe
+from torchslam.geometry.motion import apart
+from torchslam.mapping.keyframes import why_keyframe
 from torchslam.world.world import World
 
 SCENE = Scene.of(100)

@@ -18,7 +18,7 @@ from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
 from torchslam.mapping.mapper import Mapper, world_scale
-from torchslam.mapping.new_points import has_consistent_scale, match_along_epipolar_lines
+from torchslam.mapping.new_points import FreeKeypoints, has_consistent_scale, match_along_epipolar_lines
 from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
 from torchslam.tracking.initialization import Initializer
@@ -192,12 +192,16 @@ def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
 
 
 def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
-    views = [view_of(slam, i) for i in (4, 9)]
+    one, two = (
+        FreeKeypoints(
+            view.features, torch.arange(len(view.mask))[None], slam.camera.normalize(view.keypoints)[None]
+        )
+        for view in (view_of(slam, i) for i in (4, 9))
+    )
     T_21 = walk_from_start(slam, 9) @ se3_inverse(walk_from_start(slam, 4))
-    rows = [torch.nonzero(view.mask)[:, 0] for view in views]
-    first, second = match_along_epipolar_lines(*views, *rows, T_21, slam.camera, 1.0, CONFIG.matching)
+    _, first, second = match_along_epipolar_lines(one, two, T_21[None], slam.camera, 1.0, CONFIG.matching)
     assert len(first) > 50
-    assert torch.equal(views[0].descriptors[first], views[1].descriptors[second])
+    assert torch.equal(one.features.descriptors[0, first], two.features.descriptors[0, second])
 
 
 def test_scale_consistency() -> None:
@@ -207,7 +211,7 @@ def test_scale_consistency() -> None:
     T_2w[2, 3] = -2.0  # two metres ahead: the point appears twice as large
     scales = torch.tensor([2.0, 1.0, 4.0], dtype=torch.float64)
     consistent = has_consistent_scale(
-        points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (1.0, 8.0)
+        points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (scales[1], 2 * scales[2])
     )
     assert consistent.tolist() == [True, False, False]
 

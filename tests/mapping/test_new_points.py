@@ -11,13 +11,16 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
-from torchslam.geometry import se3_inverse, transform, triangulation_covariance
+from torchslam.geometry import se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.mapping.new_points import (
+    FreeKeypoints,
+    around,
     has_baseline,
     has_consistent_scale,
     match_along_epipolar_lines,
     triangulate_against,
 )
+from torchslam.values import Features, View
 from torchslam.world.map import Map
 
 SCENE = Scene.of(300)
@@ -29,10 +32,12 @@ def half_known(T_cw: Tensor, noise: float = 0.0) -> Map:
     return world_in(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
 
 
-def triangulated(slam_map: Map, *overrides: str) -> Tensor:
-    """(n,) rows of the points that keyframes 1 and 0 make."""
-    before = len(slam_map.points)
-    triangulate_against(slam_map, 1, 0, CAMERA, load_config(None, overrides))
+def triangulated(
+    slam_map: Map, *overrides: str, keyframe: int = 1, neighbours: tuple[int, ...] = (0,)
+) -> Tensor:
+    """(n,) rows of the points that a keyframe and its neighbours make."""
+    before, config = len(slam_map.points), load_config(None, overrides)
+    triangulate_against(slam_map, keyframe, torch.tensor(neighbours), CAMERA, config)
     return torch.arange(before, len(slam_map.points))
 
 
@@ -57,6 +62,27 @@ def test_what_both_see_and_neither_knows_becomes_a_point_where_it_is() -> None:
     assert (slam_map.points["born"][new] == 1).all()
     assert (slam_map.points["times_observed"][new] == 2).all()
     assert len(triangulated(slam_map)) == 0  # they are known now
+
+
+def test_several_neighbours_at_once_are_as_one_after_the_other() -> None:
+    T_cw = sideways(4, step=0.4)
+    together, apart = half_known(T_cw), half_known(T_cw)
+    new = triangulated(together, keyframe=3, neighbours=(0, 1, 2))
+    for neighbour in (0, 1, 2):
+        assert len(triangulated(apart, keyframe=3, neighbours=(neighbour,))) > 0
+    assert torch.equal(together.keyframes["point_ids"], apart.keyframes["point_ids"])
+    for name in ("positions_w", "covariances_w"):
+        torch.testing.assert_close(together.points[name], apart.points[name], atol=1e-9, rtol=1e-6)
+    assert len(new) == len(torch.unique(shown(together, 3, new)))
+
+
+def test_of_several_neighbours_the_first_counts() -> None:
+    slam_map = half_known(sideways(3, step=0.4))
+    new = triangulated(slam_map, keyframe=2, neighbours=(0, 1))
+    table = slam_map.keyframes["point_ids"]
+    alone = triangulated(half_known(sideways(3, step=0.4)), keyframe=2, neighbours=(0,))
+    assert torch.isin(new, table[0]).sum() == len(alone) < len(new)
+    assert not torch.isin(table[0][table[0] >= new[0]], table[1]).any()
 
 
 def test_new_points_know_how_certain_they_are() -> None:
@@ -126,8 +152,8 @@ def test_cameras_must_be_apart_by_a_share_of_the_depth() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     seen = slam_map.points_seen_by(torch.tensor([0]))
     share = 0.4 / float(slam_map.positions_w[seen, 2].median())
-    assert has_baseline(slam_map, 1, 0, 0.99 * share)
-    assert not has_baseline(slam_map, 1, 0, 1.01 * share)
+    assert has_baseline(slam_map, 1, torch.tensor([0, 1]), 0.99 * share).tolist() == [True, False]
+    assert not has_baseline(slam_map, 1, torch.tensor([0]), 1.01 * share)
     assert len(triangulated(slam_map, f"mapping.min_baseline={1.01 * share}")) == 0
     assert len(triangulated(slam_map, f"mapping.min_baseline={0.99 * share}")) > 0
 
@@ -137,11 +163,29 @@ def test_the_depth_is_that_of_the_neighbour() -> None:
     slam_map = half_known(T_cw)
     seen = slam_map.points_seen_by(torch.tensor([0]))
     share = math.hypot(0.5, 2.0) / float(slam_map.positions_w[seen, 2].median() + 2.0)
-    assert has_baseline(slam_map, 1, 0, 0.99 * share)
-    assert not has_baseline(slam_map, 1, 0, 1.01 * share)
+    assert has_baseline(slam_map, 1, torch.tensor([0]), 0.99 * share)
+    assert not has_baseline(slam_map, 1, torch.tensor([0]), 1.01 * share)
 
 
 ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
+
+
+def free(view: View, rows: Tensor) -> FreeKeypoints:
+    """Some keypoints (n,) of a view."""
+    features = Features(*(x[:, rows] for x in vars(view.features).values()))
+    return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints))
+
+
+def matched(
+    views: list[View], rows: list[Tensor], T_21: Tensor, epipolar_px: float = 2.0
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) keypoints among some rows of two views that match."""
+    one, two = (free(view, some) for view, some in zip(views, rows, strict=True))
+    which, at_1, at_2 = match_along_epipolar_lines(
+        one, two, T_21[None], CAMERA, epipolar_px, MatchingConfig()
+    )
+    assert not which.any()
+    return one.rows[0, at_1], two.rows[0, at_2]
 
 
 def epipolar(offset: float, limit: float = 2.0, **changes: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,7 +196,7 @@ def epipolar(offset: float, limit: float = 2.0, **changes: Tensor) -> tuple[Tens
     middle = (moved - torch.tensor([159.5, 119.5])).norm(dim=-1) < 60  # where a pixel is 1 / focal length
     rows = [torch.nonzero(mask)[:, 0] for mask in (views[0].mask, views[1].mask & middle)]
     T_21 = ALONG[1] @ se3_inverse(ALONG[0])
-    return match_along_epipolar_lines(*views, *rows, T_21, CAMERA, limit, MatchingConfig())
+    return matched(views, rows, T_21, limit)
 
 
 def test_matches_lie_on_the_epipolar_line() -> None:
@@ -186,7 +230,7 @@ def test_a_keypoint_has_one_partner() -> None:
     views[0] = replace(views[0], keypoints=keypoints, descriptors=descriptors)
     rows = [torch.nonzero(view.mask)[:, 0] for view in views]
     T_21 = ALONG[1] @ se3_inverse(ALONG[0])
-    first, second = match_along_epipolar_lines(*views, *rows, T_21, CAMERA, 2.0, MatchingConfig())
+    first, second = matched(views, rows, T_21)
     assert twin[0] in first
     assert twin[1] not in first
     assert len(torch.unique(second)) == len(second)
@@ -196,8 +240,7 @@ def test_nobody_matches_nobody() -> None:
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
     rows, nobody = torch.arange(10), torch.arange(0)
     for one, other in ((nobody, rows), (rows, nobody)):
-        found = match_along_epipolar_lines(*views, one, other, pose(1.0), CAMERA, 2.0, MatchingConfig())
-        assert [len(part) for part in found] == [0, 0]
+        assert [len(part) for part in matched(views, [one, other], pose(1.0))] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -208,13 +251,43 @@ def test_sizes_go_with_one_over_the_distance(factor: float, consistent: bool) ->
     points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
     ahead = pose(0, 0, -4.0)
     one, size = torch.tensor([1.5]).double(), torch.tensor([4.5 * factor]).double()
-    assert bool(has_consistent_scale(points_w, pose(), ahead, one, size, (1.0, 20.0))[0]) is consistent
-    assert bool(has_consistent_scale(points_w, ahead, pose(), size, one, (0.1, 20.0))[0]) is consistent
+    finest, coarsest = torch.tensor([[0.1, 20.0]]).double().unbind(-1)
+    sizes = (finest, coarsest)
+    assert bool(has_consistent_scale(points_w, pose(), ahead, one, size, sizes)[0]) is consistent
+    assert bool(has_consistent_scale(points_w, ahead, pose(), size, one, sizes)[0]) is consistent
 
 
 def test_sizes_beyond_those_of_the_detector_are_not_expected() -> None:
     points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
     one, two = torch.tensor([1.5]).double(), torch.tensor([2.0]).double()
-    assert has_consistent_scale(points_w, pose(), pose(0, 0, -4.0), one, two, (1.0, 2.0)).all()
-    assert not has_consistent_scale(points_w, pose(), pose(0, 0, -4.0), one, two, (1.0, 8.0)).any()
+    finest, coarse, coarser = torch.tensor([[1.0, 2.0, 8.0]]).double().unbind(-1)
+    ahead = pose(0, 0, -4.0)
+    assert has_consistent_scale(points_w, pose(), ahead, one, two, (finest, coarse)).all()
+    assert not has_consistent_scale(points_w, pose(), ahead, one, two, (finest, coarser)).any()
     assert transform(pose(0, 0, -4.0), points_w)[0, 2] == 2.0
+
+
+def test_angles_around_an_axis() -> None:
+    generator = torch.Generator().manual_seed(0)
+    axes, rays = (
+        torch.randn(*shape, 3, generator=generator, dtype=torch.float64) for shape in ((4,), (4, 9))
+    )
+    axes[0] = torch.tensor([0.0, 0.0, 2.0])
+    angles, sines = around(axes, rays)
+    unit, across = (torch.nn.functional.normalize(x, dim=-1) for x in (axes[:, None], rays))
+    torch.testing.assert_close(sines, torch.linalg.cross(unit.expand_as(rays), across).norm(dim=-1))
+    turn = so3_exp(0.3 * unit[:, 0])
+    turned, _ = around(axes, rays @ turn.mT)
+    torch.testing.assert_close(torch.remainder(turned - angles, 2 * math.pi), torch.full_like(angles, 0.3))
+
+
+def test_a_window_reaches_over_the_end_of_a_turn() -> None:
+    """Forwards the planes turn around the middle of the image: all angles occur."""
+    ahead = torch.stack([pose(), pose(0, 0, -0.8)])
+    views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ahead)]
+    rows = [torch.nonzero(view.mask)[:, 0] for view in views]
+    first, second = matched(views, rows, ahead[1])
+    shows = SCENE.shows(0)[first]
+    assert torch.equal(shows, SCENE.shows(1)[second])
+    both = set(SCENE.shows(0)[rows[0]].tolist()) & set(SCENE.shows(1)[rows[1]].tolist())
+    assert len(first) == len(both) > 50

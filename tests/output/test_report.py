@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from torchslam.evaluation import evaluate
-from torchslam.output.report import metrics, summary, table
+from torchslam.geometry import transform
+from torchslam.output.report import doubts, metrics, quality, summary, table
 from torchslam.run import Run
 from torchslam.values import State, Tracked, Trajectory
 from torchslam.world.world import World
@@ -26,6 +27,37 @@ def test_counts(run: Run) -> None:
     assert (figures["session"], figures["world"]) == (0, 0)
     counts = {"world": 0, "keyframes": 6, "points": 119, "posed": 23, "uncertain": 0, "lost": 4}
     assert figures["worlds"] == [counts]
+
+
+def test_quality(run: Run) -> None:
+    graph = run.history.graph(run.map, run.camera)
+    points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
+    pixels, valid = run.camera.project(points_c)
+    assert valid.any()
+    expected = float((pixels - graph.pixels).norm(dim=-1)[valid].mean())
+    seen = torch.bincount(graph.point_index)
+    found = quality(run)
+    assert found["reprojection_px"] == pytest.approx(expected)
+    assert found["track_length"] == pytest.approx(float(seen[seen > 0].double().mean()))
+    figures = metrics(run)
+    assert figures["uncertain"] == 0
+    assert summary(figures)["quality"] == (
+        f"{expected:.2f} px mean reprojection error, points seen in {found['track_length']:.1f} frames, "
+        "0.0% of the frames uncertain"
+    )
+    assert "quality" not in summary(figures | {"reprojection_px": None})
+    assert quality(replace(run, worlds=())) == quality(replace(run, session=7))
+    assert quality(replace(run, session=7)) == {"reprojection_px": None, "track_length": None}
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "posed", "said"), [(12, 23, True), (11, 23, False), (9, 9, False), (5, 10, True)]
+)
+def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: int, said: bool) -> None:
+    found = doubts(metrics(run) | {"keyframes": keyframes, "posed": posed})
+    assert [text.partition(":")[0] for text in found] == [
+        f"{keyframes} of {posed} posed frames are keyframes"
+    ] * said
 
 
 def test_counts_of_several_worlds_and_sessions(run: Run, world: World) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, sideways
 from torchslam.config import Config
-from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, so3_log, transform
+from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, so3_log, transform
 from torchslam.refinement.adjustment import map_of, turned
 from torchslam.refinement.frame import back_to_given
 from torchslam.refinement.pairs import Pair, candidates, choose_keyframes, find_pairs
@@ -195,6 +195,22 @@ def test_matches_are_verified(generator: torch.Generator) -> None:
     wrong = T_cw.clone()
     wrong[2] = se3_exp(torch.tensor([0, 0, 0, 0, 0, math.radians(16)], dtype=torch.float64)) @ T_cw[2]
     assert [(p.first, p.second) for p in find_pairs(views, wrong, CAMERA, CONFIG)] == [(0, 1)]
+
+
+def test_images_that_are_reduced_have_the_same_pairs() -> None:
+    """What is noise at 640x480 is noise in four times as large an image, which is looked at reduced to that."""
+    scene, T_cw = Scene.of(), sideways(3, step=0.4)
+    small = [scene.view(index, T, noise=0.5) for index, T in enumerate(T_cw)]
+    found = []
+    for factor in (2, 8):
+        size = factor * CAMERA.width, factor * CAMERA.height
+        focal, centre = factor * CAMERA.params[:2], factor * (CAMERA.params[2:] + 0.5) - 0.5
+        camera = Camera.pinhole(*focal.tolist(), *centre.tolist(), size=size)
+        views = [replace(view, keypoints=factor * (view.keypoints + 0.5) - 0.5) for view in small]
+        found.append(find_pairs(views, T_cw, camera, CONFIG))
+    assert len(found[0]) == len(found[1]) > 0
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one.keypoints_1, other.keypoints_1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])

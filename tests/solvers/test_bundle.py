@@ -164,6 +164,9 @@ def test_two_maps_without_a_common_point_are_not_determined(bundle_scene):
     )
     solution = bundle_adjust(problem)
     assert not solution.success
+    unchecked = bundle_adjust(problem, check=False)
+    assert unchecked.success
+    assert torch.equal(unchecked.T_cw, solution.T_cw)
     assert solution.T_cw.isfinite().all()
     solution.T_cw.sum().backward()
     assert (pixels.grad == 0).all()

@@ -71,14 +71,14 @@ def test_gauss_newton_expansion_is_semi_definite_and_exact_for_small_residuals(m
     for near in (False, True):
         observations, points_c = make_observations(noise=20.0)
         lin = linearize(observations, points_c)
-        expansion = gauss_newton_expansion(lin, torch.tensor(near))
-        assert torch.linalg.eigvalsh(expansion.hessian).min() > -1e-9
+        expansion = gauss_newton_expansion(lin, lin.J.movedim(0, -1), torch.tensor(near))
+        assert torch.linalg.eigvalsh(expansion.hessian.movedim(-1, 0)).min() > -1e-9
     observations, points_c = make_observations(noise=1e-7)
     lin = linearize(observations, points_c)
     exact = exact_expansion(observations, points_c)
-    torch.testing.assert_close(
-        gauss_newton_expansion(lin, torch.tensor(True)).hessian, exact.hessian, atol=1e-4, rtol=1e-6
-    )
+    expansion = gauss_newton_expansion(lin, lin.J.movedim(0, -1), torch.tensor(True))
+    torch.testing.assert_close(expansion.gradient.mT, exact.gradient)
+    torch.testing.assert_close(expansion.hessian.movedim(-1, 0), exact.hessian, atol=1e-4, rtol=1e-6)
 
 
 def test_a_point_behind_the_camera_costs_much_and_pulls_nowhere(make_observations, model, dtype, device):

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.scene import Scene, sideways, world_in
 from torchslam.solvers import Marginals
 from torchslam.values import View
 from torchslam.world.map import NO_POINT, Map
@@ -148,3 +149,24 @@ def test_covariances_are_taken_over_and_unknown_ones_leave_what_is_there(small_m
     assert torch.equal(small_map.keyframes["covariances"], frames)
     assert small_map.points["covariances_w"].diagonal(dim1=1, dim2=2).sum(-1).tolist() == [0, 3, 0, 0, 3, 0]
     torch.testing.assert_close(small_map.centre_covariances_w()[1:], points)
+
+
+def test_what_many_keyframes_share_is_what_each_of_them_shares(small_map: Map) -> None:
+    everyone = torch.arange(small_map.num_keyframes)
+    shared = small_map.shared(everyone)
+    assert torch.equal(shared, shared.T)
+    assert not shared.diagonal().any()
+    for keyframe in everyone.tolist():
+        seen = small_map.points_seen_by(everyone[keyframe][None])
+        others = small_map.observers(seen)
+        others[keyframe] = 0
+        assert torch.equal(shared[keyframe], others)
+    assert int(shared.max()) > 0
+
+
+def test_around_are_the_nearest_of_each() -> None:
+    slam_map = world_in(Scene.of(200), sideways(8, step=0.3)).map
+    asked = torch.tensor([6, 1])
+    near = [slam_map.covisible(keyframe, 2) for keyframe in asked.tolist()]
+    assert [len(some) for some in near] == [2, 2]
+    assert torch.equal(slam_map.around(asked, 2), torch.unique(torch.cat([asked, *near])))

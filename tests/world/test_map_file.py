@@ -240,7 +240,7 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (put(F + "reference", 0, 6), "reference from 0 to 6, there are 0 to 5"),
         (put(O + "row", 0, 3), "row from 0 to 3, there are 0 to 2"),
         (put(O + "point_ids", 0, 120), "point_ids from 0 to 120, there are 0 to 119"),
-        (put(O + "keypoints", 0, -1), "keypoints from -1"),
+        (put(O + "keypoints", 0, -2), "keypoints from -2"),
     ],
 )
 def test_tables_that_do_not_fit_are_refused(

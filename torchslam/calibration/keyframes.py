@@ -13,7 +13,7 @@ from torchslam.solvers.graph import ObservationGraph
 
 KERNEL_SCALE = 2.45  # as in `solve`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6
-ITERATIONS = 50
+ITERATIONS = 400  # where all depths have to move with a focal length that is far off, 200 are needed
 FEWEST = 24  # frames that a camera is refined on, if there are
 # What is looked at of a camera, in this order: the logarithm of the focal length, k1, k2, and the principal point.
 FOCAL, K1, K2, CX, CY = range(5)

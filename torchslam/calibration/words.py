@@ -12,6 +12,7 @@ from torchslam.geometry import Camera
 # with a cost that is lower by a share of its own.
 CERTAIN, NOTABLE = 3.0, 0.01
 LARGE, LOWER = 0.03, 0.02
+SUFFERS = "poses and map may be badly wrong with it"
 OPEN = "pure rotation, a straight way and a plane leave it open"
 
 
@@ -39,13 +40,21 @@ def contradiction(given: Camera, refined: Refinement) -> str:
 
     refined: with the focal length alone free
     """
-    off = abs(math.log(float(refined.camera.focal) / float(given.focal)))
+    was, focal = float(given.focal), float(refined.camera.focal)
+    off = abs(math.log(focal / was))
     lower = 1 - refined.cost / refined.cost_before if refined.cost_before > 0 else 0.0
     certain = off > max(NOTABLE, CERTAIN * refined.given_rest)
     if not certain and not (off > LARGE and lower > LOWER):
         return ""
-    found = _focal(refined, refined.given_rest)
-    return f"the images agree better with a focal length of {found} than with {float(given.focal):.0f}"
+    if not refined.is_determined:
+        return (
+            f"the images contradict a focal length of {was:.0f} px and do not say which is right; {SUFFERS}"
+        )
+    better = "the images agree better with a focal length of"
+    if off <= LARGE:
+        return f"{better} {_focal(refined, refined.given_rest)} than with {was:.0f}"
+    # A run chooses its matches by the camera it has: far off, they lead only most of the way to the right one.
+    return f"{better} {focal:.0f} px or {'more' if focal > was else 'less'} than with {was:.0f}; {SUFFERS}"
 
 
 def _focal(refined: Refinement, std: float) -> str:

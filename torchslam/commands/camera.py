@@ -50,11 +50,17 @@ def find_camera(
     return sequence.with_camera(calibrated.camera.to("cpu")), said
 
 
-def judged(finished: Run) -> str:
-    """What a first session has against its focal length; empty where it agrees with it, or was not finished."""
-    if finished.failure or finished.interrupted or finished.session:
-        return ""
-    return contradiction(finished.camera, refine(finished.graph))
+def judged(finished: Run, found: str) -> str:
+    """What there is to say of the camera of a run: how it was found, and what the run has against its focal length.
+
+    found: by `find_camera`, empty where the camera was given. Only a first session that was finished is asked.
+    """
+    against = ""
+    if not (finished.failure or finished.interrupted or finished.session):
+        against = contradiction(finished.camera, refine(finished.graph))
+    if found:
+        return "; but over all frames ".join(filter(None, (found, against)))
+    return f"{against}; --refine-camera looks for a better one" if against else ""
 
 
 def _tell(done: Round) -> None:

@@ -17,9 +17,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="where its folder goes; default: %(default)s",
     )
+    parser.add_argument("--sha256", metavar="HEX", help="checksum of the archive: another one is deleted")
     parser.add_argument("--url", default=ETH3D_URL, help="server that has the archives; default: %(default)s")
 
 
 def execute(options: argparse.Namespace) -> int:
-    print(download(options.name, options.to, options.url))
+    print(download(options.name, options.to, options.url, sha256=options.sha256))
     return 0

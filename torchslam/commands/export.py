@@ -9,6 +9,10 @@
 
 Lengths are in map units. Up is the mean up direction of the keyframes' cameras: gravity is not known. Images are read
 again from the sequence that the run read.
+
+Then, for example, `ns-train splatfacto --data DIR/export/nerfstudio`, `train.py -s DIR/export/colmap` (3D Gaussian
+Splatting knows pinhole cameras alone: --undistort), `rerun DIR/export/recording.rrd`, `evo_traj tum
+DIR/export/trajectory.txt`.
 """
 
 from __future__ import annotations
@@ -51,7 +55,8 @@ class Job:
 
     directory: of the results; figures: of the run, from there
     world, camera: from its map
-    source:    what the images are read from; None where they are not wanted, or nothing says where they are
+    source:    what the images are read from, and
+    fps:       at what rate, where the run was told; None where they are not wanted, or nothing says where they are
     undistort: whether images and keypoints are to be as of a pinhole camera
     """
 
@@ -63,6 +68,7 @@ class Job:
     keyframes_alone: bool
     undistort: bool
     source: str | None
+    fps: float | None
 
     @property
     def session(self) -> int:
@@ -79,7 +85,7 @@ class Job:
         scene = scene_of(self.world, self.camera, self.session, self.keyframes_alone)
         images = None
         if self.source is not None:
-            images = open_images(self.source, scene, self.undistort)
+            images = open_images(self.source, scene, self.undistort, self.fps)
         return (undistorted(scene) if self.undistort else scene), images
 
     def trajectory(self) -> Trajectory:
@@ -167,6 +173,7 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
         keyframes_alone=keyframes_alone,
         undistort=options.undistort or options.to == "rerun",
         source=source,
+        fps=figures.get("source_fps"),
     )
 
 
@@ -183,7 +190,7 @@ def _colmap(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
-    return {"camera": colmap_camera(scene.camera)[0]} | _figures(scene)
+    return {"camera": colmap_camera(scene.camera)[0]} | _figures(job, scene)
 
 
 def _nerfstudio(job: Job) -> dict[str, str]:
@@ -191,19 +198,23 @@ def _nerfstudio(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_nerfstudio(job.output, scene, job.R_up)
-    return _figures(scene)
+    return _figures(job, scene)
 
 
 def _rerun(job: Job) -> dict[str, str]:
     scene, images = job.scene()
     write_recording(job.output, scene, job.R_up, images)
-    return _figures(scene)
+    return _figures(job, scene)
 
 
-def _figures(scene: Scene) -> dict[str, str]:
+def _figures(job: Job, scene: Scene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
+    frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
+    if job.keyframes_alone:
+        posed = job.world.history.count(job.session)
+        frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all takes all of them"
     return {
-        "frames": f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes",
+        "frames": frames,
         "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
         "error": f"{error:.4f} px, mean over the points",
     }

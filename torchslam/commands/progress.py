@@ -11,11 +11,13 @@ from typing import Any
 from tqdm import tqdm
 
 from torchslam.commands.stopping import Stopping
+from torchslam.progress_line import stream
 from torchslam.values import StepResult
 
 
 class ProgressBar:
-    """Frame, rate, state and points on one line of stderr; warnings are printed above it.
+    """Frame, rate, state and points on one line of stderr, in a log on one every few seconds; warnings are printed
+    above it.
 
     A signal takes effect after the frame, or the iteration, at hand, when the map is whole.
 
@@ -32,8 +34,7 @@ class ProgressBar:
             total=frames,
             initial=done,
             unit=" frames",
-            file=sys.stderr,
-            dynamic_ncols=True,
+            **stream(),
             bar_format="{n_fmt} frames, {rate_noinv_fmt}{postfix}"
             if frames is None
             else "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
@@ -54,12 +55,11 @@ class ProgressBar:
             self._bar.close()
             self._adjusting = tqdm(
                 total=iterations,
-                file=sys.stderr,
-                dynamic_ncols=True,
+                **stream(),
                 bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
             )
-        self._adjusting.total, self._adjusting.n = iterations, iteration + 1  # worlds begin anew
-        self._adjusting.refresh()
+        self._adjusting.total = iterations
+        self._adjusting.update(iteration + 1 - self._adjusting.n)  # worlds begin anew
         self._stopping.check()
 
     def __enter__(self) -> ProgressBar:

@@ -45,9 +45,10 @@ REFINED = "refined"  # folder in the results
 
 @dataclass(frozen=True)
 class Plan:
-    """source: what the sequence was opened from; choice, radial: as in `refine`"""
+    """source, fps: what the sequence was opened from; choice, radial: as in `refine`"""
 
     source: str
+    fps: float | None
     output: Path
     device: torch.device
     overwrite: bool
@@ -92,6 +93,7 @@ def execute(options: argparse.Namespace) -> int:
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.JUDGED
     plan = Plan(
         options.path,
+        options.fps,
         options.output,
         options.device,
         options.overwrite,
@@ -153,6 +155,7 @@ def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
         "rounds": refined.rounds,
         "dropped": sequence.dropped,
         "source": full_name(plan.source),
+        "source_fps": plan.fps,
     }
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)

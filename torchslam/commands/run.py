@@ -36,11 +36,12 @@ from torchslam.export.colours import paint
 from torchslam.export.recording import import_rerun
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
-from torchslam.output.report import metrics, summary, table
+from torchslam.output.report import doubts, metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.output.view import VIEW, write_view
 from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
 from torchslam.run import Frames, Progressed, Run, run_sequence
+from torchslam.scouting import Scouting
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
 
@@ -55,7 +56,8 @@ Errors = TypeVar("Errors")
 class Plan:
     """Where a run reads and writes.
 
-    source:     what the sequence was opened from, for those that need its images again
+    source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
+                where that was said
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
     map:        file of a saved map to go on in, without `mapping` only to localise in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
@@ -77,6 +79,7 @@ class Plan:
     processes: int | None = None
     view: bool = False
     video: bool = False
+    fps: float | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -146,6 +149,7 @@ def execute(options: argparse.Namespace) -> int:
         processes=options.processes,
         view=options.view,
         video=options.video,
+        fps=options.fps,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -186,6 +190,8 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     written |= {"video": plan.output / VIDEO} if plan.video else {}
     words = summary(figures) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
+    for doubt in doubts(figures):
+        print(f"torchslam: warning: {doubt}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status
@@ -208,6 +214,8 @@ def frames_of(
         print(f"torchslam: one process: {alone}", file=sys.stderr)
     if alone or processes == 1:
         return nullcontext(sequence)
+    if slam.config.patches.enabled:
+        return Scouting(sequence, slam)
     return Ahead(sequence, slam.camera, slam.config, slam.clock, processes - 1)
 
 
@@ -268,9 +276,9 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
         _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
     )
-    figures["camera"] = "; but over all frames ".join(filter(None, (camera, judged(finished))))
+    figures["camera"] = judged(finished, camera)
     figures["dropped"] = sequence.dropped
-    figures["source"] = full_name(plan.source)
+    figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)
     results = read_results(plan.output)

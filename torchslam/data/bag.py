@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.image_file import MAX_BYTES, bit_depth, decode_pixels, grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.regular_file import check_regular
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -33,6 +35,9 @@ LOOKS_FOR = "a ROS bag (.bag, .mcap, or a folder with metadata.yaml)"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
+MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
+"""Bytes of a recording, and of the text that describes it."""
+MAX_FILES = 10_000
 SAMPLES = 20
 """Images in which the brightest pixel is looked for, where they have 16 bits."""
 
@@ -85,10 +90,13 @@ class BagSequence(Sequence):
         self._position = 0
         self._stream: Iterator[Any] = iter(())
         self._rewind()
-        samples = [self._read(message) for message in sorted(self._messages)[:SAMPLES]]
-        self._bits = bit_depth(samples)
+        self._bits, size = 8, None
+        for message in sorted(self._messages)[:SAMPLES]:
+            image = self._read(message)
+            self._bits = max(self._bits, bit_depth([image]))
+            size = size or (image.shape[1], image.shape[0])
+        assert size is not None  # a topic has images
         camera = topic.calibration if camera is None else camera
-        size = (samples[0].shape[1], samples[0].shape[0])
         left_out = len(order) - len(self._messages)
         super().__init__(
             path.stem,
@@ -199,6 +207,10 @@ def _open_reader(path: Path) -> AnyReader:
     except ImportError:
         raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
     with _errors(str(path)):
+        for file in itertools.islice(path.iterdir(), MAX_FILES) if path.is_dir() else (path,):
+            if not file.is_dir():
+                limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
+                check_regular(file, limit, "a file of a recording")
         # A single file of ROS 2 is in the folder of its recording, or a recording of its own.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
@@ -214,6 +226,8 @@ def _connection(reader: AnyReader, topic: str) -> Connection:
 
 def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
     """The topic to be read. Raises SequenceError where there is none, or several and none is named."""
+    if not all(isinstance(each.topic, str) for each in reader.connections):
+        raise SequenceError(f"{path}: cannot be read: topics without a name")
     images = [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
     topics = list(dict.fromkeys(each.topic for each in images if "depth" not in each.topic.lower()))
     if wanted is not None:

@@ -6,7 +6,6 @@ corner there, so that their principal points are half a pixel larger.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -17,8 +16,10 @@ from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.text_file import numbered_lines, parse_floats, read_text
 from torchslam.data.yaml_text import yaml_numbers, yaml_value
 from torchslam.errors import CalibrationError
+from torchslam.regular_file import JSON_BYTES, parse_json
 
 HALF_PIXEL = 0.5
+MAX_BYTES = 1 << 18
 LARGEST = 1e12  # numbers in JSON have any number of digits
 FISHEYES = ("equidistant", "fisheye", "kannala", "opencv_fisheye")
 BROWN = ("plumb_bob", "radtan", "radial-tangential", "radial_tangential", "rational_polynomial", "none", "")
@@ -53,7 +54,8 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises CalibrationError naming the file.
     """
     path = Path(path)
-    text = read_text(path, CalibrationError)
+    # A transforms.json has all frames in it.
+    text = read_text(path, CalibrationError, JSON_BYTES if path.suffix.lower() == ".json" else MAX_BYTES)
     start = text.lstrip()
     if start.startswith("{"):
         return _from_transforms(path, text)
@@ -203,8 +205,8 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
 def _from_transforms(path: Path, text: str) -> Calibration:
     """The camera that all frames of a transforms.json share."""
     try:
-        content: Any = json.loads(text)
-    except (ValueError, RecursionError) as cause:
+        content: Any = parse_json(text)
+    except ValueError as cause:
         raise CalibrationError(f"{path}: not valid JSON: {cause}") from cause
     numbers = {key: value for key, value in content.items() if isinstance(value, int | float)}
     if not all(abs(value) < LARGEST for value in numbers.values()):  # not so NaN either

@@ -1,14 +1,21 @@
 """Public sequences from their servers: fetched with resume, unpacked without trust, put in place at once.
 
+Neither the server nor the archive decides how much that takes: both have limits. An archive that cannot be unpacked, or
+is not the one that was wanted, is deleted, so that the next try fetches it again.
+
 Source of the archives: https://www.eth3d.net/slam_datasets
 """
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import http.client
 import re
 import shutil
 import stat
+import tempfile
+import time
 import urllib.error
 import urllib.request
 import zipfile
@@ -16,7 +23,10 @@ from pathlib import Path, PurePosixPath
 
 from tqdm import tqdm
 
+from torchslam import regular_file
+from torchslam.data.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
+from torchslam.progress_line import stream
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
@@ -24,15 +34,38 @@ TIMEOUT = 60.0
 """Seconds without a byte before a transfer is given up."""
 ATTEMPTS = 5
 """How often a transfer that breaks off is taken up again, as long as it gets further each time."""
+MAX_BYTES = 1 << 34
+"""An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
+UNPACKING, CONTENT = ".unpacking", "content"
+OF_THE_DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
+"""Errors that say nothing against an archive."""
+SLOWEST = 4096
+"""Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
+MARGIN = 1 << 30
+"""Bytes that unpacking leaves free on the disk."""
+SMALL = 1 << 28
+MAX_RATIO = 100
+"""How many times its own size an archive may unpack to, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
 
 
-def download(name: str, directory: str | Path, base_url: str = ETH3D_URL, progress: bool = True) -> Path:
+def download(
+    name: str,
+    directory: str | Path,
+    base_url: str = ETH3D_URL,
+    progress: bool = True,
+    sha256: str | None = None,
+) -> Path:
     """Fetch `eth3d/NAME` (its monocular archive) into `directory`; returns the folder of the sequence.
 
     A transfer that breaks off is taken up where it stopped, in this call or the next one; a sequence that is there
     already is not fetched again. The folder appears whole or not at all.
+
+    sha256: of the archive, as 64 hexadecimal digits; another archive is deleted
+
     Raises DownloadError.
     """
+    if sha256 is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", sha256):
+        raise DownloadError(f"a SHA-256 has 64 hexadecimal digits, this is `{sha256}`")
     found = re.fullmatch(r"eth3d/([A-Za-z0-9_]+)", name)
     if found is None:
         raise DownloadError(f"unknown sequence `{name}`; known are eth3d/NAME, for example eth3d/plant_1")
@@ -44,39 +77,81 @@ def download(name: str, directory: str | Path, base_url: str = ETH3D_URL, progre
     archive.parent.mkdir(parents=True, exist_ok=True)
     if not archive.exists():
         _fetch(url, archive, progress)
-    unpack(archive, target)
+    try:
+        if sha256 is not None:
+            _check_sum(archive, sha256)
+        unpack(archive, target)
+    except NoRoomError:  # the archive may be a good one
+        raise
+    except DownloadError as error:
+        archive.unlink(missing_ok=True)
+        raise DownloadError(f"{error}; it was deleted: the same command fetches it again") from error
     archive.unlink()
     return target
+
+
+class NoRoomError(DownloadError):
+    """What an archive holds does not fit on the disk."""
 
 
 def unpack(archive: Path, target: Path) -> None:
     """Unpack a zip archive of one sequence so that `target` appears whole or not at all.
 
-    A single folder at the top of the archive is left out of the path. Raises DownloadError for a damaged archive and
-    for entries that are absolute, climb out of the folder or are links.
+    A single folder at the top of the archive is left out of the path. Raises DownloadError for a damaged archive, one
+    that is larger unpacked than images are, and entries without a name, that are absolute, climb out of the folder or
+    are links; NoRoomError for one that does not fit on the disk.
     """
-    staging = target.with_name(target.name + ".unpacking")
-    shutil.rmtree(staging, ignore_errors=True)
+    staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=UNPACKING, dir=target.parent))
     try:
+        regular_file.check_regular(archive, MAX_BYTES, "an archive that is read")
         with zipfile.ZipFile(archive) as contents:
+            _check_size(archive, contents.infolist(), target)
             for entry in contents.infolist():
                 _check_entry(archive, entry)
-            contents.extractall(staging)
-        entries = list(staging.iterdir())
+            contents.extractall(staging / CONTENT)
+        entries = list((staging / CONTENT).iterdir())
         single = len(entries) == 1 and entries[0].is_dir()
-        (entries[0] if single else staging).rename(target)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, OSError) as cause:
-        raise DownloadError(
-            f"{archive}: cannot be unpacked into {target}: {cause}; delete it and try again"
-        ) from cause
+        (entries[0] if single else staging / CONTENT).rename(target)
+    except DownloadError:
+        raise
+    except Exception as cause:  # zipfile and the decompressors below it have no common error
+        if isinstance(cause, OSError) and cause.errno in OF_THE_DISK:
+            raise NoRoomError(f"{archive}: cannot be unpacked into {target}: {cause.strerror}") from cause
+        why = str(cause).replace(str(staging), "") or type(cause).__name__
+        raise DownloadError(f"{archive}: not a zip archive, or a damaged one: {why}") from cause
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
 
+def _check_sum(archive: Path, sha256: str) -> None:
+    """Raises DownloadError for an archive with another checksum."""
+    with archive.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != sha256.lower():
+        raise DownloadError(f"{archive}: has the SHA-256 {found}, not {sha256.lower()}")
+
+
+def _check_size(archive: Path, entries: list[zipfile.ZipInfo], target: Path) -> None:
+    """Raises DownloadError for more than an archive of images holds, or more than has room on the disk."""
+    needed, size = sum(entry.file_size for entry in entries), archive.stat().st_size
+    if needed > max(SMALL, MAX_RATIO * size):
+        raise DownloadError(
+            f"{archive}: {size} bytes that unpack to {needed}: more than {MAX_RATIO} times as much is no sequence"
+        )
+    free = shutil.disk_usage(target.parent).free
+    if len(entries) > MAX_FILES or needed > free - MARGIN:
+        raise NoRoomError(
+            f"{archive}: {len(entries)} files of {needed >> 20} MiB do not fit into {target.parent} "
+            f"({free >> 20} MiB free); unpack it elsewhere, or set TMPDIR"
+        )
+
+
 def _check_entry(archive: Path, entry: zipfile.ZipInfo) -> None:
-    """Raises DownloadError for an entry that could write outside of the folder it is unpacked into."""
+    """Raises DownloadError for an entry without a name, or that could write outside of the folder."""
     # Backslashes and drive letters are ordinary characters here, but not where Windows unpacks.
     path = PurePosixPath(entry.filename.replace("\\", "/"))
+    if not path.parts and not path.is_absolute():
+        raise DownloadError(f"{archive}: an entry without a name; nothing was unpacked")
     if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", entry.filename):
         raise DownloadError(
             f"{archive}: entry `{entry.filename}` climbs out of the folder; nothing was unpacked"
@@ -126,7 +201,8 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
         resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
         length = response.headers.get("Content-Length")
         start = start if resumed else 0
-        total = None if length is None else start + int(length)
+        total = start + int(length) if length is not None and re.fullmatch(r"\d{1,18}", length) else None
+        _check_length(url, total or start, part)
         bar = tqdm(
             total=total,
             initial=start,
@@ -134,9 +210,24 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
             unit_scale=True,
             desc=url.rsplit("/", 1)[-1],
             disable=not progress,
+            **stream(),
         )
         with bar, part.open("ab" if resumed else "wb") as file:
-            while chunk := response.read(CHUNK):
+            since, waited = 0, time.monotonic()
+            while chunk := response.read1(CHUNK):
                 file.write(chunk)
                 bar.update(len(chunk))
+                since += len(chunk)
+                _check_length(url, file.tell(), part)
+                if since >= SLOWEST * TIMEOUT:
+                    since, waited = 0, time.monotonic()
+                elif time.monotonic() - waited > TIMEOUT:
+                    raise OSError(f"slower than {SLOWEST} bytes a second")
     return total
+
+
+def _check_length(url: str, size: int, part: Path) -> None:
+    """Raises DownloadError for more than any archive has: a body may have no end. What came of it is deleted."""
+    if size > MAX_BYTES:
+        part.unlink(missing_ok=True)
+        raise DownloadError(f"{url}: more than {MAX_BYTES} bytes, the most that is fetched")

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
-from torchslam.data.text_file import check_later, numbered_lines, parse_floats
+from torchslam.data.text_file import check_later, numbered_lines, parse_count, parse_floats
+from torchslam.data.trajectory_file import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.values import Trajectory
@@ -55,9 +56,10 @@ def _read_images(folder: Path) -> list[ImageEntry]:
     for number, line in numbered_lines(folder / "data.csv", SequenceError):
         where = f"{folder / 'data.csv'}:{number}"
         words = [word.strip() for word in line.split(",")]
-        if len(words) != 2 or not words[0].isdecimal():
+        nanoseconds = parse_count(words[0])
+        if len(words) != 2 or nanoseconds is None:
             raise SequenceError(f"{where}: expected `nanoseconds,file`, got `{line}`")
-        entries.append(ImageEntry(int(words[0]) / NANOSECONDS, folder / "data" / words[1], where))
+        entries.append(ImageEntry(nanoseconds / NANOSECONDS, folder / "data" / words[1], where))
     return entries
 
 
@@ -82,11 +84,12 @@ def _read_body_poses(path: Path, T_bc: Tensor) -> Trajectory:
     rows: list[list[float]] = []
     for number, line in numbered_lines(path, TrajectoryError):
         where = f"{path}:{number}"
-        nanoseconds, _, rest = line.partition(",")
+        first, _, rest = line.partition(",")
+        nanoseconds = parse_count(first.strip())
         row = parse_floats(rest, where, TrajectoryError)
-        if not nanoseconds.strip().isdecimal() or len(row) < 7:
+        if nanoseconds is None or len(row) < 7:
             raise TrajectoryError(f"{where}: expected nanoseconds, position and quaternion, got `{line}`")
-        times.append(int(nanoseconds) / NANOSECONDS)
+        times.append(nanoseconds / NANOSECONDS)
         if rows:
             check_later(times[-1], times[-2], where, TrajectoryError)
         rows.append(row[:7])
@@ -94,7 +97,8 @@ def _read_body_poses(path: Path, T_bc: Tensor) -> Trajectory:
         raise TrajectoryError(f"{path}: no poses")
     table = torch.tensor(rows, dtype=torch.float64)
     T_wb = rigid(matrix_from_quaternion(table[:, [4, 5, 6, 3]]), table[:, :3])
-    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wb @ T_bc)
+    T_wc = checked_poses(T_wb @ T_bc, path)
+    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)
 
 
 def _text(path: Path) -> str:

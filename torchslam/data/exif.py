@@ -5,13 +5,16 @@ Source: Exif 2.32 (CIPA DC-008), tag 0xA405 FocalLengthIn35mmFilm, which is by t
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
+from torchslam import regular_file
 from torchslam.data.calibration import FocalGuess, Size
+from torchslam.data.image_file import MAX_BYTES
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 
@@ -36,11 +39,12 @@ def read_focal(path: Path) -> FocalGuess:
     Raises CalibrationError for a file without one.
     """
     try:
-        with Image.open(path) as image:
+        content = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
+        with Image.open(io.BytesIO(content)) as image:
             found = image.getexif().get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH_35MM)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as cause:
+    except Exception as cause:  # a damaged block fails in any way
         raise CalibrationError(f"{path}: its EXIF block cannot be read: {cause}") from cause
-    if not isinstance(found, int | float) or found <= 0:
+    if not isinstance(found, int | float) or not 0 < found < math.inf:
         raise CalibrationError(
             f"{path}: no 35 mm focal length in its EXIF block; give --camera f=0.8w or fov=65 instead"
         )

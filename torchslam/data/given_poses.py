@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import struct
 from collections import Counter
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchslam import regular_file
 from torchslam.data.association import nearest
 from torchslam.data.calibration import Calibration
 from torchslam.data.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
@@ -36,6 +37,7 @@ MODEL_NAMES = {
     8: "SIMPLE_RADIAL_FISHEYE",
     9: "RADIAL_FISHEYE",
 }
+_MAX_BYTES = 1 << 30
 _POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 
@@ -87,7 +89,7 @@ def read_poses(path: str | Path) -> GivenPoses:
     Raises TrajectoryError or CalibrationError naming the file.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
         if (path / TRANSFORMS).is_file():
             return _read_transforms(path / TRANSFORMS)
         for name in ("images.bin", "images.txt"):
@@ -165,8 +167,9 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
 
 
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
-    images, data = [], path.read_bytes()
+    images = []
     try:
+        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
         at = 8
         for _ in range(count):
@@ -175,7 +178,7 @@ def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
             (points,) = struct.unpack_from("<Q", data, end + 1)
             images.append((data[at + 64 : end].decode(), numbers))
             at = end + 9 + _POINT_BYTES * points
-    except (struct.error, ValueError) as cause:
+    except (OSError, struct.error, ValueError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not COLMAP's images: {cause}") from cause
     return images
 
@@ -183,7 +186,7 @@ def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
 def _binary_camera(path: Path) -> Calibration:
     """The single camera of a cameras.bin."""
     try:
-        data = path.read_bytes()
+        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
@@ -202,15 +205,15 @@ def _binary_camera(path: Path) -> Calibration:
 def _read_transforms(path: Path) -> GivenPoses:
     """Frames as nerfstudio, instant-ngp and the first NeRF write them; a world that was moved stays as it is."""
     try:
-        content: Any = json.loads(read_text(path, TrajectoryError))
+        content: Any = regular_file.parse_json(read_text(path, TrajectoryError, regular_file.JSON_BYTES))
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
         T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64)
-    except (ValueError, KeyError, TypeError, RecursionError) as cause:
+    except (ValueError, KeyError, TypeError, RuntimeError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
-    if not bool(((R @ R.mT - torch.eye(3, dtype=R.dtype)).abs() < _ORTHOGONAL).all()):
+    if not bool(T_wc.isfinite().all() & ((R @ R.mT - torch.eye(3, dtype=R.dtype)).abs() < _ORTHOGONAL).all()):
         raise TrajectoryError(f"{path}: a transform_matrix that is no rotation and translation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it

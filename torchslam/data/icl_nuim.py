@@ -15,6 +15,7 @@ from torchslam.data.folder import DEFAULT_RATE
 from torchslam.data.frame_names import find_frames
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.presets import PRESETS
+from torchslam.data.text_file import parse_count
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.errors import SequenceError
 from torchslam.values import Trajectory
@@ -37,7 +38,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
     folder = Path(path)
     rate = rate or DEFAULT_RATE
     found = find_frames(folder / "rgb")
-    unnumbered = [file for file in found.frames if not file.stem.isdecimal()]
+    unnumbered = [file for file in found.frames if parse_count(file.stem) is None]
     if unnumbered:
         raise SequenceError(f"{unnumbered[0]}: frames of ICL-NUIM are named by their number")
     entries = [ImageEntry(int(file.stem) / rate, file, str(file)) for file in found.frames]

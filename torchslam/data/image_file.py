@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,11 +14,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchslam import regular_file
 from torchslam.errors import FrameError
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
-
-
+WIDTH, HEIGHT = 256, 257  # tags of a TIFF
 AS_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
 """An image file above this size is not read."""
@@ -46,14 +48,9 @@ def read_pixels(path: str | Path, where: str) -> np.ndarray:
 
 def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     try:
-        size = Path(path).stat().st_size
-        data = Path(path).read_bytes() if size <= MAX_BYTES else b""
+        data = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
-    if size > MAX_BYTES:
-        raise FrameError(
-            f"{where}: {path} has {size} bytes, more than the {MAX_BYTES} of an image that is read"
-        )
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
     image = decode_pixels(data, flags)
@@ -69,7 +66,7 @@ def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
         return None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # a header that promises more pixels than OpenCV takes
+    except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
         return None
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
@@ -84,7 +81,9 @@ def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
     """(H, W) uint8, or uint16 of which `bits` carry something -> (1, 1, H, W) float32 in [0, 1]."""
     if grey.dtype == np.uint16:
         white = (1 << bits) - 1 if bits > 8 else 65535
-        return torch.from_numpy(grey.astype(np.float32) / white).clamp_(max=1.0)[None, None]
+        floats = grey.astype(np.float32)
+        floats /= white  # in place: of a large image one copy less
+        return torch.from_numpy(floats).clamp_(max=1.0)[None, None]
     return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
 
 
@@ -94,14 +93,31 @@ def bgr_to_tensor(image: np.ndarray) -> Tensor:
 
 
 def _promised_pixels(data: bytes) -> int:
-    """How many pixels a header promises; 0 where that is left to the decoder's own limit."""
+    """How many pixels a header promises, in all its pages; more than are decoded where it does not say."""
+    if data.startswith((b"II*\0", b"MM\0*")):
+        return _tiff_pixels(data)
     try:
-        with Image.open(io.BytesIO(data)) as image:
-            return image.width * image.height
-    except Image.DecompressionBombError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images: these have their limit
+            with Image.open(io.BytesIO(data)) as image:
+                return image.width * image.height
+    except Exception:  # a damaged header fails in any way
         return MAX_PIXELS + 1
-    except Exception:  # a damaged header fails in any way, and a format may be one that only OpenCV knows
-        return 0
+
+
+def _tiff_pixels(data: bytes) -> int:
+    """Of the first page of a TIFF: Pillow does not open all kinds that OpenCV reads. Source: TIFF 6.0, section 2."""
+    order: Literal["little", "big"] = "little" if data.startswith(b"II") else "big"
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], order)
+
+    start = number(4, 4)
+    sides = {WIDTH: 0, HEIGHT: 0}
+    for at in range(start + 2, start + 2 + 12 * number(start, 2), 12):
+        if number(at, 2) in sides:  # entries: tag, type (3: two bytes, 4: four), count, value
+            sides[number(at, 2)] = number(at + 8, 2 if number(at + 2, 2) == 3 else 4)
+    return sides[WIDTH] * sides[HEIGHT] or MAX_PIXELS + 1
 
 
 def _is_truncated(data: bytes) -> bool:

@@ -103,20 +103,22 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
 def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
     """(width, height) that most of the first three readable images have, since the first may be the odd one, and how
     many of their bits are used: of 16, what the brightest pixel of some images all along needs."""
-    images: list[np.ndarray] = []
+    sizes: list[tuple[int, int]] = []
     failures: list[FrameError] = []
+    bits = 8
+    is_deep = False
     for entry in entries:
         try:
-            images.append(read_pixels(entry.path, entry.where))
+            image = read_pixels(entry.path, entry.where)
+            sizes.append((image.shape[1], image.shape[0]))
+            bits, is_deep = max(bits, bit_depth([image])), is_deep or image.dtype == np.uint16
         except FrameError as failure:
             failures.append(failure)
-        if len(images) == 3 or len(failures) == ATTEMPTS:
+        if len(sizes) == 3 or len(failures) == ATTEMPTS:
             break
-    if not images:
+    if not sizes:
         raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
-    size = Counter((image.shape[1], image.shape[0]) for image in images).most_common(1)[0][0]
-    if any(image.dtype == np.uint16 for image in images):
-        for entry in entries[:: max(1, len(entries) // SAMPLES)]:
-            with contextlib.suppress(FrameError):  # said when the frame is read
-                images.append(read_pixels(entry.path, entry.where))
-    return size, bit_depth(images)
+    for entry in entries[:: max(1, len(entries) // SAMPLES)] if is_deep else ():
+        with contextlib.suppress(FrameError):  # said when the frame is read
+            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where)]))
+    return Counter(sizes).most_common(1)[0][0], bits

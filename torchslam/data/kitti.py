@@ -15,6 +15,7 @@ from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.frame_names import find_frames
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import numbered_lines, parse_floats
+from torchslam.data.trajectory_file import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.values import Trajectory
 
@@ -83,7 +84,7 @@ def _read_poses(path: Path, times: Tensor, offset_x: float) -> Trajectory | None
     T_w0[:, :3] = rows.view(-1, 3, 4)
     T_0c = torch.eye(4, dtype=torch.float64)
     T_0c[0, 3] = -offset_x
-    return Trajectory(times, T_w0 @ T_0c)
+    return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
 
 def _read_rows(path: Path, columns: int, error: type[SequenceError] | type[TrajectoryError]) -> Tensor:

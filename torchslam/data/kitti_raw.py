@@ -19,6 +19,7 @@ from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.frame_names import find_frames
 from torchslam.data.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.text_file import check_later, numbered_lines, parse_floats
+from torchslam.data.trajectory_file import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.values import Trajectory
@@ -132,7 +133,8 @@ def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajector
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
     times = _read_times(drive / "oxts" / "timestamps.txt", TrajectoryError)
     T_wi, kept = _read_packets(packets, times)
-    return Trajectory(torch.tensor(kept, dtype=torch.float64), T_wi @ se3_inverse(T_ci))
+    T_wc = checked_poses(T_wi @ se3_inverse(T_ci), packets)
+    return Trajectory(torch.tensor(kept, dtype=torch.float64), T_wc)
 
 
 def _read_rigid(path: Path) -> Tensor:

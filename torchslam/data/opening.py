@@ -48,9 +48,12 @@ def open_sequence(
     if fps is not None and not 0 < fps < math.inf:
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
     given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
-    sequence = _open(str(path), given, fps)
-    if mask is not None:
-        sequence = Masked(sequence, mask)
+    try:
+        sequence = _open(str(path), given, fps)
+        if mask is not None:
+            sequence = Masked(sequence, mask)
+    except OSError as cause:  # a folder that may not be listed, a name that is too long
+        raise SequenceError(f"{cause.filename or path}: cannot be read: {cause.strerror or cause}") from cause
     sequence = cut(sequence, start, stop)
     if fps is not None:
         sequence = thin(sequence, fps)

@@ -217,7 +217,8 @@ class Sequence(ABC):
 
     def _describe_camera(self) -> str:
         if self._camera is None:
-            return "missing: --camera gives it"
+            decides = "the images decide, unless --camera says it"
+            return f"missing: {decides if self.known_length is not None else '--camera gives it'}"
         numbers = " ".join(f"{number:.6g}" for number in self._camera.params.tolist())
         guessed = " (guessed)" if self.calibrated is Calibrated.GUESSED else ""
         return f"{self._camera.model} {numbers}{guessed}"

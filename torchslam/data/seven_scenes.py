@@ -16,6 +16,7 @@ from torchslam.data.frame_names import match_pattern
 from torchslam.data.image_sequence import ImageSequence
 from torchslam.data.presets import PRESETS
 from torchslam.data.text_file import numbered_lines, parse_floats
+from torchslam.data.trajectory_file import checked_poses
 from torchslam.errors import TrajectoryError
 from torchslam.values import Trajectory
 
@@ -71,4 +72,4 @@ def _read_pose(path: Path) -> Tensor | None:
     # The nearest rotation: poses are printed with few digits.
     U, _, Vh = torch.linalg.svd(R)
     T_wc[:3, :3] = U @ Vh
-    return T_wc
+    return checked_poses(T_wc, path)

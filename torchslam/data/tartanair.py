@@ -16,6 +16,7 @@ from torchslam.data.frame_names import find_frames
 from torchslam.data.image_sequence import ImageSequence
 from torchslam.data.presets import PRESETS
 from torchslam.data.text_file import numbered_lines, parse_floats
+from torchslam.data.trajectory_file import checked_poses
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.values import Trajectory
@@ -67,4 +68,5 @@ def _read_poses(path: Path, times: list[float]) -> Trajectory:
     table = torch.tensor(rows, dtype=torch.float64)
     quaternions = table[:, 3:] / table[:, 3:].norm(dim=-1, keepdim=True)
     R = matrix_from_quaternion(quaternions) @ torch.tensor(AXES, dtype=torch.float64)
-    return Trajectory(torch.tensor(times, dtype=torch.float64), rigid(R, table[:, :3]))
+    T_wc = checked_poses(rigid(R, table[:, :3]), path)
+    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)

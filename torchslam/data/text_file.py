@@ -7,20 +7,27 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchslam import regular_file
 from torchslam.errors import TorchslamError
 
-MAX_BYTES = 1 << 28
+MAX_BYTES = 1 << 27
 """A text file above this size is not read: lists and poses of a million frames are smaller."""
+MAX_DIGITS = 19
+"""Of a whole number: nanoseconds since 1970 have 19, until 2286."""
+MAX_LINE = 1 << 16
+"""Characters of a line of numbers."""
 
 
-def read_text(path: str | Path, error: type[TorchslamError]) -> str:
-    """The text of a file. Raises `error` where it does not exist, is not text or is too large."""
+def read_text(path: str | Path, error: type[TorchslamError], limit: int | None = None) -> str:
+    """The text of a file. Raises `error` where it does not exist, is not text or is too large.
+
+    limit: bytes; None: MAX_BYTES
+    """
     try:
-        size = Path(path).stat().st_size
-        if size > MAX_BYTES:
-            raise error(f"{path}: has {size} bytes, more than the {MAX_BYTES} of a text that is read")
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as cause:
+        return regular_file.read_text(path, MAX_BYTES if limit is None else limit, "a text that is read")
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    except ValueError as cause:
         raise error(f"{path}: cannot be read: {cause}") from cause
 
 
@@ -37,6 +44,8 @@ def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tu
 
 def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[float]:
     """The finite numbers of a line, apart by spaces or commas. Raises `error` at `where` otherwise."""
+    if len(text) > MAX_LINE:
+        raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
     numbers = []
     for word in text.replace(",", " ").split():
         try:
@@ -47,6 +56,11 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
             raise error(f"{where}: `{word}` is not a finite number")
         numbers.append(number)
     return numbers
+
+
+def parse_count(text: str) -> int | None:
+    """A whole number from 0 on, of at most 19 digits; None for anything else."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
 
 
 def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:

@@ -5,12 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchslam.data.text_file import check_later, numbered_lines, parse_floats
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid
 from torchslam.values import Trajectory
 
+ORTHOGONAL = 0.05
+"""How far R R^T of a pose may be from the identity: some are printed with few digits."""
+FARTHEST = 1e12
+"""Of a position: metres to beyond Neptune."""
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -37,7 +42,19 @@ def read_trajectory(path: str | Path) -> Trajectory:
         raise TrajectoryError(f"{path}: no poses")
     table = torch.tensor(rows, dtype=torch.float64)
     quaternions = table[:, 4:] / table[:, 4:].norm(dim=-1, keepdim=True)
-    return Trajectory(table[:, 0].contiguous(), rigid(matrix_from_quaternion(quaternions), table[:, 1:4]))
+    T_wc = checked_poses(rigid(matrix_from_quaternion(quaternions), table[:, 1:4]), path)
+    return Trajectory(table[:, 0].contiguous(), T_wc)
+
+
+def checked_poses(T_wc: Tensor, path: Path | str) -> Tensor:
+    """Poses (..., 4, 4) as they are. Raises TrajectoryError for one that is no rotation, or is out of this world."""
+    R, positions_w = T_wc[..., :3, :3], T_wc[..., :3, 3]
+    error = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs()
+    if not bool((error < ORTHOGONAL).all()):  # not so NaN either
+        raise TrajectoryError(f"{path}: a pose that is no rotation and translation")
+    if not bool((positions_w.abs() < FARTHEST).all()):
+        raise TrajectoryError(f"{path}: a position farther off than {FARTHEST:g}")
+    return T_wc
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:

@@ -11,14 +11,18 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.image_file import bgr_to_tensor, grey_to_tensor
+from torchslam.data.image_file import MAX_PIXELS, bgr_to_tensor, grey_to_tensor
+from torchslam.data.mp4_claims import claimed_samples
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.regular_file import check_regular
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
 LOOKS_FOR = f"a video ({', '.join(sorted(SUFFIXES))})"
+MP4 = (".mp4", ".mov", ".m4v", ".3gp")
+MAX_BYTES = 1 << 40
 MAX_FRAMES = 2_000_000
 """Frames of a video that are counted: 18 hours at 30 a second."""
 
@@ -33,7 +37,15 @@ class VideoSequence(Sequence):
     def __init__(self, path: Path, camera: GivenCamera | None) -> None:
         """Raises SequenceError for a file that holds no video, CalibrationError for a camera that does not fit."""
         self._path = path
+        _check(path)
         self._rewind()
+        width, height = (
+            self._capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        if width * height > MAX_PIXELS:
+            raise SequenceError(
+                f"{path}: frames of {width:.0f}x{height:.0f}, more than the {MAX_PIXELS} pixels that are read"
+            )
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         times, notes = self._read_times(), []
         rate = self._capture.get(cv2.CAP_PROP_FPS)
@@ -120,6 +132,20 @@ def matches(path: str) -> bool:
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequence:
     """A video file; its times are its own. Raises SequenceError or CalibrationError."""
     return VideoSequence(Path(path), camera)
+
+
+def _check(path: Path) -> None:
+    """Raises SequenceError for what is no regular file, and for an MP4 that claims more frames than it has bytes."""
+    try:
+        check_regular(path, MAX_BYTES, "a video that is read")
+        claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
+        size = path.stat().st_size
+    except OSError as cause:
+        raise SequenceError(f"{path}: cannot be read: {cause.strerror}") from cause
+    if claimed > size:
+        raise SequenceError(
+            f"{path}: damaged: its index speaks of {claimed} frames, the file has {size} bytes"
+        )
 
 
 def _rising(times: list[float]) -> list[int]:

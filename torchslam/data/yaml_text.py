@@ -22,7 +22,9 @@ def yaml_value(text: str, key: str) -> str | None:
         return line.strip("\"'")
     block = _block(below, len(found[1]))
     data = yaml_value(block, "data")
-    return " ".join(re.findall(r"^\s*-\s*([^\s:]+)\s*$", block, re.MULTILINE)) if data is None else data
+    return (
+        " ".join(re.findall(r"^[ \t]*-[ \t]*([^\s:]+)[ \t]*$", block, re.MULTILINE)) if data is None else data
+    )
 
 
 def yaml_numbers(text: str, keys: tuple[str, ...], where: str) -> list[float] | None:

@@ -40,20 +40,24 @@ class Images:
         return image if self._undistort is None else self._undistort(image)
 
 
-def open_images(source: str, scene: Scene, undistort: bool = False) -> Images:
+def open_images(source: str, scene: Scene, undistort: bool = False, fps: float | None = None) -> Images:
     """The images that the frames of a scene are from, at the size that the run saw them in.
+
+    fps: at which the run read them, which is the time of images that have none
 
     They are found by their times: the run may have read a part of the sequence.
     Raises ResultsError where it is gone or another one.
     """
+    times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
     try:
         sequence = open_sequence(source)
+        if fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
+            sequence = open_sequence(source, fps=fps)
         if sequence.size != scene.camera.size:
             sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
     except SequenceError as error:
         raise ResultsError(f"the sequence of this run cannot be read: {error}; {WITHOUT}") from None
     row_at = {time: row for row, time in enumerate(sequence.timestamps.tolist())}
-    times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
     if not all(time in row_at for time in times.values()):
         raise ResultsError(
             f"{source}: not the sequence of this run, whose frames have other times; {WITHOUT}"

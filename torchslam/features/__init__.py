@@ -9,7 +9,7 @@ from torch import nn
 from torchslam.errors import ConfigError
 from torchslam.features.bits import hamming, pack_bits, unpack_bits
 from torchslam.features.learned import ALIKED, XFeat
-from torchslam.features.matching import match, match_projected
+from torchslam.features.matching import expand_runs, match, match_pairs, match_projected
 from torchslam.features.opencv_orb import OpenCVORB
 from torchslam.features.orb import ORB
 from torchslam.features.simulated import SimulatedFeatures
@@ -21,9 +21,11 @@ __all__ = [
     "OpenCVORB",
     "SimulatedFeatures",
     "XFeat",
+    "expand_runs",
     "extractor",
     "hamming",
     "match",
+    "match_pairs",
     "match_projected",
     "pack_bits",
     "unpack_bits",

@@ -21,8 +21,10 @@ from torchslam.errors import ConfigError
 from torchslam.features.corners import soft_peak
 from torchslam.features.masking import only_where
 from torchslam.features.orb import check_images
+from torchslam.regular_file import check_regular
 from torchslam.values import Features
 
+MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0
 
 
@@ -154,8 +156,9 @@ def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tens
 def _read(weights: str | Path) -> dict[str, Tensor]:
     """The tensors of a safetensors file."""
     try:
+        check_regular(weights, MAX_BYTES, "a file of weights")
         return load_file(str(weights))
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise ConfigError(f"{weights}: cannot read the weights ({error})") from error
 
 

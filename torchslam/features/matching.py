@@ -28,13 +28,14 @@ _BAND = 32.0  # pixels: height of the bands of keypoints that a window search lo
 
 
 class _Nearest(NamedTuple):
-    """For each of N1 rows its nearest (B, N1) column, the distances to it and to the second nearest, and whether no
-    other row is nearer to that column."""
+    """For each of N1 rows its nearest (B, N1) column, the distance to it, whether there is one that may match, whether
+    no other row is nearer to that column, and the distance to the second nearest, where it was asked for."""
 
     column: Tensor
     distance: Tensor
-    second: Tensor
+    found: Tensor
     mutual: Tensor
+    second: Tensor | None
 
 
 @full_precision
@@ -66,28 +67,25 @@ def match(
     batch, rows, columns = len(descriptors_1), descriptors_1.shape[1], descriptors_2.shape[1]
     if rows == 0 or columns == 0:
         return _no_matches(batch, rows, descriptors_1.device)
-    similarity = None
+    similarity, masks = None, (features_1.mask, features_2.mask, allowed)
     if descriptors_1.dtype == torch.uint8:
-        nearest = _nearest_bits(descriptors_1, descriptors_2, features_1.mask, features_2.mask, allowed)
+        nearest = _nearest_bits(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
         if temperature is not None:
             similarity = -hamming(descriptors_1, descriptors_2).float()
     else:
         similarity = descriptors_1 @ descriptors_2.mT
-        nearest = _nearest_floats(similarity, features_1.mask, features_2.mask, allowed)
-    mask = features_1.mask & features_2.mask.any(1, keepdim=True)
-    if allowed is not None:
-        mask = mask & (allowed & features_2.mask[:, None, :]).any(2)
+        nearest = _nearest_floats(similarity, *masks, with_second=ratio is not None)
+    mask = nearest.found
     if max_distance is not None:
         mask = mask & (nearest.distance <= max_distance)
-    if ratio is not None:
+    if ratio is not None and nearest.second is not None:
         mask = mask & (nearest.distance < ratio * nearest.second)
     if mutual:
         mask = mask & nearest.mutual
     mask = _one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
     weights = None
     if temperature is not None and similarity is not None:
-        logits = similarity / temperature
-        weights = _dual_softmax(logits, nearest.column, features_1.mask, features_2.mask, allowed) * mask
+        weights = _dual_softmax(similarity / temperature, nearest.column, *masks) * mask
     return _matches(nearest.column, nearest.distance, mask, weights)
 
 
@@ -148,6 +146,36 @@ def match_projected(
     return _matches(local, distance, _one_to_one(local, distance.detach(), accepted, columns))
 
 
+@full_precision
+def match_pairs(
+    descriptors_1: Tensor, descriptors_2: Tensor, rows: Tensor, columns: Tensor, max_distance: float
+) -> tuple[Tensor, Tensor]:
+    """Who of some pairs are each other's nearest: rows (m,), ascending, and columns (m,).
+
+    descriptors_1, descriptors_2: (N1, 32) uint8 or (N1, D) unit-length floats, likewise (N2, ...)
+    rows, columns: (P,), (P,) the pairs that may match; max_distance: Hamming bits, or 1 - cosine for floats
+
+    Raises ValueError if the descriptors do not go together.
+    """
+    _check_descriptors(descriptors_1[None], descriptors_2[None])
+    distances = _pair_distances(_take(descriptors_1, rows), _take(descriptors_2, columns))
+    near = torch.nonzero(distances <= max_distance).squeeze(1)
+    rows, columns, distances = _take(rows, near), _take(columns, near), _take(distances, near)
+    column, found, _ = _best_of_pairs(rows, columns, distances, None, len(descriptors_1), None)
+    row, _, _ = _best_of_pairs(columns, rows, distances, None, len(descriptors_2), None)
+    kept = torch.nonzero(found).squeeze(1)
+    kept = kept[row[column[kept]] == kept]
+    return kept, column[kept]
+
+
+def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
+    counts = ends - starts
+    run = torch.repeat_interleave(counts)
+    shift = starts - (counts.cumsum(0) - counts)
+    return run, torch.arange(run.shape[0], device=run.device) + _take(shift, run)
+
+
 def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
     """(B, N1, N2) bool, the pairs that may match."""
     possible = mask_1[:, :, None] & mask_2[:, None, :]
@@ -155,7 +183,12 @@ def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
 
 
 def _nearest_bits(
-    descriptors_1: Tensor, descriptors_2: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
+    descriptors_1: Tensor,
+    descriptors_2: Tensor,
+    mask_1: Tensor,
+    mask_2: Tensor,
+    allowed: Tensor | None,
+    with_second: bool,
 ) -> _Nearest:
     """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
     keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
@@ -176,21 +209,25 @@ def _nearest_bits(
         return (bits // 2 - (key.to(torch.int64) >> index_bits)).float()
 
     best, column_best = keys.amax(2), keys.amax(1)
-    column = highest - (best.to(torch.int64) & highest)
-    keys.scatter_(2, column[..., None], 2 * masked)
-    second = distance(keys.amax(2))
-    second = torch.where(second > bits, torch.inf, second)
-    nearest = distance(best)
-    return _Nearest(column, nearest, second, nearest <= distance(column_best).gather(1, column))
+    column, nearest, second = highest - (best.to(torch.int64) & highest), distance(best), None
+    if with_second:
+        keys.scatter_(2, column[..., None], 2 * masked)
+        second = distance(keys.amax(2))
+        second = torch.where(second > bits, torch.inf, second)
+    mutual = nearest <= distance(column_best).gather(1, column)
+    return _Nearest(column, nearest, nearest <= bits, mutual, second)
 
 
-def _nearest_floats(similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> _Nearest:
+def _nearest_floats(
+    similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None, with_second: bool
+) -> _Nearest:
     """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
     values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
     best, column = values.max(2)
     mutual = best >= values.amax(1).gather(1, column)
-    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2)
-    return _Nearest(column, 1 - similarity.gather(2, column[..., None])[..., 0], second, mutual)
+    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2) if with_second else None
+    nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
+    return _Nearest(column, nearest, best > -torch.inf, mutual, second)
 
 
 def _dual_softmax(
@@ -233,11 +270,8 @@ def _window_pairs(
         torch.searchsorted(keys, key(bands, (pixels[..., 0] + sign * radius)[..., None]), right=sign > 0)
         for sign in (-1, 1)
     )
-    counts = torch.where(used, right - left, 0).flatten()
-    run = torch.repeat_interleave(counts)
-    starts = left.flatten() - (counts.cumsum(0) - counts)
-    row = torch.div(run, spans, rounding_mode="floor")
-    column = _take(order, torch.arange(run.shape[0], device=run.device) + _take(starts, run))
+    run, place = expand_runs(left.flatten(), torch.where(used, right, left).flatten())
+    row, column = torch.div(run, spans, rounding_mode="floor"), _take(order, place)
     dx, dy = (
         _take(keypoints[..., k].flatten(), column) - _take(pixels[..., k].flatten(), row) for k in (0, 1)
     )
@@ -263,7 +297,7 @@ def _pair_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
 
 
 def _best_of_pairs(
-    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor, rows: int, ratio: float | None
+    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor | None, rows: int, ratio: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of each row the nearest column, whether it passes the ratio test, and its distance (with its graph): (rows,).
 
@@ -284,7 +318,7 @@ def _best_of_pairs(
     distance = torch.where(found, nearest, torch.inf)
     if distances.requires_grad:
         distance = torch.where(found, distances[best_pair], torch.inf)
-    if ratio is not None:
+    if ratio is not None and scales is not None:
         same = (_take(scales, column) / _take(scales[best], row) - 1).abs() < 0.05
         rival_row, rival_value = _where(same & ~chosen, row, values)
         second = _lowest(rival_row, rival_value, rows)

@@ -174,15 +174,15 @@ class Camera:
         distorted = self._distortion.distort(normalized, coefficients)
         inverse_depth = torch.where(valid, 1 / points_c[..., 2].masked_fill(~valid, 1.0), 0.0)
         scale = focal * inverse_depth[..., None]
-        if self.model == "pinhole":
-            J_normalized = torch.diag_embed(scale)
-            J_depth = -scale * normalized
-        else:
-            J_normalized = self._distortion.slope(normalized, coefficients) * scale[..., None]
-            J_depth = -(
-                J_normalized[..., 0] * normalized[..., :1] + J_normalized[..., 1] * normalized[..., 1:]
-            )
-        return self._to_pixels(distorted, valid), valid, torch.cat((J_normalized, J_depth[..., None]), dim=-1)
+        slope = self._distortion.slope(normalized, coefficients) * scale[..., None]
+        (a, b), (c, d), (x, y) = (
+            slope[..., 0, :].unbind(-1),
+            slope[..., 1, :].unbind(-1),
+            normalized.unbind(-1),
+        )
+        rows = torch.stack((a, b, -(a * x + b * y), c, d, -(c * x + d * y)))
+        J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
+        return self._to_pixels(distorted, valid), valid, J
 
     def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Pixels as from `project`, with the analytic derivatives with respect to points and parameters.

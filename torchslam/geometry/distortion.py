@@ -68,7 +68,12 @@ def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
     determinant = a * d - b * c
     determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
     x, y = residual.unbind(-1)
-    return -torch.stack((d * x - b * y, a * y - c * x), dim=-1) / determinant[..., None]
+    return -_beside(d * x - b * y, a * y - c * x) / determinant[..., None]
+
+
+def _beside(*columns: Tensor) -> Tensor:
+    """(..., n) of n tensors (...), each in one piece of memory: whoever reads or writes one of them streams."""
+    return torch.stack(columns).movedim(0, -1)
 
 
 # --- no distortion ---
@@ -106,8 +111,8 @@ def _radial_tangential(xy: Tensor, k: Tensor) -> Tensor:
     p1, p2 = k[..., 2], k[..., 3]
     r2, xy2 = x * x + y * y, 2 * x * y
     radial = _radial_factor(r2, k)
-    return torch.stack(
-        (x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)), dim=-1
+    return _beside(
+        x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)
     )
 
 
@@ -121,7 +126,7 @@ def _radial_tangential_slope(xy: Tensor, k: Tensor) -> Tensor:
     cross = slope * x * y + 2 * (p1 * x + p2 * y)
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return torch.stack((xx, cross, cross, yy), dim=-1).unflatten(-1, (2, 2))
+    return _beside(xx, cross, cross, yy).unflatten(-1, (2, 2))
 
 
 def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
@@ -131,8 +136,8 @@ def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
     r2 = xx + yy
     r4 = r2 * r2
     r6 = r4 * r2
-    rows = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
-    return torch.stack(rows, dim=-1).unflatten(-1, (2, 5))
+    columns = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
+    return _beside(*columns).unflatten(-1, (2, 5))
 
 
 def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:

@@ -59,18 +59,20 @@ def triangulate(
     camera_1: Camera,
     camera_2: Camera,
     mask: Tensor | None = None,
+    normalized: tuple[Tensor, Tensor] | None = None,
 ) -> Triangulation:
     """Triangulates matches of two views, with the least squared error in undistorted coordinates.
 
     T_1w, T_2w: (..., 4, 4); pixels_1, pixels_2: (..., N, 2); mask: (..., N). Rows outside the mask may hold
-    anything. Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject
-    by `angles`, `depths` and `errors`.
+    anything. normalized: the pixels undistorted, twice (..., N, 2), where the caller has them already.
+    Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject by `angles`,
+    `depths` and `errors`.
     Source: Lindstrom, "Triangulation made easy", 2010 (two iterations, exact to far below the noise).
     """
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     mask = finite if mask is None else mask & finite
-    x_1 = camera_1.normalize(torch.where(mask[..., None], pixels_1, 0.0))
-    x_2 = camera_2.normalize(torch.where(mask[..., None], pixels_2, 0.0))
+    x_1, x_2 = normalized or (camera_1.normalize(pixels_1), camera_2.normalize(pixels_2))
+    x_1, x_2 = (torch.where(mask[..., None], x, 0.0) for x in (x_1, x_2))
     T_21 = T_2w @ se3_inverse(T_1w)
     R_21, t_21 = T_21[..., :3, :3], T_21[..., :3, 3]
     x_1, x_2 = correct_matches(skew(t_21) @ R_21, x_1, x_2)

@@ -6,7 +6,7 @@ match would have to move in both images together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
@@ -29,11 +29,12 @@ from torchslam.geometry.ransac import (
     gather_rows,
     pad_groups,
     sample_minimal,
-    truncated_rows,
     truncated_score,
 )
+from torchslam.geometry.robust import Kernel, robustify
 
 _CANDIDATES = 4  # essential matrices of each round that are optimised
+_MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras
 _FEW_CANDIDATES = 2  # homographies and rotations
 _ITERATIONS = 4  # of their local optimisation
 
@@ -55,14 +56,25 @@ class TwoViews:
 
     @staticmethod
     def of(
-        pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera, threshold: float, mask: Tensor
+        pixels_1: Tensor,
+        pixels_2: Tensor,
+        camera_1: Camera,
+        camera_2: Camera,
+        threshold: float,
+        mask: Tensor,
+        weights: Tensor | None,
     ) -> TwoViews:
         x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
         scale_1, scale_2 = (
             camera.pixel_scale(x).prod(-1).sqrt() / threshold
             for camera, x in ((camera_1, x_1), (camera_2, x_2))
         )
-        return TwoViews(x_1, x_2, scale_1, scale_2, mask)
+        views = TwoViews(x_1, x_2, scale_1, scale_2, mask)
+        return views if weights is None else views.in_units(torch.where(mask, weights, 1.0).rsqrt())
+
+    def in_units(self, thresholds: Tensor) -> TwoViews:
+        """The same with thresholds so many times as large. (B, N) or (B, 1)."""
+        return replace(self, scale_1=self.scale_1 / thresholds, scale_2=self.scale_2 / thresholds)
 
     def select(self, rows: Tensor) -> TwoViews:
         """Some of the problems."""
@@ -169,19 +181,35 @@ def _retract_essential(state: State, step: Tensor) -> State:
 
 
 def fit_essential(
-    views: TwoViews, R: Tensor, t: Tensor, iterations: int, width: float = 1.0
+    views: TwoViews,
+    R: Tensor,
+    t: Tensor,
+    iterations: int,
+    scales: Tensor,
+    kernel: Kernel = "truncated",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their truncated costs (B, K)."""
+    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
+
+    scales: (B,) of the kernel, in thresholds
+    """
 
     def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _fit_essential_part(iterations, width, *part)
+        return _fit_essential_part(iterations, kernel, *part)
 
-    R, t, cost = in_parts(fit, t.shape[1] * 6 * views.mask.shape[1], R, t, *views.epipolar, views.mask)
+    numbers = t.shape[1] * 6 * views.mask.shape[1]
+    R, t, cost = in_parts(fit, numbers, R, t, *views.epipolar, views.mask, scales)
     return R, t, cost
 
 
 def _fit_essential_part(
-    iterations: int, width: float, R: Tensor, t: Tensor, constraint: Tensor, variance: Tensor, mask: Tensor
+    iterations: int,
+    kernel: Kernel,
+    R: Tensor,
+    t: Tensor,
+    constraint: Tensor,
+    variance: Tensor,
+    mask: Tensor,
+    scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     B, K = t.shape[:2]
     left_table, variance_table = _essential_tables(R.dtype, R.device)
@@ -198,8 +226,10 @@ def _fit_essential_part(
         rows = value.mul_(inverse)
         residual = rows[:, :, -1:]
         rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
-        used, cost = truncated_rows(residual.squeeze(2).square(), mask, width)
-        rows = rows.mul_(used[:, :, None]).view(B * K, 6, constraint.shape[-1])
+        robust = robustify(residual.squeeze(2).square(), kernel, scales[:, None, None])
+        cost = torch.where(mask[:, None], robust.rho, 0.0).sum(-1)
+        weight = torch.where(mask[:, None], robust.weight, 0.0).sqrt_()
+        rows = rows.mul_(weight[:, :, None]).view(B * K, 6, constraint.shape[-1])
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
@@ -217,29 +247,70 @@ def score_essential(views: TwoViews, E: Tensor) -> Tensor:
 
 
 def propose_essential(
-    views: TwoViews, count: int, generator: torch.Generator
+    views: TwoViews, count: int, generator: torch.Generator, in_front: bool
 ) -> tuple[State, Tensor, Tensor]:
-    """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support."""
+    """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support.
+
+    in_front: matches that lie behind a camera count as wrong
+    """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)
     x_1, x_2 = gather_rows(views.x_1, sample), gather_rows(views.x_2, sample)
     E, row = five_point(x_1.flatten(0, 1), x_2.flatten(0, 1))
-    E, valid = pad_groups(E.flatten(1), row // count, B, _CANDIDATES)
+    candidates = _MORE_CANDIDATES if in_front else _CANDIDATES
+    E, valid = pad_groups(E.flatten(1), row // count, B, candidates)
 
     def score(E: Tensor, rows: Tensor | None) -> Tensor:
         return score_essential(views if rows is None else views.rows(rows), E.unflatten(-1, (3, 3)))
 
-    best = best_models(score, E, valid, views.mask, _CANDIDATES, generator)
+    best = best_models(score, E, valid, views.mask, candidates, generator)
     R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
     # Padding has no pose; start it from the identity.
     R = torch.where(
         valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
     )
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
-    R, t, cost = fit_essential(views, R, t, _ITERATIONS)
+    R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(B))
+    if in_front:
+        R, t, cost = best_in_front(views, R, t)
     (R, t), cost = best_of((R, t), cost)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
+
+
+def twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """The four poses of one essential matrix. (B, 3, 3), (B, 3) -> (B, 4, 3, 3), (B, 4, 3)."""
+    turn = 2 * t[..., :, None] * t[..., None, :] - torch.eye(3, dtype=t.dtype, device=t.device)
+    return torch.stack((R, R, turn @ R, turn @ R), dim=1), torch.stack((t, -t, t, -t), dim=1)
+
+
+def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Which matches lie in front of both cameras, and their parallax in thresholds. Poses (B, K) -> (B, K, N) twice."""
+    ray_1 = views.h_1[:, None] @ R.mT
+    ray_2 = views.h_2[:, None].expand_as(ray_1)
+    normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
+    t_rows = t[:, :, None].expand_as(ray_1)
+    depth_1 = -(torch.linalg.cross(t_rows, ray_2, dim=-1) * normal).sum(-1)
+    depth_2 = -(torch.linalg.cross(t_rows, ray_1, dim=-1) * normal).sum(-1)
+    parallax = normal.norm(dim=-1) * torch.minimum(views.scale_1, views.scale_2)[:, None]
+    return (depth_1 > 0) & (depth_2 > 0), parallax
+
+
+def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the four poses of each essential matrix (B, K) the one of least truncated cost, and that cost (B, K).
+
+    Matches behind a camera count as wrong, but where their parallax is within the threshold.
+    """
+    B, K = t.shape[:2]
+    squared = sampson_squared(views, R, t)
+    R, t = (x.unflatten(0, (B, K)).flatten(1, 2) for x in twisted(R.flatten(0, 1), t.flatten(0, 1)))
+    ahead, parallax = ahead_and_parallax(views, R, t)
+    possible = (ahead | (parallax < 1)).unflatten(1, (K, 4)) & views.mask[:, None, None]
+    score = torch.where(possible, (1 - squared[:, :, None]).clamp_min(0.0), 0.0).sum(-1)
+    score, best = score.max(dim=-1)
+    rows = 4 * torch.arange(K, device=best.device) + best
+    R, t = gather_rows(R.flatten(2), rows).unflatten(-1, (3, 3)), gather_rows(t, rows)
+    return R, t, views.mask.sum(-1, keepdim=True) - score
 
 
 # --- homography and pure rotation ---

@@ -1,1 +1,41 @@
-"""SLAM as a module to train through."""
+"""A kit to train with through SLAM: clips of sequences, poses of clips, losses, and trainings that can be resumed."""
+
+from torchslam.learning.clip import ClipGraph, ClipLoss, ClipPoses, ClipSLAM, clip_loss, clip_mean
+from torchslam.learning.clips import Batches, Clip, Clips, Looking, collate, frames_in, parallax
+from torchslam.learning.losses import (
+    clip_reprojection,
+    epipolar_loss,
+    motion_difference,
+    path_length,
+    pose_errors,
+    pose_nll,
+    relative_ate,
+    reprojection_loss,
+)
+from torchslam.learning.training import Log, Training
+
+__all__ = [
+    "Batches",
+    "Clip",
+    "ClipGraph",
+    "ClipLoss",
+    "ClipPoses",
+    "ClipSLAM",
+    "Clips",
+    "Log",
+    "Looking",
+    "Training",
+    "clip_loss",
+    "clip_mean",
+    "clip_reprojection",
+    "collate",
+    "epipolar_loss",
+    "frames_in",
+    "motion_difference",
+    "parallax",
+    "path_length",
+    "pose_errors",
+    "pose_nll",
+    "relative_ate",
+    "reprojection_loss",
+]

@@ -1,13 +1,13 @@
 """SLAM of short clips as a module to train: images in, poses out, gradients back into whatever found the keypoints.
 
-The system decides what is discrete (which keypoints match, which frames are keyframes) without gradient. What it
-leaves behind is a least-squares problem whose pixels are read anew from the features, with their gradients; the poses
-are its minimiser, differentiated by the implicit function theorem.
+The system decides what is discrete (which keypoints match, which frames are keyframes) without gradient: it looks,
+once. What it leaves behind is a least-squares problem whose pixels are read anew from the features, with their
+gradients, as often as one likes; the poses are its minimiser, differentiated by the implicit function theorem.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -23,6 +23,33 @@ from torchslam.slam import SLAM
 from torchslam.solvers.graph import GraphSolution, solve
 from torchslam.values import Features, Frame
 from torchslam.world.history import RunGraph
+
+OnFailure = Literal["raise", "skip"] | float
+
+
+@dataclass(frozen=True)
+class ClipGraph:
+    """What the system decided about a clip of T frames, or about each of B clips; nothing in it has a gradient.
+
+    runs:    one per clip: its keyframes and points, and which keypoint of which frame saw which; None where no map
+             started
+    cameras: one per clip, float64
+    frames:  T
+    batched: whether this is of B clips, were it only one
+    """
+
+    runs: tuple[RunGraph | None, ...]
+    cameras: tuple[Camera, ...]
+    frames: int
+    batched: bool = False
+
+    @staticmethod
+    def stack(graphs: Sequence[ClipGraph]) -> ClipGraph:
+        """One of B clips of several of one clip each, all with as many frames."""
+        if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
+            raise ValueError("graphs to stack must be of one clip each, and of equally many frames")
+        runs, cameras = zip(*((graph.runs[0], graph.cameras[0]) for graph in graphs), strict=True)
+        return ClipGraph(runs, cameras, graphs[0].frames, batched=True)
 
 
 @dataclass(frozen=True)
@@ -62,12 +89,19 @@ def clip_loss(
     poses: ClipPoses,
     T_cw_groundtruth: Tensor,
     error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
-    on_failure: Literal["raise", "skip"] | float = "raise",
+    on_failure: OnFailure = "raise",
 ) -> ClipLoss:
-    """The mean over the clips of an error, and what became of the clips that have none.
+    """The mean over the clips of an error against the true poses, see `clip_mean`.
 
     T_cw_groundtruth: as `poses.T_cw`
-    error:      function of poses, true poses and mask, each with the dimensions of `poses`, to () or (B,)
+    error: function of poses, true poses and mask, each with the dimensions of `poses`, to () or (B,)
+    """
+    return clip_mean(poses, error(poses.T_cw, T_cw_groundtruth, poses.posed), on_failure)
+
+
+def clip_mean(poses: ClipPoses, errors: Tensor, on_failure: OnFailure = "raise") -> ClipLoss:
+    """The mean over the clips of their errors, () or (B,), and what became of the clips that have none.
+
     on_failure: "raise" raises ClipError with the reasons; "skip" leaves failed clips out, and raises ClipError if none
                 is left; with a number each of them costs that much, without gradient. A failed clip never counts as one
                 without error: a front end could learn to fail.
@@ -78,7 +112,7 @@ def clip_loss(
     if reasons and (on_failure == "raise" or (on_failure == "skip" and len(reasons) == len(poses.reason))):
         raise ClipError(f"{len(reasons)} of {len(poses.reason)} clips failed; {'; '.join(reasons)}")
     price = 0.0 if isinstance(on_failure, str) else float(on_failure)
-    errors = torch.where(poses.success, error(poses.T_cw, T_cw_groundtruth, poses.posed), price)
+    errors = torch.where(poses.success, errors, price)
     counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success
     return ClipLoss(errors.sum() / counted.sum(), poses.failures)
 
@@ -93,6 +127,13 @@ class ClipSLAM(nn.Module):
             poses = clip_slam(images, camera)
             clip_loss(poses, T_cw_groundtruth, on_failure=1.0).loss.backward()
             optimizer.step()
+
+    A call looks and poses. Where keypoints only move or are weighed anew while they learn, look once and keep what was
+    seen; then a step takes about a tenth of a second without the front end:
+
+        graph = clip_slam.look(images, camera)
+        ...
+        poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, features)
 
     extractor: module from images (B, 1, H, W) to Features with differentiable keypoints, such as
                ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; `train` would have their
@@ -113,42 +154,86 @@ class ClipSLAM(nn.Module):
         self.weigh = weigh
         self.config = config or Config()
 
-    def forward(self, images: Tensor, camera: Camera) -> ClipPoses:
-        """Run the system on a clip (T, 1, H, W) or on each of several clips (B, T, 1, H, W), floats in [0, 1].
+    def forward(self, images: Tensor, camera: Camera, graph: ClipGraph | None = None) -> ClipPoses:
+        """Poses of a clip (T, 1, H, W), or of each of several clips (B, T, 1, H, W), floats in [0, 1].
+
+        camera: of all, or with params (B, K) of each clip its own
+        graph:  what `look` saw of these images before; it looks anew if None
 
         The front end works where the images are, everything behind it where the camera is. World and unit are
         arbitrary, and without gradient: take a loss that does not depend on them, as `clip_loss`. A clip in which no
         map starts has no posed frame and a gradient of zero; `success` and `reason` tell. Raises ValueError for another
         shape, FrameError for images that have not the size that the camera has.
         """
-        if images.ndim == 5:
-            clips = [self._clip(clip, camera) for clip in images]
-            return ClipPoses(
-                torch.stack([clip.T_cw for clip in clips]),
-                torch.stack([clip.posed for clip in clips]),
-                torch.stack([clip.success for clip in clips]),
-                tuple(reason for clip in clips for reason in clip.reason),
-                tuple(graph for clip in clips for graph in clip.graphs),
-                tuple(solution for clip in clips for solution in clip.solutions),
-            )
-        if images.ndim != 4:
-            raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
-        return self._clip(images, camera)
+        features = self.extract(images)
+        graph = self.look(images, camera, features) if graph is None else graph
+        return self.pose(graph, features, camera)
 
-    def _clip(self, images: Tensor, camera: Camera) -> ClipPoses:
-        """The poses of one clip (T, 1, H, W)."""
+    def extract(self, images: Tensor) -> Features | list[Features]:
+        """What the front end finds in a clip, or in each of several, shapes as in `forward`."""
+        if images.ndim not in (4, 5):
+            raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
+        return [self.extractor(clip) for clip in images] if images.ndim == 5 else self.extractor(images)
+
+    @torch.no_grad()
+    def look(
+        self, images: Tensor, camera: Camera, features: Features | Sequence[Features] | None = None
+    ) -> ClipGraph:
+        """What the system makes of a clip or of several, without gradient: matches, keyframes, correspondences.
+
+        images, camera: as in `forward`; features: what `extract` finds in them, if it was asked before
+        """
+        seen = _per_clip(self.extract(images) if features is None else features)
+        clips, batched = (images, True) if images.ndim == 5 else (images[None], False)
+        # A copy: parameters may move in place while they learn.
+        camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
+        cameras = _cameras(camera, len(clips))
+        looked = (self._look(*one) for one in zip(clips, seen, cameras, strict=True))
+        return ClipGraph(tuple(looked), cameras, clips.shape[1], batched)
+
+    def pose(
+        self, graph: ClipGraph, features: Features | Sequence[Features], camera: Camera | None = None
+    ) -> ClipPoses:
+        """The poses that a graph has with these features, differentiable with respect to them and to the camera.
+
+        features: of the clip, or one per clip: the same keypoints in the same rows as when it was looked, moved as may
+                  be. A row whose mask is False by now does not count.
+        camera:   as in `forward`; the one that was looked through, without gradient, if None
+        """
+        seen = _per_clip(features)
+        cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
+        if len(seen) != len(graph.runs) or any(len(each.mask) != graph.frames for each in seen):
+            shapes = [tuple(each.mask.shape) for each in seen]
+            raise ValueError(
+                f"features of shapes {shapes} for {len(graph.runs)} clips of {graph.frames} frames"
+            )
+        clips = [self._pose(*one) for one in zip(graph.runs, seen, cameras, strict=True)]
+        if not graph.batched:
+            return clips[0]
+        return ClipPoses(
+            torch.stack([clip.T_cw for clip in clips]),
+            torch.stack([clip.posed for clip in clips]),
+            torch.stack([clip.success for clip in clips]),
+            tuple(reason for clip in clips for reason in clip.reason),
+            tuple(graph for clip in clips for graph in clip.graphs),
+            tuple(solution for clip in clips for solution in clip.solutions),
+        )
+
+    def _pose(self, seen: RunGraph | None, features: Features, camera: Camera) -> ClipPoses:
+        """The poses of one clip."""
         camera = camera.to(torch.float64)
-        features = self.extractor(images).to(camera.params.device)
+        features = features.to(camera.params.device)
         worth = torch.ones_like(features.scores) if self.weigh is None else self.weigh(features)
         # Zero times all that poses depend on: where there is no pose, there is a gradient all the same.
         nothing = 0 * (features.keypoints.sum() + worth.sum() + camera.params.sum())
-        T_cw = torch.eye(4, dtype=torch.float64, device=nothing.device) + nothing.expand(len(images), 1, 1)
-        posed = torch.zeros(len(images), dtype=torch.bool, device=nothing.device)
-        seen = self._look(images, features, camera)
+        frames = len(features.mask)
+        T_cw = torch.eye(4, dtype=torch.float64, device=nothing.device) + nothing.expand(frames, 1, 1)
+        posed = torch.zeros(frames, dtype=torch.bool, device=nothing.device)
         if seen is None:
             return ClipPoses(T_cw, posed, posed.any(), ("no map started",), (None,), (None,))
-        keypoints = (seen.frame_ids[seen.frame_index], seen.keypoint_index)
-        pixels, weights = features.keypoints[keypoints].double(), seen.weights * worth[keypoints]
+        seen = _still_seen(seen, features.mask)
+        rows = (seen.frame_ids[seen.frame_index], seen.keypoint_index)
+        pixels, weights = features.keypoints[rows].double(), seen.weights * worth[rows]
         graph = replace(seen, pixels=pixels, weights=weights, camera=camera)
         solution = solve(graph)
         T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
@@ -157,13 +242,35 @@ class ClipSLAM(nn.Module):
         reason = "" if success else _reason(solution, posed)
         return ClipPoses(T_cw, posed, success, (reason,), (graph,), (solution,))
 
-    @torch.no_grad()
     def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
-        """What the system makes of the features of a clip, without gradient; None where no map starts."""
+        """What the system makes of the features of one clip; None where no map starts."""
+        features = features.to(camera.params.device)
         slam = SLAM(camera, self.config, lambda frame: features[frame.index : frame.index + 1])
         frames = [Frame(index, float(index), image[None]) for index, image in enumerate(images)]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
         return None if run.main is None else run.main.history.graph(run.map, run.camera)
+
+
+def _per_clip(features: Features | Sequence[Features]) -> Sequence[Features]:
+    return [features] if isinstance(features, Features) else features
+
+
+def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
+    """One camera per clip, of one for all or of one with params (B, K)."""
+    if camera.params.ndim == 1:
+        return (camera,) * clips
+    if camera.params.shape[:-1] != (clips,):
+        raise ValueError(
+            f"params of the camera must be (K,) or ({clips}, K), not {tuple(camera.params.shape)}"
+        )
+    return tuple(camera[row] for row in range(clips))
+
+
+def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
+    """The graph without observations of keypoints that are none by mask (T, N)."""
+    kept = mask[graph.frame_ids[graph.frame_index], graph.keypoint_index]
+    columns = ("frame_index", "point_index", "pixels", "weights", "keypoint_index")
+    return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
 
 
 def _reason(solution: GraphSolution, posed: Tensor) -> str:

@@ -92,7 +92,16 @@ class Places:
         """
         if not self._slots or self._words is None:
             return self.keys, torch.zeros(len(self), device=self._keys.device)
-        used, codes = words_and_codes(_strongest(descriptors, mask), self._words)
+        return self._ranked(*words_and_codes(_strongest(descriptors, mask), self._words))
+
+    def like(self, key: int) -> tuple[Tensor, Tensor]:
+        """As `query` for the image of a keyframe that is there. Raises KeyError where it is not."""
+        slot = self._slots[key]
+        used = torch.nonzero(self._used[:, slot])[:, 0]
+        return self._ranked(used, self._codes[used, slot])
+
+    def _ranked(self, used: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and scores by similarity to an image that uses words (n,) with codes (n,), in order."""
         size = len(self._keys)
         # A word that no keyframe has yet is taken to be as rare as one that a single one has.
         rarity = torch.log((len(self) + 1) / self._used.sum(1).clamp(min=1.0)).square()
@@ -103,10 +112,6 @@ class Places:
             shared += rarity[word] @ alike.mul_(self._used.index_select(0, word))
         own = rarity[used].sum()
         scores = shared / (own * (rarity @ self._used)).sqrt().clamp(min=1e-12)
-        return self._ranked(scores)
-
-    def _ranked(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and scores of the slots (slots,) that are in use, in order."""
         slots = torch.nonzero(self._keys != NO_KEY)[:, 0]
         slots = slots[torch.argsort(self._keys[slots])]
         ranked = torch.sort(scores[slots].clamp(max=1.0), descending=True, stable=True)

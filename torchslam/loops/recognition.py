@@ -82,8 +82,7 @@ class Recognizer:
         """Keyframes that look like this one but share nothing with it, the likeliest first, one of each place."""
         slam_map = world.map
         known = two_steps_around(slam_map, keyframe)
-        view = slam_map.view(keyframe)
-        keys, _ = self.places.query(view.descriptors, view.mask)
+        keys, _ = self.places.like(slam_map.key(keyframe))
         taken: list[tuple[World, Tensor]] = [(world, known)]
         for key in keys[: 4 * self.config.loops.candidates].tolist():
             found = self.worlds.find(key)
@@ -114,8 +113,8 @@ class Recognizer:
 def two_steps_around(slam_map: Map, keyframe: int) -> Tensor:
     """(k,) a keyframe, those that share points with it, and those that share many with the first of these."""
     near = slam_map.covisible(keyframe, slam_map.num_keyframes, min_shared=1)
-    further = [slam_map.covisible(other, _AROUND) for other in near[:_AROUND].tolist()]
-    return torch.unique(torch.cat([near.new_tensor([keyframe]), near, *further]))
+    further = slam_map.around(near[:_AROUND], _AROUND)
+    return torch.unique(torch.cat([near.new_tensor([keyframe]), near, further]))
 
 
 def may_have_drifted(

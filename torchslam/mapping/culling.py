@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import transform
-from torchslam.mapping.keyframes import apart
+from torchslam.geometry.motion import apart
 from torchslam.world.compaction import Renumbering, remove_keyframes
 from torchslam.world.map import Map
 from torchslam.world.world import World
@@ -45,9 +45,7 @@ def cull_keyframes(world: World, settings: KeyframesConfig) -> Renumbering | Non
 def around_new_ones(world: World) -> Tensor:
     """(k,) keyframes that share points with those that were not there at the last culling, the newest first."""
     slam_map = world.map
-    new = range(world.asked, slam_map.num_keyframes)
-    near = [slam_map.covisible(keyframe, AROUND) for keyframe in new]
-    candidates = torch.unique(torch.cat([*near, slam_map.ids(*new)]))
+    candidates = slam_map.around(slam_map.ids(*range(world.asked, slam_map.num_keyframes)), AROUND)
     may_go = (candidates > 0) & (candidates < slam_map.num_keyframes - NEWEST)
     return candidates[may_go & (candidates != world.track.reference)].flip(0)
 

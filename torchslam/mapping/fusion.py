@@ -34,9 +34,7 @@ def find_in(
         return point_ids[:0], point_ids[:0]
     table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
     features = slam_map.features(keyframes)
-    finest = features.scales.masked_fill(~features.mask, torch.inf).amin(1, keepdim=True)
-    coarsest = features.scales.masked_fill(~features.mask, 0.0).amax(1, keepdim=True)
-    T_cw, sizes = slam_map.T_cw[keyframes], (finest, coarsest)
+    T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
     pixels, scales, visible = look_at(slam_map, point_ids, T_cw, camera, angle, sizes)
     observers, _ = slam_map.scales_of(point_ids)
     visible &= (observers != keyframes[:, None, None]).all(-1)
@@ -63,7 +61,9 @@ def find_in(
 
 def merge(slam_map: Map, found: Tensor, there: Tensor) -> None:
     """Merge pairs of points (m,), (m,): of those that are one, the one with most observations stays."""
-    observed = slam_map.points["times_observed"]
+    pairs = torch.stack([found, there], dim=1)
+    counts = slam_map.points["times_observed"][pairs]
+    observed = dict(zip(pairs.flatten().tolist(), counts.flatten().tolist(), strict=True))
     heir: dict[int, int] = {}
 
     def last_heir(point: int) -> int:
@@ -71,11 +71,11 @@ def merge(slam_map: Map, found: Tensor, there: Tensor) -> None:
             point = heir[point]
         return point
 
-    for pair in zip(found.tolist(), there.tolist(), strict=True):
+    for pair in pairs.tolist():
         one, other = (last_heir(point) for point in pair)
         if one != other:
             old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
             heir[old] = kept
     if heir:
         last = [last_heir(point) for point in heir.values()]
-        slam_map.replace(observed.new_tensor(list(heir)), observed.new_tensor(last))
+        slam_map.replace(found.new_tensor(list(heir)), found.new_tensor(last))

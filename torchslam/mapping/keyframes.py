@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from torchslam.config import KeyframesConfig
-from torchslam.geometry import se3_inverse, so3_log, transform
+from torchslam.geometry import transform
+from torchslam.geometry.motion import apart
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
 
@@ -34,10 +34,3 @@ def why_keyframe(view: View, tracked: Tracked, world: World, settings: Keyframes
     if overlap < settings.min_overlap:
         return f"sees {overlap:.0%} of the points of its reference keyframe"
     return ""
-
-
-def apart(T_cw: Tensor, T_kw: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """(k,), (k,) how far cameras T_kw (k, 4, 4) are from T_cw (4, 4): shares of a depth (), and degrees."""
-    T_ck = T_cw @ se3_inverse(T_kw)
-    translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
-    return translation, torch.rad2deg(torch.linalg.vector_norm(so3_log(T_ck[:, :3, :3]), dim=-1))

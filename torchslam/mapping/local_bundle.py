@@ -90,6 +90,7 @@ def adjust_keyframes(
         iterations=iterations,
         tolerance=tolerance,
         progress=progress,
+        check=False,
     )
     slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
     slam_map.points["positions_w"][point_ids] = solution.points_w

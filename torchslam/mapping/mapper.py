@@ -55,10 +55,10 @@ class Mapper:
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
             neighbours = slam_map.covisible(keyframe, 2 * settings.neighbours)
-            last = range(keyframe - 1, -1, -1)
-            partners = neighbours.tolist() if settings.partners == "covisible" else last
-            for neighbour in partners[: settings.neighbours]:
-                triangulate_against(slam_map, keyframe, neighbour, self.camera, self.config)
+            last = range(keyframe - 1, max(keyframe - 1 - settings.neighbours, -1), -1)
+            partners = neighbours if settings.partners == "covisible" else slam_map.ids(*last)
+            partners = partners[: settings.neighbours]
+            triangulate_against(slam_map, keyframe, partners, self.camera, self.config)
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from torchslam.errors import ResultsError
+from torchslam.regular_file import read_text
 from torchslam.values import State, StepResult
 
 COLUMNS = ("index", "timestamp", "state", "world", "keyframe", "matches", "inliers", "reason")
 STAGE_SUFFIX = "_ms"
+MAX_BYTES = 1 << 28
+"""Of two million frames."""
 
 
 def write_frames(path: str | Path, results: Sequence[StepResult]) -> None:
@@ -31,18 +36,20 @@ def write_frames(path: str | Path, results: Sequence[StepResult]) -> None:
 def read_frames(path: str | Path) -> list[StepResult]:
     """The rows of a file written by `write_frames`, without poses. Raises ResultsError that names file and line."""
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            return [_result(row, f"{path}:{reader.line_num}") for row in reader]
+        reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES, "a list of frames"), newline=""))
+        return [_result(row, f"{path}:{reader.line_num}") for row in reader]
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ResultsError(f"{path}: not a list of frames: {error}") from None
 
 
 def _result(row: dict[str, str], where: str) -> StepResult:
     try:
+        _check_counts(row)
         return StepResult(
             index=int(row["index"]),
-            timestamp=float(row["timestamp"]),
+            timestamp=_finite(row["timestamp"]),
             state=State(row["state"]),
             T_cw=None,
             world=int(row["world"]) if row["world"] else None,
@@ -51,10 +58,26 @@ def _result(row: dict[str, str], where: str) -> StepResult:
             inliers=int(row["inliers"]),
             reason=row["reason"],
             stage_ms={
-                name.removesuffix(STAGE_SUFFIX): float(value)
+                name.removesuffix(STAGE_SUFFIX): _finite(value)
                 for name, value in row.items()
                 if name.endswith(STAGE_SUFFIX) and value
             },
         )
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise ResultsError(f"{where}: not a row of frames.csv: {error}") from None
+
+
+def _check_counts(row: dict[str, str]) -> None:
+    """Raises ValueError for a count that no run has, and where columns are missing."""
+    for name in ("index", "world", "keyframe", "matches", "inliers"):
+        if row[name] and not 0 <= int(row[name]) < 1 << 31:
+            raise ValueError(f"{name} is {int(row[name])}")
+    if row["reason"] is None:
+        raise ValueError("it is too short")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"`{text}` is not a finite number")
+    return number

@@ -10,8 +10,12 @@ from typing import Any
 import torch
 
 from torchslam.evaluation import Evaluation
+from torchslam.geometry import transform
 from torchslam.run import Run
 from torchslam.values import State, StepResult
+
+FEW = 10
+"""Posed frames of which it says nothing how many are keyframes."""
 
 
 def metrics(
@@ -23,6 +27,7 @@ def metrics(
     those whose pose was given as such, lost those that tracking gave up on; initialised_at is the index of the frame
     that started the map, or None. posed, keyframes and points are of the main world, whose number is world, as far as
     this run saw it; worlds has the counts of each world: see `world_counts`. session says which run over the map it is.
+    reprojection_px and track_length are of the main world, too: see `quality`.
     Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
     truth, the figures of the evaluation are added, and as online_ate_m that of the poses as they
     were given, see `evaluation.ate_apart`.
@@ -38,6 +43,7 @@ def metrics(
         "initialised_at": None if start is None else start.index,
         "keyframes": len(run.keyframes),
         "points": run.map.num_points,
+        **quality(run),
         "session": run.session,
         "world": None if run.main is None else run.main.number,
         "worlds": world_counts(run),
@@ -54,6 +60,37 @@ def metrics(
     if online_ate_m is not None:
         figures["online_ate_m"] = online_ate_m
     return figures
+
+
+@torch.no_grad()
+def quality(run: Run) -> dict[str, float | None]:
+    """How well the map explains what this run's frames saw of it; None where they saw nothing.
+
+    reprojection_px: mean distance of the points' projections from the observed pixels
+    track_length:    in how many of the frames a point was seen, in the mean
+    """
+    found: dict[str, float | None] = {"reprojection_px": None, "track_length": None}
+    if run.main is None or run.map.num_points == 0:
+        return found
+    graph = run.history.graph(run.map, run.camera)
+    rows = torch.nonzero(graph.sessions[graph.frame_index] == run.session)[:, 0]
+    T_cw, points_w = graph.T_cw[graph.frame_index[rows]], graph.points_w[graph.point_index[rows]]
+    pixels, valid = run.camera.project(transform(T_cw, points_w[:, None])[:, 0])
+    if bool(valid.any()):
+        found["reprojection_px"] = float((pixels - graph.pixels[rows])[valid].norm(dim=-1).mean())
+        found["track_length"] = len(rows) / len(torch.unique(graph.point_index[rows]))
+    return found
+
+
+def doubts(figures: Mapping[str, Any]) -> list[str]:
+    """What speaks against a run that went well, in words."""
+    keyframes, posed = figures["keyframes"], figures["posed"]
+    if posed < FEW or 2 * keyframes < posed:
+        return []
+    return [
+        f"{keyframes} of {posed} posed frames are keyframes: from frame to frame too little is found again; "
+        "take the frames closer together (--stride, --fps), or more keypoints (features.num_keypoints)"
+    ]
 
 
 def world_counts(run: Run) -> list[dict[str, int]]:
@@ -112,6 +149,11 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
         "lost": f"{figures['lost']} frames; {figures['uncertain']} had an uncertain pose",
         "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
     }
+    if figures.get("reprojection_px") is not None:
+        rows["quality"] = (
+            f"{figures['reprojection_px']:.2f} px mean reprojection error, points seen in "
+            f"{figures['track_length']:.1f} frames, {figures['uncertain'] / frames:.1%} of the frames uncertain"
+        )
     rows |= _beside(figures)
     rows |= {"camera": figures["camera"]} if figures.get("camera") else {}
     rows |= {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from torchslam.errors import FrameError, ResultsError
 from torchslam.export.ply import write_map_cloud
 from torchslam.geometry import Camera
 from torchslam.output.frames_file import read_frames, write_frames
+from torchslam.regular_file import JSON_BYTES, parse_json, read_text
 from torchslam.run import Run, keyframe_rows
 from torchslam.values import StepResult, Trajectory
 from torchslam.world.map import Map
@@ -124,7 +127,7 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     """The content of metrics.json. Raises ResultsError where it is missing or something else."""
     path = directory / METRICS
     try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
+        figures = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
@@ -132,7 +135,34 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     missing = [name for name in NEEDED if not isinstance(figures, dict) or name not in figures]
     if missing:
         raise ResultsError(f"{path}: not the figures of a run: {', '.join(missing)} missing")
+    wrong = [name for name, is_right in _FIGURES.items() if name in figures and not is_right(figures[name])]
+    if wrong:
+        raise ResultsError(f"{path}: not the figures of a run: {wrong[0]} is {repr(figures[wrong[0]])[:100]}")
     return figures
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 31
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def _are_worlds(value: object) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(world, dict) and _is_count(world.get("world")) for world in value
+    )
+
+
+# What is read of metrics.json again, and what it must be.
+_FIGURES: dict[str, Callable[[Any], bool]] = {
+    "world": lambda value: value is None or _is_count(value),
+    "worlds": _are_worlds,
+    "ate_m": _is_number,
+    **dict.fromkeys(("session", "posed", "keyframes"), _is_count),
+    **dict.fromkeys(("source", "failure"), lambda value: isinstance(value, str)),
+}
 
 
 def results_in(directory: Path) -> list[Path]:

@@ -25,7 +25,9 @@ ALIKE = 8  # others that look most like it
 MAX_TURN_DEG = 60.0  # between views that look alike, by their given poses
 # What a relative rotation may be off from the given poses': a place that only looks alike is seldom seen so alike.
 MAX_OFF_DEG = 15.0
-THRESHOLD_PX = 2.0  # about the noise, and what a focal length that is 5 % off bends
+THRESHOLD_PX = (
+    2.0  # of an image that is not reduced: about the noise, and what a focal length that is 5 % off bends
+)
 MIN_MATCHES = 20
 _AT_ONCE, _MAX_SAMPLES = 16, 500
 
@@ -71,7 +73,7 @@ def find_pairs(views: list[View], T_cw: Tensor, camera: Camera, config: Config) 
     found = [pair for pair in found if len(pair[2]) >= MIN_MATCHES]
     pairs: list[Pair] = []
     for start in range(0, len(found), _AT_ONCE):
-        pairs += _verified(found[start : start + _AT_ONCE], views, T_cw, camera, config.seed)
+        pairs += _verified(found[start : start + _AT_ONCE], views, T_cw, camera, config)
     return pairs
 
 
@@ -93,7 +95,11 @@ def candidates(views: list[View], T_cw: Tensor) -> list[tuple[int, int]]:
 
 
 def _verified(
-    found: list[tuple[int, int, Tensor, Tensor]], views: list[View], T_cw: Tensor, camera: Camera, seed: int
+    found: list[tuple[int, int, Tensor, Tensor]],
+    views: list[View],
+    T_cw: Tensor,
+    camera: Camera,
+    config: Config,
 ) -> list[Pair]:
     """Those of several pairs whose matches have a relative pose in common that the given ones do not rule out."""
     size = max(len(at_1) for _, _, at_1, _ in found)
@@ -108,10 +114,12 @@ def _verified(
         pixels[1],
         camera,
         camera,
-        threshold=THRESHOLD_PX,
+        threshold=THRESHOLD_PX * config.features.reduction(camera.size),
         mask=mask,
-        seed=seed,
+        seed=config.seed,
         max_samples=_MAX_SAMPLES,
+        kernel="truncated",
+        min_samples=64,
     )
     pairs = []
     for row, (one, other, at_1, at_2) in enumerate(found):

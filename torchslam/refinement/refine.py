@@ -117,17 +117,18 @@ def refine(
     frames = torch.tensor([view.index for view in views], dtype=torch.int64)
     T_cw = given.T_cw[rows[frames]].to(camera.params)
     say(f"{len(views)} images with poses")
-    chosen, pairs, failure = _connected(views, T_cw, camera, config)
+    scaled = config.for_size(camera.size)  # what is told to the steps, as in a run
+    chosen, pairs, failure = _connected(views, T_cw, camera, scaled)
     if failure:
         return Refined(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
     say(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
     keyframes = [views[row] for row in chosen]
     slam_map, camera, refined, rounds = _rounds(
-        keyframes, T_cw[chosen], pairs, camera, config, choice, radial, say
+        keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, say
     )
     world = World.empty(0, camera.params)
     world.map = slam_map
-    results = Poser(camera, config).pose(world, views, T_cw)
+    results = Poser(camera, scaled).pose(world, views, T_cw)
     _conclude(world, camera, frames, T_cw)
     run = _run((world,), camera, config, views, results, skipped, "")
     return Refined(run, given, rows, refined, rounds)

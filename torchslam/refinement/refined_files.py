@@ -11,13 +11,16 @@ import torch
 from torch import Tensor
 
 from torchslam.data.given_poses import COLMAP, NERFSTUDIO
+from torchslam.data.text_file import read_text
 from torchslam.data.trajectory_file import write_trajectory
+from torchslam.errors import TrajectoryError
 from torchslam.export.colmap import write_colmap
 from torchslam.export.conventions import opengl
 from torchslam.export.nerfstudio import nerfstudio_camera
 from torchslam.export.scene import Scene, scene_of
 from torchslam.geometry import se3_inverse
 from torchslam.refinement.refine import Refined
+from torchslam.regular_file import JSON_BYTES, parse_json
 from torchslam.values import Trajectory
 
 COVARIANCES = "covariances.txt"
@@ -103,7 +106,7 @@ def _write_colmap(folder: Path, refined: Refined) -> None:
 
 def _write_transforms(path: Path, refined: Refined, frames: Tensor, T_cw: Tensor) -> None:
     """The file as it was, with other poses and the camera; what else it says of its frames stays."""
-    content = json.loads(refined.given.path.read_text(encoding="utf-8-sig"))
+    content = parse_json(read_text(refined.given.path, TrajectoryError, JSON_BYTES))
     rows = refined.rows[frames].tolist()
     poses = dict(zip(rows, opengl(se3_inverse(T_cw)).tolist(), strict=True))
     kept = [

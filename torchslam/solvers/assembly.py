@@ -1,7 +1,9 @@
 """From second-order expansions per observation to the normal equations over poses, points and camera.
 
-To first order a point in the camera frame moves with its pose and its world position as dp = G xi + R dX, G = [I, -p^];
-to second order the rotation adds omega x (omega x p) / 2 + omega x (R dX).
+Frames move along the axes of the world: seen from there, a point that lies at the ray r from the camera moves to first
+order as dp = v + omega x r + dX, so that the Hessian C of an observation in its point is also that against v, and
+r x C against omega. To second order the rotation adds omega x (omega x r) / 2 + omega x dX.
+Rows run along the observations: every operation streams through contiguous memory.
 """
 
 from __future__ import annotations
@@ -9,76 +11,59 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry.lie import skew
 from torchslam.solvers.residuals import Expansion
 from torchslam.solvers.schur import NormalEquations, Structure, Tangent
 
 
 def assemble(
-    structure: Structure,
-    expansion: Expansion,
-    points_c: Tensor,
-    R_cw: Tensor,
-    free_points: Tensor,
-    exact: bool,
+    structure: Structure, expansion: Expansion, rays_w: Tensor, free_points: Tensor, exact: bool
 ) -> NormalEquations:
-    """Normal equations of observations ordered as `structure` asks.
+    """Normal equations of observations ordered as `structure` asks, for frames that move along the world's axes.
 
-    expansion: gradient (O, 3 + K) and Hessian (O, 3 + K, 3 + K) in the camera-frame points and the camera
-    points_c:  (O, 3); R_cw: (O, 3, 3) rotations of the observing frames
+    expansion: gradient (3 + K, O) and Hessian (3 + K, 3 + K, O) in the points in the world and the camera
+    rays_w:    (3, O) from the observing camera to the point, in the axes of the world
     exact:     include the second-order terms of the rotation, for the exact Hessian
     """
-    gradient, hessian = expansion.gradient, expansion.hessian
-    slope, curve = gradient[:, :3], hessian[:, :3, :3]
-    linked = structure.num_linked
-
-    # Points: R^T C R and R^T q.
-    rotated = curve @ R_cw
-    points = structure.sum_by_point(
-        torch.cat(
-            (R_cw.mT @ rotated, R_cw.mT @ torch.cat((slope[..., None], hessian[:, :3, 3:]), dim=-1)), dim=-1
-        )
-    )
-    # Pose against point: G^T C R.
-    turned = torch.linalg.cross(points_c[:linked, :, None].expand(linked, 3, 3), rotated[:linked], dim=1)
+    gradient, hessian = expansion
+    slope, linked = gradient[:3], structure.num_linked
+    # The columns of all blocks: against points, the gradient, against the camera.
+    moved = torch.cat((hessian[:3, :3], slope[:, None], hessian[:3, 3:]), dim=1)
+    points = structure.sum_by_point(moved.flatten(0, 1).mT).unflatten(-1, (3, -1))
+    slope, rays_w, moved = slope[:, :linked], rays_w[:, :linked], moved[..., :linked]
+    turned = _cross(rays_w, moved)
+    twice = _cross(rays_w, turned[:, :3].transpose(0, 1))
+    against_points = turned[:, :3]
     if exact:
-        turned = turned - skew(slope[:linked]) @ R_cw[:linked]
-    blocks = torch.cat((rotated[:linked], turned), dim=1)
-    coupling = blocks.new_zeros(structure.storage_rows, 6)
-    coupling = coupling.index_add_(0, structure.coupling, blocks.mT.reshape(-1, 6))
-
-    frames = _sum_by_frame(structure, points_c[:linked], gradient[:linked], hessian[:linked], exact)
+        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
+        against_points = against_points - _cross(slope, eye)
+        outer = slope[:, None] * rays_w
+        twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
+    blocks = torch.cat((moved[:, :3], against_points)).permute(2, 1, 0).reshape(-1, 6)
+    coupling = blocks.new_zeros(structure.storage_rows, 6).index_add_(0, structure.coupling, blocks)
+    moved, turned, twice = (structure.sum_by_frame(values) for values in (moved, turned, twice))
+    upper = torch.cat((moved[..., :3], turned[..., :3].mT), dim=-1)
+    lower = torch.cat((turned[..., :3], twice), dim=-1)
+    rest = torch.cat((moved[..., 3:], turned[..., 3:]), dim=1)
     return NormalEquations(
         structure,
-        Tangent(frames[..., -1], points[..., 3], gradient[:, 3:].sum(0)),
-        frames[..., :6],
+        Tangent(rest[..., 0], points[..., 3], gradient[3:].sum(-1)),
+        torch.cat((upper, lower), dim=1),
         points[..., :3],
-        hessian[:, 3:, 3:].sum(0),
-        frames[..., 6:-1],
+        hessian[3:, 3:].sum(-1),
+        rest[..., 1:],
         points[..., 4:],
         coupling,
         free_points,
     )
 
 
-def _sum_by_frame(
-    structure: Structure, points_c: Tensor, gradient: Tensor, hessian: Tensor, exact: bool
-) -> Tensor:
-    """[G^T C G, G^T C_camera, G^T q] summed over each free frame's observations, (F, 6, 6 + K + 1)."""
-    slope, curve = gradient[:, :3], hessian[:, :3, :3]
-    count = points_c.shape[0]
-    # C (-p^) row by row is p x row.
-    curve_turned = torch.linalg.cross(points_c[:, None, :].expand(count, 3, 3), curve, dim=2)
-    right = torch.cat((curve, curve_turned, hessian[:, :3, 3:], slope[..., None]), dim=-1)
-    eye = torch.eye(3, dtype=points_c.dtype, device=points_c.device)
-    G = torch.cat((eye.expand(count, 3, 3), -skew(points_c)), dim=-1)
-    sums, begin = [], 0
-    for end in structure.frame_ends:
-        total = G[begin:end].flatten(0, 1).mT @ right[begin:end].flatten(0, 1)
-        if exact:
-            outer = slope[begin:end].mT @ points_c[begin:end]
-            bend = 0.5 * (outer + outer.mT) - outer.trace() * eye
-            total = total + torch.nn.functional.pad(bend, (3, total.shape[1] - 6, 3, 0))
-        sums.append(total)
-        begin = end
-    return torch.stack(sums) if sums else right.new_zeros(0, 6, right.shape[-1])
+def product(A: Tensor, B: Tensor) -> Tensor:
+    """A B of matrices (m, 3, O) and (3, n, O). -> (m, n, O)."""
+    first = A[:, 0, None] * B[0]
+    return first.addcmul(A[:, 1, None], B[1]).addcmul(A[:, 2, None], B[2])
+
+
+def _cross(u: Tensor, columns: Tensor) -> Tensor:
+    """u x every column: (3, O), (3, n, O) -> (3, n, O)."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return torch.stack([(u[i] * columns[j]).addcmul(u[j], columns[i], value=-1) for i, j in pairs])

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.bundle_minimization import BundleMinimization, Found
 from torchslam.solvers.bundle_problem import BundleProblem, sanitized
 from torchslam.solvers.implicit import Backward, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence, Progress
-from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
 
 __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
@@ -78,6 +78,7 @@ def bundle_adjust(
     iterations: int = 20,
     tolerance: float = 1e-8,
     progress: Progress | None = None,
+    check: bool = True,
 ) -> BundleSolution:
     """Minimise robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
 
@@ -88,6 +89,7 @@ def bundle_adjust(
               points, see `implicit.Backward`. The gradient ends at the start values of what moves.
     tolerance: stop where a step promises to lower the cost by less than this share of it
     progress: called with the number of each iteration and the most there are; what it raises is raised here
+    check:    find out whether all that moves is determined; else `success` is for the start alone, a tenth is saved
 
     Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
     positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
@@ -98,7 +100,9 @@ def bundle_adjust(
     """
     check_backward(backward)
     given = sanitized(problem, scale)
-    minimization = BundleMinimization(problem.camera, kernel, free_camera, iterations, tolerance, progress)
+    minimization = BundleMinimization(
+        problem.camera, kernel, free_camera, iterations, tolerance, progress, check
+    )
     if backward == "unroll":
         found = minimization.minimize(given)
     else:

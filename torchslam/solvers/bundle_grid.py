@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.bundle_layout import camera_columns
 from torchslam.solvers.bundle_model import Estimate
 from torchslam.solvers.bundle_priors import PriorTerms, block_diagonal, prior_terms, still_open
@@ -34,9 +35,8 @@ from torchslam.solvers.residuals import (
     variance_factor,
     weigh,
 )
-from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
-from torchslam.solvers.tangent import retract
+from torchslam.solvers.tangent import retract, turned
 
 
 class GridEstimate(NamedTuple):
@@ -88,9 +88,9 @@ class GridBundle:
             expansion, cost = self._pinhole(points_c, near[:, None, None])
         else:
             lin = self._linearize(estimate, points_c)
-            expansion = _as_grid(gauss_newton_expansion(lin, near[:, None, None]))
+            expansion = _expanded(lin, near)
             cost = lin.cost.sum((1, 2))
-        equations, prior_cost = self._equations(estimate, expansion, points_c)
+        equations, prior_cost = self._equations(estimate, expansion)
         return GridModel(estimate, cost + prior_cost, equations)
 
     def step(self, model: GridModel, damping: Tensor) -> tuple[GridEstimate, Tensor]:
@@ -101,7 +101,8 @@ class GridBundle:
         decrease = torch.where(factorized.reduced.definite, 0.5 * decrease, torch.inf)
         frames, camera = self._split(step)
         leading = frames.shape[1]
-        T_cw = torch.cat((retract(T_cw[:, :leading], -frames), T_cw[:, leading:]), dim=1)
+        moved = retract(T_cw[:, :leading], -turned(T_cw[:, :leading, :3, :3], frames[..., None])[..., 0])
+        T_cw = torch.cat((moved, T_cw[:, leading:]), dim=1)
         if self.directions is not None:
             params = params - camera.unflatten(1, (params.shape[1], -1)) @ self.directions.mT
         return GridEstimate(T_cw, points_w - points, params), decrease
@@ -120,17 +121,18 @@ class GridBundle:
         expansion = exact_expansion(self._observations(ordered), points_c.mT, self.directions is not None)
         if self.directions is not None:
             expansion = expansion.along(self._columns)
-        equations, _ = self._equations(ordered, _as_grid(expansion), points_c, exact=True)
+        equations, _ = self._equations(ordered, _as_grid(expansion), exact=True)
         factorized = self._factorized(ordered, equations)
-        padding = layout.order.shape[1] - layout.free.shape[1]
+        leading = layout.free.shape[1]
+        padding, R_cw = layout.order.shape[1] - leading, ordered.T_cw[:, :leading, :3, :3]
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = right
-            frames = take(frames, layout.order)[:, : layout.free.shape[1]]
-            frames = torch.where(layout.free[..., None], frames, 0.0)
+            frames = torch.where(layout.free[..., None], take(frames, layout.order)[:, :leading], 0.0)
+            frames = turned(R_cw.mT, frames[..., None])[..., 0]
             solved, points = factorized.solve(torch.cat((frames.flatten(1), camera), dim=1), points.mT)
             frames, camera = self._split(solved)
-            frames = torch.nn.functional.pad(frames, (0, 0, 0, padding))
+            frames = torch.nn.functional.pad(turned(R_cw, frames[..., None])[..., 0], (0, 0, 0, padding))
             return take(frames, layout.rank), points.mT, camera
 
         return solve
@@ -147,14 +149,16 @@ class GridBundle:
         columns = 0 if self.directions is None else self._columns.shape[-1] - 3
         num_parameters = 6 * layout.free.sum(1) + 3 * layout.free_points.sum(1) + columns
         factor = variance_factor(flat, Linearization(*(part.flatten(1, 2) for part in lin)), num_parameters)
-        expansion = _as_grid(gauss_newton_expansion(lin, torch.zeros_like(factor)[:, None, None]))
-        equations, _ = self._equations(ordered, expansion, points_c, share=factor[:, None, None])
+        expansion = _expanded(lin, torch.zeros_like(factor))
+        equations, _ = self._equations(ordered, expansion, share=factor[:, None, None])
         inverse, points = self._factorized(ordered, equations).marginals()
         inverse, points = factor[:, None, None] * inverse, factor[:, None, None, None] * points
-        size = 6 * layout.free.shape[1]
+        leading = layout.free.shape[1]
+        size, R_cw = 6 * leading, ordered.T_cw[:, :leading, :3, :3]
         frames = inverse[:, :size, :size].unflatten(1, (-1, 6)).unflatten(3, (-1, 6)).diagonal(dim1=1, dim2=3)
-        frames = torch.where(layout.free[..., None, None], frames.movedim(-1, 1), 0.0)
-        padding = layout.order.shape[1] - layout.free.shape[1]
+        frames = turned(R_cw, turned(R_cw, frames.movedim(-1, 1)).mT)
+        frames = torch.where(layout.free[..., None, None], frames, 0.0)
+        padding = layout.order.shape[1] - leading
         frames = take(torch.nn.functional.pad(frames, (0, 0, 0, 0, 0, padding)), layout.rank)
         return Marginals(frames, points, inverse[:, size:, size:])
 
@@ -223,13 +227,13 @@ class GridBundle:
         self,
         estimate: GridEstimate,
         expansion: GridExpansion,
-        points_c: Tensor,
         exact: bool = False,
         share: Tensor | float = 1.0,
     ) -> tuple[GridEquations, Tensor | float]:
         """The equations with a share of the priors, and the priors' cost (B,)."""
-        free = self.data.layout.free
-        equations = assemble_grid(expansion, points_c, estimate.T_cw[..., :3, :3], free, exact)
+        R_cw, t_cw = estimate.T_cw[..., :3, :3], estimate.T_cw[..., :3, 3:]
+        rays_w = estimate.points_w[:, None] + R_cw.mT @ t_cw
+        equations = assemble_grid(expansion, rays_w, R_cw, self.data.layout.free, exact)
         terms = self._priors(estimate, exact)
         if terms is None:
             return equations, 0.0
@@ -254,7 +258,8 @@ class GridBundle:
                 prior_information=inputs.prior_information[:, :leading],
             )
         T_cw = estimate.T_cw[:, : free.shape[1]]
-        return prior_terms(inputs, T_cw, estimate.params, free, self.directions, exact)
+        terms = prior_terms(inputs, T_cw, estimate.params, free, self.directions, exact)
+        return None if terms is None else terms.in_world(T_cw[..., :3, :3])
 
     def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """The parts of (B, D) that are of the free frames (B, F', 6) and of the cameras."""
@@ -269,7 +274,8 @@ class GridBundle:
         return factorized_grid(equations, layout.free_points, more, damping, self._gauge(estimate))
 
     def _gauge(self, estimate: GridEstimate) -> Tensor | None:
-        """Directions (B, 6 F', g) that what is fixed leaves open, zero where nothing is; None where nowhere."""
+        """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None
+        where nowhere."""
         layout = self.data.layout
         free, anchors = layout.free, layout.anchors.sum(1)
         is_open = (anchors < 2) & ~layout.held_points & free.any(1)
@@ -279,12 +285,14 @@ class GridBundle:
         first = torch.where(anchors > 0, layout.anchors.int().argmax(1), 0)[:, None]
         origin = se3_inverse(take(estimate.T_cw, first))[:, :, None, :3, 3]
         scaling = torch.nn.functional.pad(transform(T_free, origin).squeeze(-2), (0, 3))
+        R_wc = T_free[..., :3, :3].mT
+        scaling = turned(R_wc, scaling[..., None])[..., 0]
         scaling = torch.where((free & is_open[:, None])[..., None], scaling, 0.0)
         length = scaling.square().sum((1, 2), keepdim=True)
         motions = (scaling * torch.where(length > 0, length, 1.0).rsqrt())[..., None]
         adrift = is_open & (anchors == 0) & (free.sum(1) > 1)
         if adrift.any():
-            moves = torch.where(free[..., None, None], -se3_adjoint(T_free), 0.0)
+            moves = torch.where(free[..., None, None], -turned(R_wc, se3_adjoint(T_free)), 0.0)
             whole = torch.cat((motions, moves), dim=-1).flatten(1, 2)
             eye = torch.eye(*whole.shape[1:], dtype=whole.dtype, device=whole.device)
             whole = torch.linalg.qr(torch.where(adrift[:, None, None], whole, eye)).Q
@@ -294,6 +302,13 @@ class GridBundle:
             priors = self._priors(estimate)
             motions = motions if priors is None else still_open(motions, priors.frames)
         return motions.flatten(1, 2)
+
+
+def _expanded(lin: Linearization, near: Tensor) -> GridExpansion:
+    """Without the bend of the projection; near: (B,)."""
+    J = lin.J.movedim((-2, -1), (0, 1))
+    gradient, hessian = gauss_newton_expansion(lin, J, near[:, None, None])
+    return GridExpansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())
 
 
 def _as_grid(expansion: Expansion) -> GridExpansion:

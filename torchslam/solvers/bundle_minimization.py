@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.bundle_grid import GridBundle
 from torchslam.solvers.bundle_layout import Layout, Moving, build_layout, what_moves
 from torchslam.solvers.bundle_model import Bundle, Estimate
@@ -19,7 +20,6 @@ from torchslam.solvers.grid_layout import GridLayout, build_grid_layout, fits_gr
 from torchslam.solvers.implicit import Ndims
 from torchslam.solvers.levenberg import LeastSquares, M, Progress, X, minimize
 from torchslam.solvers.residuals import Observations, linearize_each
-from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import Marginals
 from torchslam.solvers.tangent import move, pull_back, push, retract
 
@@ -101,10 +101,12 @@ class BundleMinimization:
         iterations: int,
         tolerance: float,
         progress: Progress | None,
+        check: bool = True,
     ) -> None:
         self.camera, self.kernel = camera, kernel
         self.free_camera = free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
+        self.check = check
         self._last: tuple[Tensor, Moving, list[Part]] | None = None
 
     def minimize(self, inputs: Tensors) -> Found:
@@ -118,7 +120,9 @@ class BundleMinimization:
             bundle, bundle.start, self.iterations, self.tolerance, self._progress(given, part)
         )
         with torch.no_grad():
-            success = bundle.solvable & bundle.definite(model) & given.finite[part.rows]
+            success = bundle.solvable & given.finite[part.rows]
+            if self.check:
+                success = success & bundle.definite(model)
         return Found(
             *bundle.in_order(model.estimate),
             success,

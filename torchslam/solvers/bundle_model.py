@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -11,12 +12,14 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
-from torchslam.solvers.assembly import assemble
-from torchslam.solvers.bundle_layout import Layout, camera_columns
+from torchslam.geometry.robust import Kernel
+from torchslam.solvers.assembly import assemble, product
+from torchslam.solvers.bundle_layout import Layout
 from torchslam.solvers.bundle_priors import PriorTerms, prior_terms, still_open
 from torchslam.solvers.bundle_problem import Inputs
 from torchslam.solvers.folding import Tensors
 from torchslam.solvers.residuals import (
+    Expansion,
     Linearization,
     Observations,
     exact_expansion_of_each,
@@ -24,14 +27,13 @@ from torchslam.solvers.residuals import (
     linearize_each,
     variance_factor,
 )
-from torchslam.solvers.robust import Kernel
 from torchslam.solvers.schur import (
     FactorizedEquations,
     Marginals,
     NormalEquations,
     Tangent,
 )
-from torchslam.solvers.tangent import retract
+from torchslam.solvers.tangent import retract, turned
 
 
 class Estimate(NamedTuple):
@@ -44,11 +46,27 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleModel:
-    """The local model of the cost (1,) at an estimate."""
+    """The local model of the cost (1,) at an estimate; its equations are made when they are asked for.
+
+    Where a minimisation ends nobody asks, and they are most of the work.
+    """
 
     estimate: Estimate
     cost: Tensor
-    equations: NormalEquations
+    assembled: Callable[[], NormalEquations]
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        return self.assembled()
+
+
+class Seen(NamedTuple):
+    """Per observation the rotation (3, 3, O') of its frame, and the ray to its point: (3, O') in the axes of the world
+    and (O', 3) in those of the camera."""
+
+    R_cw: Tensor
+    rays_w: Tensor
+    points_c: Tensor
 
 
 class Bundle:
@@ -66,13 +84,9 @@ class Bundle:
         """directions: (K, n) in which the parameters move, None where they do not; camera_of: (O,)"""
         self.layout, self.inputs, self.directions = layout, inputs, directions
         self.camera, self.kernel = camera, kernel
-        self.columns: Tensor | None = None  # from points and directions to points and parameters
         self.camera_of: Tensor | None = None  # where there are several, of each observation
         if len(inputs.params) > 1:
             self.camera_of = camera_of.index_select(0, layout.observations)
-        if directions is not None:
-            columns = camera_columns(directions, len(inputs.params))
-            self.columns = columns[0] if self.camera_of is None else columns.index_select(0, self.camera_of)
         self.observations = self._observed(
             inputs.pixels.index_select(0, layout.observations),
             inputs.weights.index_select(0, layout.observations),
@@ -84,12 +98,12 @@ class Bundle:
         self.solvable = torch.tensor([solvable], device=inputs.pixels.device)
 
     def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
-        lin, points_c, R_cw = self._linearize(estimate)
-        expansion = gauss_newton_expansion(lin, near)
-        layout = self.layout
-        equations = assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=False)
-        equations, cost = self._with_priors(equations, estimate)
-        return BundleModel(estimate, (lin.cost.sum() + cost)[None], equations)
+        seen, terms = self._seen(estimate), self._priors(estimate)
+        lin = self._linearize(estimate, seen)
+        cost = lin.cost.sum() if terms is None else lin.cost.sum() + terms.cost
+        return BundleModel(
+            estimate, cost[None], lambda: _with_priors(self._equations(seen, lin, near), terms)
+        )
 
     def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
         equations, estimate = model.equations, model.estimate
@@ -97,7 +111,8 @@ class Bundle:
         step = factorized.solve(equations.gradient)
         decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
-        moved = retract(estimate.T_cw.index_select(0, frames), -step.frames)
+        T_free = estimate.T_cw.index_select(0, frames)
+        moved = retract(T_free, -turned(T_free[:, :3, :3], step.frames[..., None])[..., 0])
         params = estimate.params
         if self.directions is not None:
             params = params - step.camera.view(len(params), -1) @ self.directions.mT
@@ -110,7 +125,7 @@ class Bundle:
         return new if bool(accept) else old
 
     def factorized(self, model: BundleModel) -> FactorizedEquations:
-        """The undamped equations of a model at a minimum, ready to be solved."""
+        """The undamped equations of a model at a minimum, ready to be solved; frames in the axes of the world."""
         return model.equations.factorized(gauge=self._gauge(model.estimate))
 
     def definite(self, model: BundleModel) -> Tensor:
@@ -128,7 +143,10 @@ class Bundle:
         return Estimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
     def _gauge(self, estimate: Estimate) -> Tensor | None:
-        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is."""
+        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is.
+
+        In the axes of the world, as are all vectors of the equations.
+        """
         layout, T_cw = self.layout, estimate.T_cw
         is_anchor = torch.zeros(len(T_cw), dtype=torch.bool, device=T_cw.device)
         is_anchor[layout.frame_index] = True
@@ -141,55 +159,38 @@ class Bundle:
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
         scaling = torch.nn.functional.pad(transform(T_free, origin[None]).squeeze(-2), (0, 3))[..., None]
         motions = scaling if len(anchors) else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
+        motions = turned(T_free[:, :3, :3].mT, motions)
         motions = torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
             return motions if priors is None else still_open(motions, priors.frames)
 
     def _priors(self, estimate: Estimate, exact: bool = False) -> PriorTerms | None:
-        """What the priors on free frames (F') and the cameras add."""
+        """What the priors on free frames (F') and the cameras add, in the axes of the world."""
         frames, inputs = self.layout.free_frames, self.inputs
         poses = inputs.pose_prior
         if poses is not None:
             T_cw, information = (x.index_select(0, frames) for x in (poses.T_cw, poses.information))
             inputs = inputs._replace(prior_T_cw=T_cw, prior_information=information)
         T_cw = estimate.T_cw.index_select(0, frames)
-        return prior_terms(
-            inputs, T_cw, estimate.params, torch.ones_like(frames).bool(), self.directions, exact
-        )
-
-    def _with_priors(
-        self, equations: NormalEquations, estimate: Estimate, exact: bool = False, share: Tensor | float = 1.0
-    ) -> tuple[NormalEquations, Tensor | float]:
-        """The equations with a share of the priors added, and the priors' cost."""
-        terms, gradient = self._priors(estimate, exact), equations.gradient
-        if terms is None:
-            return equations, 0.0
-        gradient = gradient._replace(
-            frames=gradient.frames + terms.frames_gradient, camera=gradient.camera + terms.camera_gradient
-        )
-        return (
-            replace(
-                equations,
-                gradient=gradient,
-                frames=equations.frames + share * terms.frames,
-                camera=equations.camera + share * terms.camera,
-            ),
-            terms.cost,
-        )
+        moving = torch.ones_like(frames).bool()
+        terms = prior_terms(inputs, T_cw, estimate.params, moving, self.directions, exact)
+        return None if terms is None else terms.in_world(T_cw[:, :3, :3])
 
     def marginals(self, estimate: Estimate) -> Marginals:
         """Covariances (1, F, 6, 6), (1, P, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
         estimate = self.ordered(estimate)
-        lin, points_c, R_cw = self._linearize(estimate)
-        expansion = gauss_newton_expansion(lin, torch.zeros_like(self.solvable))
+        seen = self._seen(estimate)
+        lin = self._linearize(estimate, seen)
+        equations = self._equations(seen, lin, torch.zeros_like(self.solvable))
         layout, structure = self.layout, self.layout.structure
-        equations = assemble(structure, expansion, points_c, R_cw, layout.free_points, exact=False)
         num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + len(equations.camera)
         factor = variance_factor(self.observations, lin, num_parameters)
         # Priors are in absolute units, which the residuals do not calibrate.
-        equations, _ = self._with_priors(equations, estimate, share=factor)
+        equations = _with_priors(equations, self._priors(estimate), share=factor)
         free, points, camera = equations.factorized(gauge=self._gauge(estimate)).marginals()
+        R_cw = estimate.T_cw[layout.free_frames, :3, :3]
+        free = turned(R_cw, turned(R_cw, free).mT)
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         blocks = factor * frames, factor * points[layout.point_rank], factor * camera
         return Marginals(*(block[None] for block in blocks))
@@ -198,27 +199,41 @@ class Bundle:
         """v -> H^-1 v with the exact Hessian at a minimum, for a batch of one in the order of the problem."""
         layout, ordered = self.layout, self.ordered(estimate)
         exact = self._exact_equations(ordered).factorized(gauge=self._gauge(ordered))
+        R_cw = ordered.T_cw[layout.free_frames, :3, :3]
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = (part[0] for part in right)
-            tangent = Tangent(
-                frames.index_select(0, layout.free_frames), points.index_select(0, layout.point_order), camera
-            )
-            solved = exact.solve(tangent)
-            spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, solved.frames)
+            free = turned(R_cw.mT, frames.index_select(0, layout.free_frames)[..., None])[..., 0]
+            solved = exact.solve(Tangent(free, points.index_select(0, layout.point_order), camera))
+            free = turned(R_cw, solved.frames[..., None])[..., 0]
+            spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, free)
             vector = spread, solved.points.index_select(0, layout.point_rank), solved.camera
             return tuple(part[None] for part in vector)
 
         return solve
 
-    def _linearize(self, estimate: Estimate) -> tuple[Linearization, Tensor, Tensor]:
-        """Errors, points in the camera frame (O', 3) and rotations (O', 3, 3) of the observing frames."""
-        T_cw = estimate.T_cw.index_select(0, self.layout.frame_index)
-        points_w = estimate.points_w.index_select(0, self.layout.point_index)
-        R_cw = T_cw[:, :3, :3]
-        points_c = (R_cw @ points_w[..., None]).squeeze(-1) + T_cw[:, :3, 3]
-        lin = linearize_each(self._observations(estimate), points_c, self.columns is not None)
-        return lin if self.columns is None else lin._replace(J=lin.J @ self.columns), points_c, R_cw
+    def _seen(self, estimate: Estimate) -> Seen:
+        R_cw = estimate.T_cw[:, :3, :3]
+        centres_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
+        frames = torch.cat((R_cw.flatten(1), centres_w[..., 0]), dim=-1)
+        rows = frames.index_select(0, self.layout.frame_index).mT.contiguous()
+        R_cw = rows[:9].unflatten(0, (3, 3))
+        rays_w = estimate.points_w.index_select(0, self.layout.point_index).mT - rows[9:]
+        return Seen(R_cw, rays_w, product(R_cw, rays_w[:, None])[:, 0].mT)
+
+    def _linearize(self, estimate: Estimate, seen: Seen) -> Linearization:
+        return linearize_each(self._observations(estimate), seen.points_c, self.directions is not None)
+
+    def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
+        """Derivatives (m, 3 + K, O') in points_c and the camera, as such in points_w and what moves of all cameras."""
+        points = product(rows[:, :3], R_cw)
+        if self.directions is None:
+            return points
+        camera = self.directions.mT @ rows[:, 3:]
+        if self.camera_of is not None:
+            every = torch.arange(len(self.inputs.params), device=rows.device)
+            camera = torch.where(self.camera_of == every[:, None, None], camera[:, None], 0.0).flatten(1, 2)
+        return torch.cat((points, camera), dim=1)
 
     def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> Observations:
         camera = self.camera.with_params(params)
@@ -230,11 +245,35 @@ class Bundle:
             return self.observations
         return self._observed(self.observations.pixels, self.observations.weights, estimate.params)
 
+    def _equations(self, seen: Seen, lin: Linearization, near: Tensor) -> NormalEquations:
+        """Without the bend of the projection, and without priors."""
+        expansion = gauss_newton_expansion(lin, self._in_world(lin.J.movedim(0, -1), seen.R_cw), near)
+        return assemble(self.layout.structure, expansion, seen.rays_w, self.layout.free_points, exact=False)
+
     def _exact_equations(self, estimate: Estimate) -> NormalEquations:
-        _, points_c, R_cw = self._linearize(estimate)
-        expansion = exact_expansion_of_each(self._observations(estimate), points_c, self.columns is not None)
-        if self.columns is not None:
-            expansion = expansion.along(self.columns)
+        R_cw, rays_w, points_c = self._seen(estimate)
+        observations, is_free = self._observations(estimate), self.directions is not None
+        gradient, hessian = exact_expansion_of_each(observations, points_c, is_free)
+        half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
+        expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
         layout = self.layout
-        equations = assemble(layout.structure, expansion, points_c, R_cw, layout.free_points, exact=True)
-        return self._with_priors(equations, estimate, exact=True)[0]
+        equations = assemble(layout.structure, expansion, rays_w, layout.free_points, exact=True)
+        return _with_priors(equations, self._priors(estimate, exact=True))
+
+
+def _with_priors(
+    equations: NormalEquations, terms: PriorTerms | None, share: Tensor | float = 1.0
+) -> NormalEquations:
+    """The equations with a share of the priors added."""
+    if terms is None:
+        return equations
+    gradient = equations.gradient
+    gradient = gradient._replace(
+        frames=gradient.frames + terms.frames_gradient, camera=gradient.camera + terms.camera_gradient
+    )
+    return replace(
+        equations,
+        gradient=gradient,
+        frames=equations.frames + share * terms.frames,
+        camera=equations.camera + share * terms.camera,
+    )

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchslam.solvers.bundle_problem import Inputs
 from torchslam.solvers.prior import PosePrior, prior_expansion, prior_hessian
+from torchslam.solvers.tangent import turned
 
 
 class PriorTerms(NamedTuple):
@@ -20,6 +21,12 @@ class PriorTerms(NamedTuple):
     frames: Tensor
     camera_gradient: Tensor
     camera: Tensor
+
+    def in_world(self, R_cw: Tensor) -> PriorTerms:
+        """The same for frames (..., F, 3, 3) that move along the axes of the world."""
+        frames = turned(R_cw.mT, turned(R_cw.mT, self.frames).mT)
+        gradient = turned(R_cw.mT, self.frames_gradient[..., None])[..., 0]
+        return self._replace(frames_gradient=gradient, frames=frames)
 
 
 def prior_terms(

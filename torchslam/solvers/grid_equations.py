@@ -28,7 +28,8 @@ class GridExpansion(NamedTuple):
 
 
 class GridEquations(NamedTuple):
-    """Gradient and Hessian over F free frames and the cameras, D = 6 F + K, and points.
+    """Gradient and Hessian over F free frames, which move along the axes of the world as in `assembly`, and the
+    cameras, D = 6 F + K, and points.
 
     gradient: (B, D), points_gradient: (B, 3, P), reduced: (B, D, D), points: (B, 3, 3, P), coupling: (B, D, 3, P)
     """
@@ -41,26 +42,26 @@ class GridEquations(NamedTuple):
 
 
 def assemble_grid(
-    expansion: GridExpansion, points_c: Tensor, R_cw: Tensor, free: Tensor, exact: bool
+    expansion: GridExpansion, rays_w: Tensor, R_cw: Tensor, free: Tensor, exact: bool
 ) -> GridEquations:
     """Normal equations over the first frames, of which those that are free (B, F') move, all points, and the cameras.
 
-    points_c: (B, F, 3, P); R_cw: (B, F, 3, 3); exact: include the second-order terms of the rotation
+    expansion: in the points in the camera frames
+    rays_w:    (B, F, 3, P) from the cameras to the points, in the axes of the world; R_cw: (B, F, 3, 3)
+    exact:     include the second-order terms of the rotation
     """
-    (batch, _, dims, count), leading = expansion.gradient.shape, free.shape[1]
-    slope, upper = expansion.gradient[:, :, :3], expansion.hessian[:, :, :3]
-    rotated = R_cw.mT[:, :, None] @ upper[:, :, :, :3]  # (B, F, 3, 3, P): C R
-    R_wc = R_cw.permute(0, 3, 1, 2).flatten(2)  # (B, 3, 3 F)
-    points = (R_wc @ rotated.flatten(3).flatten(1, 2)).view(batch, 3, 3, count)
-    points_gradient = R_wc @ slope.flatten(1, 2)
-    across = (R_wc @ upper[:, :, :, 3:].reshape(batch, R_wc.shape[-1], -1)).view(batch, 3, dims - 3, count)
+    dims, leading, R_wc = expansion.gradient.shape[2], free.shape[1], R_cw.mT
+    upper = expansion.hessian[:, :, :3]
+    curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, F, 3, 3, P): R^T C R
+    slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
+    points, points_gradient, points_camera = curve.sum(1), slope.sum(1), across.sum(1)
 
-    # Pose against point: G^T C R.
-    rotated, near, R_cw = rotated[:, :leading], points_c[:, :leading], R_cw[:, :leading]
-    coupling = torch.stack((*rotated.unbind(2), *_cross(near[..., None, :], rotated)), dim=2)
-    sums = _sum_by_frame(slope[:, :leading], upper[:, :leading, :, 3:], coupling, near, R_cw, exact)
+    slope, curve, across, rays_w = (part[:, :leading] for part in (slope, curve, across, rays_w))
+    coupling = torch.stack((*curve.unbind(2), *_cross(rays_w[..., None, :], curve)), dim=2)
+    sums = _sum_by_frame(slope, across, coupling, rays_w, exact)
     if exact:
-        bend = torch.stack(_cross(slope[:, :leading, :, None], R_cw[..., None]), dim=2)
+        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[None, None, ..., None]
+        bend = torch.stack(_cross(slope[:, :, :, None], eye), dim=2)
         coupling = coupling - torch.nn.functional.pad(bend, (0, 0, 0, 0, 3, 0))
     gradient, frames, frames_camera = sums
     if not free.all():  # what only fills up stays where it is
@@ -73,7 +74,7 @@ def assemble_grid(
     if dims > 3:
         frames_camera = frames_camera.flatten(1, 2)
         camera = expansion.hessian[:, :, 3:, 3:].sum((1, -1))
-        coupling = torch.cat((coupling, across.transpose(1, 2)), dim=1)
+        coupling = torch.cat((coupling, points_camera.transpose(1, 2)), dim=1)
         reduced = torch.cat(
             (
                 torch.cat((reduced, frames_camera), dim=-1),
@@ -85,6 +86,11 @@ def assemble_grid(
     return GridEquations(gradient, points_gradient, reduced, points, coupling)
 
 
+def _times(R: Tensor, columns: Tensor) -> Tensor:
+    """R (B, F, 3, 3) times columns (B, F, 3, n, P)."""
+    return (R @ columns.flatten(3)).view_as(columns)
+
+
 def _cross(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """a x b along dimension 2."""
     (a0, a1, a2), (b0, b1, b2) = a.unbind(2), b.unbind(2)
@@ -92,20 +98,18 @@ def _cross(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sum_by_frame(
-    slope: Tensor, across: Tensor, coupling: Tensor, points_c: Tensor, R_cw: Tensor, exact: bool
+    slope: Tensor, across: Tensor, coupling: Tensor, rays_w: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """G^T q (B, F, 6), G^T C G (B, F, 6, 6) and G^T C_camera (B, F, 6, K) summed over the points, G = [I, -p^].
+    """G^T q (B, F, 6), G^T C G (B, F, 6, 6) and G^T C_camera (B, F, 6, K) summed over the points, G = [I, -r^].
 
-    They are sums of q, C_camera and G^T C R (B, F, 6, 3, P) times 1 and p.
+    They are sums of q, C_camera and G^T C (B, F, 6, 3, P) times 1 and r.
     """
-    num_camera, cross = across.shape[3], _CROSS.to(points_c.dtype).to(points_c.device)
-    affine = torch.cat((torch.ones_like(points_c[:, :, :1]), points_c), dim=2).mT
+    num_camera, cross = across.shape[3], _CROSS.to(rays_w.dtype).to(rays_w.device)
+    affine = torch.cat((torch.ones_like(rays_w[:, :, :1]), rays_w), dim=2).mT
     pushed = slope @ affine  # (B, F, 3, 4)
     outer = pushed[..., 1:]
     torque = torch.einsum("bmj,xfjm->xfb", cross, outer)
-    moments = R_cw[:, :, None] @ (coupling.flatten(2, 3) @ affine).unflatten(
-        2, (6, 3)
-    )  # (B, F, 6, 3, 4): of G^T C
+    moments = (coupling.flatten(2, 3) @ affine).unflatten(2, (6, 3))  # (B, F, 6, 3, 4)
     frames = torch.cat((moments[..., 0], torch.einsum("clk,xfakl->xfac", cross, moments[..., 1:])), dim=-1)
     if exact:
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)

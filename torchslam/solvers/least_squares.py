@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.robust import Kernel, robustify
 from torchslam.solvers import levenberg
 from torchslam.solvers.folding import Tensors, chosen, taken
 from torchslam.solvers.implicit import Backward, Ndims, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence
 from torchslam.solvers.linear import DefiniteFactor, factorize
 from torchslam.solvers.manifold import Manifold, Product
-from torchslam.solvers.residuals import Linearization, pull
-from torchslam.solvers.robust import Kernel, robustify
+from torchslam.solvers.residuals import Linearization, flat_along
 
 Residual = Callable[..., Tensor]
 """residual(*unknowns, *inputs) -> (B, N) or (B, N, D), each element from its own rows alone."""
@@ -183,7 +183,7 @@ class _Problem:
         J = vmap(lambda step: jvp(moved, (zero,), (step,))[1], out_dims=-1)(basis)
         lin = self._weighed(r, J)
         J = lin.J.flatten(1, 2)
-        hessian = J.mT @ pull(lin, lin.J, near[:, None]).flatten(1, 2)
+        hessian = J.mT @ _pull(lin, near[:, None]).flatten(1, 2)
         gradient = (J.mT @ lin.force.flatten(1)[..., None]).squeeze(-1)
         return _Model(unknowns, lin.cost.sum(1), gradient, hessian)
 
@@ -233,6 +233,14 @@ class _Problem:
         _, weights, scale, _ = self.data
         rho, slope, curvature = robustify(weights * residual.square().sum(-1), self.kernel, scale[:, None])
         return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
+
+
+def _pull(lin: Linearization, near: Tensor) -> Tensor:
+    """The Hessians of the costs in the residuals times J, (B, N, D, n); `near` as in `gauss_newton_expansion`."""
+    residual, weight = lin.residual, lin.weight
+    bend = flat_along(weight, lin.bend, residual.square().sum(-1), near)
+    along = (residual[..., None, :] @ lin.J) * (bend[..., None] * residual)[..., None]
+    return weight[..., None, None] * lin.J + along
 
 
 class _Minimization:

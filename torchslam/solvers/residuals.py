@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.solvers.robust import Kernel, robustify
+from torchslam.geometry.robust import Kernel, robustify
 
 
 @dataclass(frozen=True)
@@ -136,28 +136,15 @@ def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, 
     focal, centre = camera.params[..., None, :2], camera.params[..., None, 2:4]
     normalized = points_c[..., :2] / torch.where(valid, depth, 1.0)
     stretch = focal / torch.where(valid, depth, 1.0)
-    J_points = torch.cat((torch.diag_embed(stretch), (-stretch * normalized)[..., None]), dim=-1)
+    (fx, fy), (x, y) = stretch.unbind(-1), (-stretch * normalized).unbind(-1)
+    zero = torch.zeros_like(x)
+    # Entry by entry in memory, as `gauss_newton_expansion` reads them.
+    J_points = torch.stack((fx, zero, x, zero, fy, y)).unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
     return normalized * focal + centre, valid[..., 0], J_points
 
 
-def pull(linearization: Linearization, J: Tensor, near: Tensor | None) -> Tensor:
-    """The Hessian of the cost with respect to the residual, times J: (weight * I + bend * r r^T) J.
-
-    J: (..., N, 2, D) d residual / d anything. Across the residual of an outlier the Hessian is positive, along it
-    negative. `near`, broadcastable to (..., N), says where the negative part counts as flat, which keeps the
-    Gauss-Newton matrix positive semi-definite and converges several times faster close to the optimum; elsewhere bend
-    counts as zero (iteratively reweighted least squares), which descends from afar. None: the exact Hessian.
-    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
-    """
-    residual, weight, bend = linearization.residual, linearization.weight, linearization.bend
-    if near is not None:
-        bend = flat_along(weight, bend, residual.square().sum(-1), near)
-    along = (residual[..., None, :] @ J) * (bend[..., None] * residual)[..., None]
-    return weight[..., None, None] * J + along
-
-
 def flat_along(weight: Tensor, bend: Tensor, squared: Tensor, near: Tensor) -> Tensor:
-    """The bend (..., N) that `pull` takes for residuals of these squares, px^2."""
+    """The bend (..., N) that `gauss_newton_expansion` takes for residuals of these squares, px^2."""
     flat = -weight / torch.where(squared > 0, squared, 1.0)
     return torch.maximum(bend, flat) * near
 
@@ -177,9 +164,21 @@ class Expansion(NamedTuple):
         return Expansion(gradient, columns.mT @ self.hessian @ columns)
 
 
-def gauss_newton_expansion(lin: Linearization, near: Tensor) -> Expansion:
-    """Gradient, and Hessian without the bend of the projection; `near` as in `pull`."""
-    return Expansion((lin.J.mT @ lin.force[..., None]).squeeze(-1), lin.J.mT @ pull(lin, lin.J, near))
+def gauss_newton_expansion(lin: Linearization, J: Tensor, near: Tensor) -> Expansion:
+    """Gradient (D, ..., N) and Hessian (D, D, ..., N) in what moves pixels by J (2, D, ..., N), without the bend of the
+    projection.
+
+    `near`, broadcastable to (..., N), says where the kernel's curvature counts. Across the residual of an outlier the
+    Hessian is positive, along it negative: the negative part then counts as flat, which keeps the matrix positive
+    semi-definite and converges several times faster close to the optimum. Elsewhere the curvature counts as zero
+    (iteratively reweighted least squares), which descends from afar.
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
+    """
+    bend = flat_along(lin.weight, lin.bend, lin.residual.square().sum(-1), near)
+    pulled = (J[0] * lin.residual[..., 0]).addcmul(J[1], lin.residual[..., 1])  # J^T r
+    weighted = lin.weight * J
+    hessian = (weighted[0][:, None] * J[0]).addcmul(weighted[1][:, None], J[1])
+    return Expansion(lin.weight * pulled, hessian.addcmul((bend * pulled)[:, None], pulled))
 
 
 def exact_expansion(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Expansion:
@@ -189,7 +188,8 @@ def exact_expansion(observations: Observations, points_c: Tensor, free_camera: b
     """
     lin = linearize(observations, points_c, free_camera)
     force = lin.force[..., None]
-    hessian = lin.J.mT @ pull(lin, lin.J, near=None)
+    along = (lin.residual[..., None, :] @ lin.J) * (lin.bend[..., None] * lin.residual)[..., None]
+    hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
     hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
     return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
 

@@ -11,6 +11,7 @@ Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -68,6 +69,11 @@ class Structure:
         flat = values.flatten(1)[self.by_point]
         total = torch.segment_reduce(flat, "sum", lengths=self.point_counts, unsafe=True)
         return total.view(self.num_points, *values.shape[1:])
+
+    def sum_by_frame(self, values: Tensor) -> Tensor:
+        """Sums over each free frame's observations. (..., O) -> (F, ...)."""
+        sums = [values[..., begin:end].sum(-1) for begin, end in pairwise((0, *self.frame_ends))]
+        return torch.stack(sums) if sums else values.new_zeros(0, *values.shape[:-1])
 
 
 def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, num_points: int) -> Structure:

@@ -208,6 +208,8 @@ class IndependentMotion:
             self.camera,
             self.camera,
             threshold=self.settings.threshold_px,
+            kernel="truncated",
+            min_samples=64,
         )
         group = rows[motion.inliers[0]]
         enough = max(self.settings.min_matches, self.settings.min_share * len(rows))

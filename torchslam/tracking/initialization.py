@@ -138,6 +138,8 @@ class Initializer:
             self.camera,
             threshold=self.config.initialization.threshold_px,
             seed=self.config.seed,
+            kernel="truncated",
+            min_samples=64,
         )
 
     def _judge(

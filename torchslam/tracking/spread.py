@@ -41,12 +41,23 @@ def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
     Where one thing with much texture moves before a scene with little, most matches are its.
     """
+    order, rank = _ranks(pixels, size)
+    return torch.sort(order[rank < PER_CELL]).values
+
+
+def evenly(pixels: Tensor, size: tuple[int, int], count: int) -> Tensor:
+    """(m,) `count` rows of pixels (n, 2), all if there are fewer: as many of each cell of the image, if it can."""
+    order, rank = _ranks(pixels, size)
+    return torch.sort(order[torch.sort(rank, stable=True).indices[:count]]).values
+
+
+def _ranks(pixels: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(n,) rows of pixels (n, 2), cell of the image by cell, and (n,) the how many-th of its cell each is."""
     cell = cells(pixels, size)
     order = torch.argsort(cell, stable=True)
     ordered = cell[order]
     counts = torch.bincount(ordered, minlength=CELLS[0] * CELLS[1])
-    rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
-    return torch.sort(order[rank < PER_CELL]).values
+    return order, torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
 
 
 def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:

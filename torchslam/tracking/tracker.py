@@ -19,8 +19,8 @@ from torchslam.geometry import (
     squared_reprojection_errors,
     transform,
 )
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.solvers.robust import Kernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
 from torchslam.values import Tracked, View
@@ -266,6 +266,12 @@ class Tracker:
         world.track = replace(
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
+
+    def see(self, slam_map: Map, tracked: Tracked) -> None:
+        """A frame that was not asked for all that it should see: what it saw was there to be seen."""
+        if self.counts:
+            slam_map.points["times_visible"][tracked.point_ids] += 1
+        self.vouch(slam_map, tracked)
 
     def vouch(self, slam_map: Map, tracked: Tracked) -> None:
         """A frame is believed: it speaks for the points that it saw."""

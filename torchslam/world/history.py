@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.solvers.graph import GraphSolution, ObservationGraph
 from torchslam.values import Tracked, Trajectory, View
-from torchslam.world.map import Map, key_of
+from torchslam.world.map import NO_KEYPOINT, Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
 
@@ -22,7 +22,8 @@ class RunGraph(ObservationGraph):
     frame_ids:      (F,) frames of the sequence of their session
     sessions:       (F,) which run over the map saw them
     point_ids:      (P,) rows of the points of the map of their world
-    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end
+    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
+                    NO_KEYPOINT where a patch was followed
     """
 
     frame_ids: Tensor
@@ -51,7 +52,9 @@ class History:
         self.observations.append(
             row=row.expand(tracked.inliers),
             point_ids=tracked.point_ids,
-            keypoints=tracked.keypoints,
+            keypoints=tracked.keypoints
+            if view.has_features
+            else torch.full_like(tracked.keypoints, NO_KEYPOINT),
             pixels=view.keypoints[tracked.keypoints],
             scales=view.scales[tracked.keypoints],
         )
@@ -178,16 +181,20 @@ class History:
         is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
         is_seen[point_ids] = True
         rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
-        own = {name: self.observations[name][rows] for name in ("row", "keypoints", "pixels", "scales")}
         keyframes = slam_map.keyframes
+
+        def with_own(values: Tensor, name: str) -> Tensor:
+            """A column at a time: the observations are most of what a long run holds in memory."""
+            return torch.cat([values, self.observations[name][rows]])
+
         return RunGraph(
             timestamps=torch.cat([keyframes["timestamp"], self.frames["timestamp"][between]]),
             T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
             points_w=slam_map.positions_w[point_ids],
-            frame_index=torch.cat([seen.keyframe_index, slot[own["row"]]]),
+            frame_index=torch.cat([seen.keyframe_index, slot[self.observations["row"][rows]]]),
             point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
-            pixels=torch.cat([seen.pixels, own["pixels"]]),
-            weights=torch.cat([seen.scales, own["scales"]]) ** -2,
+            pixels=with_own(seen.pixels, "pixels"),
+            weights=with_own(seen.scales, "scales") ** -2,
             camera=camera,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
@@ -195,7 +202,7 @@ class History:
             world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
             sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
             point_ids=point_ids,
-            keypoint_index=torch.cat([seen.keypoint_index, own["keypoints"]]),
+            keypoint_index=with_own(seen.keypoint_index, "keypoints"),
         )
 
     def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:

@@ -17,6 +17,8 @@ from torchslam.world.schema import KEYFRAMES, POINTS
 from torchslam.world.table import Table
 
 NO_POINT = -1
+NO_KEYPOINT = -1  # of what a frame without features sees
+MIN_SHARED = 15  # points that two keyframes see, to count as neighbours
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 
 
@@ -85,14 +87,18 @@ class Map:
             mask=points["alive"][point_ids][None],
         )
 
-    def features(self, keyframes: Tensor) -> Features:
-        """What keyframes (k,) saw, as a batch, for matching."""
-        table = self.keyframes
-        scales, mask = table["scales"][keyframes], table["mask"][keyframes]
-        keypoints, angles, descriptors = (
-            table[name][keyframes] for name in ("keypoints", "angles", "descriptors")
-        )
+    def features(self, keyframes: Tensor, rows: Tensor | None = None) -> Features:
+        """What keyframes (k,) saw, as a batch, for matching: all keypoints, or some rows (k, n) of them."""
+        at = (keyframes,) if rows is None else (keyframes[:, None], rows)
+        names = ("keypoints", "scales", "angles", "descriptors", "mask")
+        keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
+
+    def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
+        """(k, 1), (k, 1) the finest and the coarsest scale among the keypoints of keyframes (k,)."""
+        scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
+        finest = scales.masked_fill(~mask, torch.inf).amin(1, keepdim=True)
+        return finest, scales.masked_fill(~mask, 0.0).amax(1, keepdim=True)
 
     def centre_covariances_w(self) -> Tensor:
         """(K, 3, 3) covariances of the positions of the keyframes, zero where unknown."""
@@ -222,12 +228,23 @@ class Map:
             **{name: row[name] for name in names},
         )
 
-    def covisible(self, keyframe: int, count: int, min_shared: int = 15) -> Tensor:
+    def shared(self, keyframes: Tensor) -> Tensor:
+        """(k, K) how many points each of keyframes (k,) shares with every other one; none with itself."""
+        table, count = self.keyframes["point_ids"][keyframes], self.num_keyframes
+        row, keypoint = torch.nonzero(table >= 0, as_tuple=True)
+        which, places = self._index_of_points.of(table[row, keypoint])
+        pairs = row[which] * count + places // self._keypoints
+        shared = torch.bincount(pairs, minlength=len(keyframes) * count).view(-1, count)
+        return shared.scatter_(1, keyframes[:, None], 0)
+
+    def covisible(self, keyframe: int, count: int, min_shared: int = MIN_SHARED) -> Tensor:
         """(<= count,) keyframes that share most points with this one, best first, itself excluded."""
-        seen = self.keyframes["point_ids"][keyframe]
-        shared = self.observers(seen[seen >= 0])
-        shared[keyframe] = 0
-        return most(shared, count, min_shared)
+        return most(self.shared(self.ids(keyframe))[0], count, min_shared)
+
+    def around(self, keyframes: Tensor, count: int) -> Tensor:
+        """(n,) keyframes (k,) and those that share most points with each of them, `count` at most, ascending."""
+        near = [most(shared, count, MIN_SHARED) for shared in self.shared(keyframes)]
+        return torch.unique(torch.cat([keyframes, *near]))
 
     def points_seen_by(self, keyframes: Tensor) -> Tensor:
         """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from torchslam.geometry import Camera
 from torchslam.values import View
-from torchslam.world.map import Map
+from torchslam.world.map import NO_KEYPOINT, Map
 from torchslam.world.schema import Schema
 
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; no columns at all where a table is empty."""
 
-FINITE = ("T_cw", "T_cr", "positions_w", "timestamp")  # what everything else is computed from
+# What everything else is computed from.
+FINITE = ("T_cw", "T_cr", "positions_w", "timestamp", "keypoints", "scales", "pixels", "reach")
 
 
 def check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
@@ -128,7 +129,7 @@ def _check_rows(columns: Columns, sessions: int) -> None:
         (frames, "reference", 0, num_keyframes),
         (seen, "row", 0, num_frames),
         (seen, "point_ids", 0, num_points),
-        (seen, "keypoints", 0, None),
+        (seen, "keypoints", NO_KEYPOINT, None),
     )
     for table, name, low, end in ranges:
         rows = table.get(name)

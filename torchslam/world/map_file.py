@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
+from torchslam.regular_file import check_regular, parse_json
 from torchslam.whole_file import write_whole
 from torchslam.world.map import Map
 from torchslam.world.map_check import check_camera, check_keys, check_world
@@ -35,6 +36,8 @@ TABLES: dict[str, Schema] = {
     "observations": OBSERVATIONS,
 }
 CAMERA = "camera.params"
+MOST = 1 << 31  # worlds and sessions
+MAX_BYTES = 1 << 34  # of a map of 100,000 keyframes
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def unpack(
             own = {name[len(start) :]: rows for name, rows in tensors.items() if name.startswith(start)}
             worlds.append(_world(number, own, camera, sessions, device))
         check_keys([world.map for world in worlds])
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
@@ -139,17 +142,21 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     from safetensors import SafetensorError, safe_open
 
     try:
+        check_regular(path, MAX_BYTES, "a map that is read")
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
             tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise ResultsError(f"{path}: no map file") from None
-    except (OSError, SafetensorError) as error:
+    except OSError as error:
+        raise ResultsError(f"{path}: not a readable safetensors file: {error.strerror or error}") from None
+    except (SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        # ... or one of a type of numbers, or with a name, that PyTorch does not know
         raise ResultsError(f"{path}: not a readable safetensors file: {error}") from None
     if metadata.keys() != {"torchslam"}:
         raise ResultsError(f"{path}: a safetensors file, but not a torchslam map")
     try:
-        about = json.loads(metadata["torchslam"])
+        about = parse_json(metadata["torchslam"])
         found = about["format"]
     except (ValueError, KeyError, TypeError):
         raise ResultsError(f"{path}: a safetensors file, but not a torchslam map") from None
@@ -195,8 +202,10 @@ def _numbers(about: dict[str, Any]) -> tuple[list[int], int, int]:
     """The numbers of the worlds, how many ever began, and how many sessions there were."""
     numbers, begun, sessions = about["worlds"], about["begun"], about["sessions"]
     whole = [*numbers, begun, sessions]
-    if not all(isinstance(number, int) and not isinstance(number, bool) and number >= 0 for number in whole):
-        raise ValueError(f"worlds {numbers}, begun {begun}, sessions {sessions}: must be numbers from 0")
+    if not all(type(number) is int and 0 <= number < MOST for number in whole):
+        raise ValueError(
+            f"worlds {numbers}, begun {begun}, sessions {sessions}: must be numbers from 0 to {MOST}"
+        )
     if len(set(numbers)) != len(numbers) or max(numbers, default=-1) >= begun:
         raise ValueError(f"worlds {numbers} of {begun} that began: numbers must differ and lie below")
     return numbers, begun, sessions

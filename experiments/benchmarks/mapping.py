@@ -1,0 +1,164 @@
+"""Does a keyframe cost more the more of them the map has?
+
+    python -m experiments.benchmarks.mapping [--output FILE]
+
+A camera goes along a wall of points, with keyframes of known pose; the next ones are mapped, adjusted and looked for
+among the places seen before, in maps of different sizes by turns. Prints a table and writes it to FILE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments.common import table
+from torchslam.config import Config
+from torchslam.geometry import Camera, transform
+from torchslam.loops.memory import Memory
+from torchslam.mapping.mapper import Mapper
+from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.tracker import Tracker
+from torchslam.values import Tracked, View
+from torchslam.world.worlds import Worlds
+
+HERE = Path(__file__).parent
+SIZES, NEXT = (200, 1000, 5000), 31
+CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
+STEP, SPACING, DEPTH = 0.4, 0.008, 4.0  # metres from keyframe to keyframe, from point to point, to the wall
+KEYPOINTS = 1000  # of a keyframe, as the default front end finds
+LEVELS, NOISE_PX = 4, 0.5
+UNMAPPED = 3  # every so many points of the wall are not in the map: the new keyframes triangulate them
+
+
+class Walk:
+    """A world of so many keyframes along the wall, and the stages that take the next ones."""
+
+    def __init__(self, keyframes: int) -> None:
+        g = self.generator = torch.Generator().manual_seed(0)
+        count = int(((keyframes + NEXT) * STEP + 3 * DEPTH) / SPACING)
+        scatter = torch.rand(count, 2, generator=g, dtype=torch.float64) - 0.5
+        x = SPACING * torch.arange(count, dtype=torch.float64) - 1.5 * DEPTH
+        self.points_w = torch.stack((x, 0.8 * DEPTH * scatter[:, 0], DEPTH + scatter[:, 1]), dim=-1)
+        self.descriptors = torch.randint(0, 256, (count, 32), generator=g, dtype=torch.uint8)
+        self.scales = 1.2 ** torch.randint(0, LEVELS, (count,), generator=g).double()
+        self.rows = torch.full((count,), -1)  # of the points in the map
+        self.worlds = Worlds(CAMERA.params)
+        self.world = self.worlds.begin()
+        self.tracker = Tracker(CAMERA, Config())
+        self.mapper = Mapper(CAMERA, Config(), Stopwatch())
+        for index in range(keyframes):
+            self._add(index)
+        slam_map = self.world.map
+        for some in torch.arange(keyframes).split(100):
+            slam_map.refresh(some)
+        self.world.asked = keyframes
+        self.memory = Memory(CAMERA, Config(), self.worlds)
+
+    def look(self, index: int) -> tuple[View, Tensor]:
+        """What the camera sees at a step of its way, and which points of the wall these are."""
+        T_cw = torch.eye(4, dtype=torch.float64)
+        T_cw[0, 3] = -index * STEP
+        first = int(index * STEP / SPACING)
+        near = torch.arange(first, min(first + int(3 * DEPTH / SPACING), len(self.rows)))
+        pixels, valid = CAMERA.project(transform(T_cw, self.points_w[near]))
+        inside = torch.nonzero(valid & CAMERA.in_image(pixels))[:KEYPOINTS, 0]
+        seen, missing = near[inside], KEYPOINTS - len(inside)
+        noise = NOISE_PX * torch.randn(len(seen), 2, generator=self.generator, dtype=torch.float64)
+
+        def padded(values: Tensor) -> Tensor:
+            return torch.cat([values, values.new_zeros(missing, *values.shape[1:])])
+
+        view = View(
+            index,
+            float(index),
+            padded(pixels[inside] + noise),
+            padded(self.scales[seen] - 1) + 1,
+            torch.zeros(KEYPOINTS, dtype=torch.float64),
+            padded(self.descriptors[seen]),
+            torch.arange(KEYPOINTS) < len(seen),
+            T_cw,
+        )
+        return view, seen
+
+    def _add(self, index: int) -> None:
+        """A keyframe of the map as it was made: it sees what it can of the points, new ones are added."""
+        slam_map = self.world.map
+        view, seen = self.look(index)
+        assert view.T_cw_groundtruth is not None
+        keyframe = slam_map.add_keyframe(view, view.T_cw_groundtruth)
+        new = seen[(self.rows[seen] < 0) & (seen % UNMAPPED > 0)]
+        self.rows[new] = slam_map.add_points(self.points_w[new], self.descriptors[new], keyframe)
+        at = torch.nonzero(self.rows[seen] >= 0)[:, 0]
+        slam_map.observe(keyframe, at, self.rows[seen[at]])
+
+    def next(self) -> dict[str, float]:
+        """Map the next keyframe; returns the milliseconds of the process by stage."""
+        slam_map = self.world.map
+        index = int(slam_map.keyframes["frame_index"][-1]) + 1
+        view, seen = self.look(index)
+        assert view.T_cw_groundtruth is not None
+        known = self.rows[seen] >= 0
+        ids = slam_map.resolve(self.rows[seen[known]])  # of merged points the heirs
+        alive = slam_map.points["alive"][ids]
+        at, ids = torch.nonzero(known)[alive, 0], ids[alive]
+        eye = torch.eye(6, dtype=torch.float64)
+        tracked = Tracked(view.T_cw_groundtruth, ids, at, len(ids), 1e-6 * eye, DEPTH)
+        spent: dict[str, float] = {}
+
+        def timed(stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+            begin = time.process_time()
+            answer = function(*arguments)
+            spent[stage] = 1e3 * (time.process_time() - begin)
+            return answer
+
+        keyframe = timed("mapping, bundle", self.mapper.insert, slam_map, view, tracked)
+        timed("memory", self.memory.add, slam_map, keyframe)
+        timed("local map", self.tracker.follow, self.world, keyframe)
+        timed("recognition", self.memory.recognizer.recognize, self.world, keyframe)
+        keys = slam_map.keys
+        renumbering = timed("tidy", self.mapper.tidy, self.world)
+        if renumbering is not None:
+            self.memory.remove(keys[renumbering.keyframes < 0])
+            self.rows = torch.where(self.rows >= 0, renumbering.points[self.rows], -1)
+        at = torch.nonzero(slam_map.keyframes["point_ids"][-1, : len(seen)] >= 0)[:, 0]
+        self.rows[seen[at]] = slam_map.keyframes["point_ids"][-1, at]
+        return spent
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, default=HERE / "mapping.md")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    with torch.inference_mode():
+        walks = {size: Walk(size) for size in SIZES}
+        spent: dict[int, list[dict[str, float]]] = {size: [] for size in SIZES}
+        for _ in range(NEXT):
+            for size, walk in walks.items():
+                spent[size].append(walk.next())
+    rows = []
+    for stage in spent[SIZES[0]][0]:
+        ms = [statistics.median(each[stage] for each in spent[size]) for size in SIZES]
+        rows.append([stage, *(f"{each:.1f}" for each in ms), f"{ms[-1] / ms[0]:.2f}"])
+    header = ["ms of one keyframe", *(f"{size} keyframes" for size in SIZES), f"{SIZES[-1]} / {SIZES[0]}"]
+    text = (
+        "# A keyframe in a small map and in a large one\n\nSimulated: a camera goes along a wall. One thread, "
+        f"medians of {NEXT} keyframes, CPU time of the process, the three maps by turns.\n\n"
+        "    python -m experiments.benchmarks.mapping\n\n"
+        f"{table(header, rows)}"
+    )
+    print(text)
+    arguments.output.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""Relative pose of real pairs of images, by threshold, beside poselib and OpenCV's MAGSAC, in one run, on one thread.
+
+    python -m experiments.benchmarks.relative_pose [--data FOLDER] [--output FILE] [--pairs 60]
+
+FOLDER holds the sequences; about so many pairs are taken of each. Every estimator gets the same matches: ORB, mutual
+and by ratio, undistorted. The error of a pair is the larger of those of rotation and of the translation's direction,
+infinite where an estimator gives no pose; "auto" gives one where it says `success`, the others almost always.
+Pairs whose true baseline is short beside what the ground truth is known to have no true direction and are left out.
+Times are CPU time of the thread, so that other work on the machine counts as little as possible, taken in turns with
+the peers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import poselib
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from torchslam.data import open_sequence
+from torchslam.data.sequence import Sequence
+from torchslam.features import ORB, match
+from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
+from torchslam.geometry.relative_pose import Model
+from torchslam.values import Features
+
+HERE = Path(__file__).parent
+# Sequences with the least baseline in metres whose direction the ground truth tells, to some degrees: several times
+# what it is good to.
+SEQUENCES = {"redkitchen": 0.1, "kitti07": 0.5, "machine_hall": 0.03, "fr2_desk_20": 0.05, "shelf_bin": 0.02}
+GAPS_S = (0.2, 0.4, 0.6, 0.8, 1.0)
+THRESHOLDS = (0.5, 1.0, 2.0, 4.0)
+ANGLES = (5, 10, 20)
+MIN_MATCHES = 8
+CONFIDENCE = 0.9999  # of every estimator
+
+
+class Pair(NamedTuple):
+    """Undistorted pixels (M, 2) of the matches, the true motion T_21 (4, 4), and the camera without distortion."""
+
+    sequence: str
+    frames: tuple[int, int]
+    pixels_1: Tensor
+    pixels_2: Tensor
+    T_21: Tensor
+    camera: Camera
+
+
+class Pose(NamedTuple):
+    """R (3, 3) and t (3,)."""
+
+    R: NDArray
+    t: NDArray
+
+
+Estimator = Callable[[Pair, float], Pose | None]
+
+
+def pairs_of(sequence: Sequence, least_baseline: float, count: int) -> list[Pair]:
+    """About `count` pairs of a sequence that have a true direction, evenly spread over gaps and time."""
+    chosen = []
+    for gap_s in GAPS_S:
+        gap = max(1, round(gap_s * sequence.frame_rate))
+        usable = []
+        for first in range(len(sequence) - gap):
+            T_1w, T_2w = sequence.pose(first), sequence.pose(first + gap)
+            if T_1w is None or T_2w is None:
+                continue
+            T_21 = T_2w @ se3_inverse(T_1w)
+            if float(T_21[:3, 3].norm()) >= least_baseline:
+                usable.append((first, first + gap, T_21))
+        rows = np.linspace(0, len(usable) - 1, min(len(usable), math.ceil(count / len(GAPS_S)))).astype(int)
+        chosen += [usable[row] for row in rows]
+    extract, seen = ORB(1000), {}
+    for index in sorted({index for first, second, _ in chosen for index in (first, second)}):
+        seen[index] = extract(sequence[index].image)
+    fx, fy, cx, cy = sequence.camera.params[:4].tolist()
+    camera = Camera.pinhole(fx, fy, cx, cy, size=sequence.size)
+    pairs = []
+    for first, second, T_21 in chosen:
+        pixels_1, pixels_2 = (
+            undistorted(pixels, sequence.camera) for pixels in matched(seen[first], seen[second])
+        )
+        if len(pixels_1) >= MIN_MATCHES:
+            pairs.append(Pair(sequence.name, (first, second), pixels_1, pixels_2, T_21.double(), camera))
+    return pairs
+
+
+def matched(first: Features, second: Features) -> tuple[Tensor, Tensor]:
+    """Pixels (M, 2) of the matches in both images."""
+    matches = match(first, second)
+    rows = matches.mask[0]
+    pixels_1 = first.keypoints[0][matches.indices_1[0][rows]]
+    pixels_2 = second.keypoints[0][matches.indices_2[0][rows]]
+    return pixels_1.double(), pixels_2.double()
+
+
+def undistorted(pixels: Tensor, camera: Camera) -> Tensor:
+    """Pixels (M, 2) as the same camera without distortion sees them."""
+    camera = camera.to(torch.float64)
+    return camera.normalize(pixels) * camera.params[:2] + camera.params[2:4]
+
+
+# --- estimators ---
+
+
+def by_torchslam(pair: Pair, threshold: float, model: Model) -> Pose | None:
+    found = estimate_relative_pose(
+        pair.pixels_1[None],
+        pair.pixels_2[None],
+        pair.camera,
+        pair.camera,
+        threshold,
+        confidence=CONFIDENCE,
+        model=model,
+    )
+    T_21 = found.T_21[0].numpy()
+    return Pose(T_21[:3, :3], T_21[:3, 3]) if model == "essential" or bool(found.success[0]) else None
+
+
+def batched_ms(pairs: list[Pair], threshold: float, model: Model) -> float:
+    """CPU milliseconds per pair where all those of one camera go in one call."""
+    spent = 0.0
+    for _, group in groupby(pairs, lambda pair: pair.sequence):
+        members = list(group)
+        pixels_1, pixels_2 = (
+            pad_sequence(side, batch_first=True, padding_value=math.nan)
+            for side in ([pair.pixels_1 for pair in members], [pair.pixels_2 for pair in members])
+        )
+        camera = members[0].camera
+        begin = time.thread_time()
+        estimate_relative_pose(
+            pixels_1, pixels_2, camera, camera, threshold, confidence=CONFIDENCE, model=model
+        )
+        spent += time.thread_time() - begin
+    return 1e3 * spent / len(pairs)
+
+
+def by_poselib(pair: Pair, threshold: float) -> Pose | None:
+    width, height = pair.camera.size
+    camera = {"model": "PINHOLE", "width": width, "height": height, "params": pair.camera.params.tolist()}
+    ransac = {"max_epipolar_error": threshold, "success_prob": CONFIDENCE, "seed": 0}
+    pose, _ = poselib.estimate_relative_pose(
+        pair.pixels_1.numpy(), pair.pixels_2.numpy(), camera, camera, ransac, {}
+    )
+    return Pose(pose.R, pose.t) if np.isfinite(pose.t).all() else None
+
+
+def by_magsac(pair: Pair, threshold: float) -> Pose | None:
+    x_1, x_2, K = pair.pixels_1.numpy(), pair.pixels_2.numpy(), pair.camera.K.numpy()
+    cv2.setRNGSeed(0)
+    E, mask = cv2.findEssentialMat(x_1, x_2, K, cv2.USAC_MAGSAC, CONFIDENCE, threshold)
+    if E is None or E.shape != (3, 3):
+        return None
+    _, R, t, _ = cv2.recoverPose(E, x_1, x_2, K, mask=mask)
+    return Pose(R, t[:, 0])
+
+
+def error_deg(pose: Pose | None, T_21: Tensor) -> float:
+    """The larger of the errors of rotation and direction; infinite without a pose."""
+    if pose is None or not pose.t.any():
+        return math.inf
+    rotation = float(so3_log(torch.tensor(pose.R) @ T_21[:3, :3].mT).norm())
+    t, truth = torch.tensor(pose.t), T_21[:3, 3]
+    direction = float(torch.atan2(torch.linalg.cross(t, truth).norm(), t @ truth))
+    return math.degrees(max(rotation, direction))
+
+
+def area_under_curve(errors: list[float], angle: float) -> float:
+    """Percent: the mean over thresholds from 0 to `angle` of the share of errors below them."""
+    return 100 * float(np.mean([max(0.0, 1 - error / angle) for error in errors]))
+
+
+class Outcome(NamedTuple):
+    """Of one estimator at one threshold: errors in degrees and CPU milliseconds, per pair."""
+
+    errors: list[float]
+    ms: list[float]
+
+
+def measured(pairs: list[Pair], estimators: dict[str, Estimator]) -> dict[tuple[str, float], Outcome]:
+    """Every estimator at every threshold, in turns."""
+    outcomes = {(name, threshold): Outcome([], []) for name in estimators for threshold in THRESHOLDS}
+    for pair in pairs:
+        for (name, threshold), outcome in outcomes.items():
+            begin = time.thread_time()
+            pose = estimators[name](pair, threshold)
+            outcome.ms.append(1e3 * (time.thread_time() - begin))
+            outcome.errors.append(error_deg(pose, pair.T_21))
+    return outcomes
+
+
+def report(pairs: list[Pair]) -> str:
+    estimators: dict[str, Estimator] = {
+        "torchslam, auto": partial(by_torchslam, model="auto"),
+        "torchslam, essential": partial(by_torchslam, model="essential"),
+        "poselib": by_poselib,
+        "OpenCV MAGSAC": by_magsac,
+    }
+    outcomes = measured(pairs, estimators)
+    names = [f"{name} {len(list(group))}" for name, group in groupby(pair.sequence for pair in pairs)]
+    lines = [
+        f"{len(pairs)} pairs ({', '.join(names)}), {', '.join(map(str, GAPS_S))} s apart; AUC at "
+        f"{', '.join(map(str, ANGLES))} degrees, percent. One thread.",
+        "",
+        "| threshold, px | " + " | ".join(f"{threshold:g}" for threshold in THRESHOLDS) + " |",
+        "|---" * (len(THRESHOLDS) + 1) + "|",
+    ]
+    for name in estimators:
+        cells = [
+            " / ".join(f"{area_under_curve(outcomes[name, threshold].errors, a):.1f}" for a in ANGLES)
+            for threshold in THRESHOLDS
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    lines += ["", "| CPU ms per pair: mean, median | " + " | ".join(f"{x:g}" for x in THRESHOLDS) + " |"]
+    lines.append("|---" * (len(THRESHOLDS) + 1) + "|")
+    for name in estimators:
+        times = [outcomes[name, threshold].ms for threshold in THRESHOLDS]
+        cells = [f"{statistics.mean(ms):.1f}, {statistics.median(ms):.1f}" for ms in times]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    models: tuple[Model, ...] = ("auto", "essential")
+    for model in models:
+        cells = [f"{batched_ms(pairs, threshold, model):.1f}" for threshold in THRESHOLDS]
+        lines.append(f"| torchslam, {model}, one call per sequence | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
+    parser.add_argument("--output", type=Path, default=HERE / "relative_pose.md")
+    parser.add_argument("--pairs", type=int, default=60, help="of images, per sequence")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    with torch.no_grad():
+        pairs: list[Pair] = []
+        for name, least_baseline in SEQUENCES.items():
+            pairs += pairs_of(open_sequence(arguments.data / name), least_baseline, arguments.pairs)
+        text = report(pairs)
+    print(text)
+    arguments.output.write_text(f"# Relative pose of real pairs\n\n{text}\n")
+
+
+if __name__ == "__main__":
+    main()

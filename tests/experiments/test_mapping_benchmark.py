@@ -1,0 +1,24 @@
+"""The walk of the mapping benchmark is one that the system maps."""
+
+from __future__ import annotations
+
+import torch
+
+from experiments.benchmarks.mapping import CAMERA, Walk
+from torchslam.geometry import fits, squared_reprojection_errors, transform
+
+
+def test_the_next_keyframes_see_old_points_and_new_ones_where_they_are() -> None:
+    with torch.inference_mode():
+        walk = Walk(12)
+        slam_map = walk.world.map
+        before = len(slam_map.points)
+        for _ in range(2):
+            assert set(walk.next()) == {"mapping, bundle", "memory", "local map", "recognition", "tidy"}
+        assert slam_map.num_keyframes == 14
+        seen = slam_map.observations(torch.tensor([13]))
+        assert int((seen.point_index < before).sum()) > 200
+        assert int((seen.point_index >= before).sum()) > 50
+        points_c = transform(slam_map.T_cw[13], slam_map.positions_w[seen.point_index])
+        errors = squared_reprojection_errors(points_c, seen.pixels, CAMERA)
+        assert float(fits(errors, seen.scales).double().mean()) > 0.95

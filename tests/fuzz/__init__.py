@@ -1,0 +1,1 @@
+"""Inputs that are wrong in every way: good ones, what is done to them, and who reads them."""

@@ -1,0 +1,261 @@
+"""Good inputs of every kind, as small as they can be: the files of each by their names."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+import zipfile
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tests.data.mp4 import write_mp4
+from tests.data.test_bag import STAMPS, Recording
+from tests.data.test_datasets import CAM_TO_CAM
+from tests.data.test_euroc import SENSOR
+from tests.fuzz.mutators import Files
+
+SIZE = (64, 48)
+VGA = (640, 480)
+
+
+def picture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """(H, W) uint8, smooth, so that its file is small."""
+    noise = np.random.default_rng(seed).integers(0, 256, (6, 8), dtype=np.uint8)
+    return cv2.resize(noise, size, interpolation=cv2.INTER_LINEAR)
+
+
+def encoded(image: np.ndarray, suffix: str = ".png") -> bytes:
+    return bytes(cv2.imencode(suffix, image)[1])
+
+
+def pictures(names: list[str], size: tuple[int, int] = SIZE) -> Files:
+    return {name: encoded(picture(index, size), Path(name).suffix) for index, name in enumerate(names)}
+
+
+def content_of(folder: Path) -> Files:
+    """The files below a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@cache
+def images() -> dict[str, Files]:
+    """An image of every kind that is read."""
+    colour = np.stack([picture(index) for index in range(3)], axis=-1)
+    found = {
+        suffix: encoded(picture(1), f".{suffix}") for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm")
+    }
+    found |= {
+        "ppm": encoded(colour, ".ppm"),
+        "colour.png": encoded(colour),
+        "colour.jpg": encoded(colour, ".jpg"),
+    }
+    found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
+    return {kind: {f"a.{kind}": content} for kind, content in found.items()}
+
+
+def tum() -> Files:
+    listing = "# timestamp filename\n" + "".join(f"{1000 + i / 10:.6f} rgb/{i}.png\n" for i in range(4))
+    poses = "# timestamp tx ty tz qx qy qz qw\n" + trajectory_text(7)
+    return pictures([f"rgb/{index}.png" for index in range(4)]) | {
+        "rgb.txt": listing.encode(),
+        "groundtruth.txt": poses.encode(),
+        "calibration.txt": b"60 61 31.5 23.5 -0.1 0.01 0.001 0.002\n",
+    }
+
+
+def trajectory_text(poses: int) -> str:
+    return "".join(f"{1000 + i / 20:.6f} {i / 20} 0.1 -2e-3 0 0 0.6 0.8\n" for i in range(poses))
+
+
+def euroc() -> Files:
+    times = [1403636579763555584 + 50_000_000 * index for index in range(3)]
+    rows = [f"{time + 1000},{index},0,0,1,0,0,0,9,9,9,9,9,9,9,9,9\n" for index, time in enumerate(times)]
+    return pictures([f"mav0/cam0/data/{time}.png" for time in times]) | {
+        "mav0/cam0/data.csv": (
+            "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in times)
+        ).encode(),
+        "mav0/cam0/sensor.yaml": SENSOR.encode(),
+        "mav0/state_groundtruth_estimate0/data.csv": ("#timestamp\n" + "".join(rows)).encode(),
+    }
+
+
+def kitti() -> Files:
+    return pictures([f"image_0/{index:06d}.png" for index in range(3)]) | {
+        "times.txt": b"0.000000e+00\n1.037430e-01\n2.074860e-01\n",
+        "calib.txt": b"P0: 70 0 31 0 0 71 23 0 0 0 1 0\nP1: 70 0 31 -8 0 71 23 0 0 0 1 0\n",
+        "poses.txt": b"1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 5 0 1 0 0 -1 0 0 0\n1 0 0 0 0 1 0 0 0 0 1 2\n",
+    }
+
+
+def kitti_raw() -> Files:
+    times = "".join(f"2011-09-26 13:02:25.{100_000_000 + i * 103_000_001:09d}\n" for i in range(3)).encode()
+    packets = {
+        f"drive_sync/oxts/data/{index:010d}.txt": f"{49 + index * 1e-5} 8.4 100 0.1 0 1.57 0 0 0\n".encode()
+        for index in range(3)
+    }
+    return (
+        pictures([f"drive_sync/image_00/data/{index:010d}.png" for index in range(3)])
+        | packets
+        | {
+            "drive_sync/image_00/timestamps.txt": times,
+            "drive_sync/oxts/timestamps.txt": times,
+            "calib_cam_to_cam.txt": CAM_TO_CAM.encode(),
+            "calib_velo_to_cam.txt": b"calib_time: x\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0.5\n",
+            "calib_imu_to_velo.txt": b"calib_time: x\nR: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n",
+        }
+    )
+
+
+def seven_scenes() -> Files:
+    poses = {f"frame-{i:06d}.pose.txt": f"1 0 0 {i}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n".encode() for i in range(3)}
+    return pictures([f"frame-{index:06d}.color.png" for index in range(3)]) | poses
+
+
+def tartanair() -> Files:
+    return pictures([f"image_left/{index:06d}_left.png" for index in range(3)]) | {
+        "pose_left.txt": b"0 0 0 0 0 0 1\n3 2 1 0 0 0.6 0.8\n3 2 1.5 0 0 0.6 0.8\n"
+    }
+
+
+def icl_nuim() -> Files:
+    return pictures([f"rgb/{index}.png" for index in (1, 2, 10)]) | {
+        "livingRoom0.gt.freiburg": b"1 0.1 0.2 0.3 0 0 0 1\n10 1 2 3 0.6 0 0 0.8\n11 0 0 0 0 0 0 1\n"
+    }
+
+
+def folder() -> Files:
+    names = ["images/1.png", "images/2.jpg", "images/10.png", "images/mask.png"]
+    return pictures(names) | {"calibration.txt": b"60 61 31.5 23.5\n"}
+
+
+def masked() -> Files:
+    frames = pictures([f"frames/{index}.png" for index in range(3)])
+    masks = {f"masks/{index}.png": encoded(np.full(SIZE[::-1], 255, np.uint8)) for index in range(2)}
+    return masks | {name: frames[name] for name in frames}
+
+
+def zipped() -> Files:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in tum().items():
+            archive.writestr(f"desk/{name}", content)
+    return {"desk.zip": buffer.getvalue()}
+
+
+@cache
+def videos() -> dict[str, Files]:
+    found = {}
+    frames = [np.stack([picture(index)] * 3, axis=-1) for index in range(5)]
+    with tempfile.TemporaryDirectory() as name:
+        write_mp4(Path(name) / "v.mp4", frames)
+        writer = cv2.VideoWriter(f"{name}/v.avi", cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE)
+        for frame in frames:
+            writer.write(frame)
+        writer.release()
+        for suffix in ("mp4", "avi"):
+            found[suffix] = {f"v.{suffix}": (Path(name) / f"v.{suffix}").read_bytes()}
+    return found
+
+
+@cache
+def bags() -> dict[str, Files]:
+    found = {}
+    with tempfile.TemporaryDirectory() as name:
+        for kind in ("ros1", "sqlite3", "mcap"):
+            target = Path(name) / kind / ("r.bag" if kind == "ros1" else "r")
+            target.parent.mkdir()
+            recording = Recording(target, kind)
+            recording.camera_info("/cam0/camera_info")
+            for index, stamp in enumerate(STAMPS):
+                recording.image("/cam0/image_raw", picture(index), stamp)
+            recording.close()
+            found[kind] = content_of(target.parent)
+    return found
+
+
+CALIBRATIONS: dict[str, Files] = {
+    "opencv.yaml": {
+        "c.yaml": b"%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+        b"   cols: 3\n   dt: d\n   data: [ 60., 0., 31.5, 0., 61., 23.5, 0., 0., 1. ]\n"
+        b"distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        b"   data: [ -0.1, 0.01, 0., 0., 0. ]\n"
+    },
+    "opencv.xml": {
+        "c.xml": b'<?xml version="1.0"?>\n<opencv_storage>\n<image_width>64</image_width>\n'
+        b'<image_height>48</image_height>\n<camera_matrix type_id="opencv-matrix">\n<rows>3</rows>\n<cols>3</cols>\n'
+        b"<dt>d</dt>\n<data>\n60. 0. 31.5 0. 61. 23.5 0. 0. 1.</data></camera_matrix>\n"
+        b'<distortion_coefficients type_id="opencv-matrix"><data>-0.1 0.01 0. 0. 0.</data></distortion_coefficients>\n'
+        b"</opencv_storage>\n"
+    },
+    "ros.yaml": {
+        "c.yaml": b"image_width: 64\nimage_height: 48\ncamera_name: left\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        b"  data: [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]\ndistortion_model: plumb_bob\ndistortion_coefficients:\n"
+        b"  rows: 1\n  cols: 5\n  data: [-0.1, 0.01, 0.001, 0.002, 0]\n"
+    },
+    "kalibr.yaml": {
+        "c.yaml": b"cam0:\n  camera_model: pinhole\n  distortion_coeffs: [-0.1, 0.01, 0.001, 0.002]\n"
+        b"  distortion_model: equidistant\n  intrinsics: [60, 61, 31.5, 23.5]\n  resolution: [64, 48]\n"
+    },
+    "euroc.yaml": {"c.yaml": SENSOR.encode()},
+    "orb.yaml": {
+        "c.yaml": b'%YAML:1.0\nCamera.type: "KannalaBrandt8"\nCamera1.fx: 60.0\nCamera1.fy: 61.0\nCamera1.cx: 31.5\n'
+        b"Camera1.cy: 23.5\nCamera1.k1: 0.01\nCamera1.k2: 0.0\nCamera1.k3: 0\nCamera1.k4: 0\nCamera.width: 64\n"
+        b"Camera.height: 48\nCamera.fps: 20\n"
+    },
+    "colmap.txt": {"c.txt": b"# Camera list\n1 OPENCV 64 48 60 61 32 24 -0.1 0.01 0.001 0.002\n"},
+    "transforms.json": {
+        "c.json": json.dumps(
+            {
+                "camera_model": "OPENCV",
+                "fl_x": 60.0,
+                "fl_y": 61.0,
+                "cx": 32.0,
+                "cy": 24.0,
+                "w": 64,
+                "h": 48,
+                "k1": -0.1,
+                "k2": 0.01,
+                "p1": 0.0,
+                "p2": 0.0,
+                "camera_angle_x": 0.9,
+            }
+        ).encode()
+    },
+    "numbers": {"c.txt": b"# fx fy cx cy\n60 61 31.5 23.5\n", "distortion.txt": b"-0.1 0.01 0.001 0.002\n"},
+    "fisheye": {"c.txt": b"fisheye 60 61 31.5 23.5 0.01 0 0 0\n"},
+}
+"""Calibration files of every program whose files are read; the first of each is what is opened."""
+
+CAMERA_ARGUMENTS = [
+    "60,61,31.5,23.5",
+    "fisheye,60,61,31.5,23.5,0,0,0,0",
+    "fov=65",
+    "f=0.8w",
+    "tum-fr1",
+    "exif",
+    "auto",
+]
+FRAME_ARGUMENTS = [
+    "start=1",
+    "start=0.1s",
+    "stop=1:30",
+    "fps=10",
+    "resize=48x36",
+    "resize=0.75",
+    "stride=2",
+    "limit=2",
+]
+OVERRIDES = [
+    "features.num_keypoints=2000",
+    "tracking.radius_px=12.5",
+    "seed=7",
+    'features.weights="a.safetensors"',
+]

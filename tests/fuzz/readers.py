@@ -1,0 +1,242 @@
+"""Everything that reads what a stranger wrote: good input, and how it is read."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from pathlib import Path
+
+import torch
+from safetensors.torch import save
+
+from tests.fuzz import goods
+from tests.fuzz.mutators import Files
+from tests.fuzz.sample_files import CONFIG, WALK, sample_files
+from tests.walks import T_cw
+from torchslam.checkpoint import read_checkpoint
+from torchslam.cli import main
+from torchslam.config import Config, load_config, to_toml
+from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
+from torchslam.data.given_poses import read_poses
+from torchslam.data.image_file import read_colour, read_grey
+from torchslam.data.sequence import Sequence
+from torchslam.errors import CalibrationError, ConfigError, FrameError
+from torchslam.features.learned import XFeat
+from torchslam.front_end import simulated_extractor
+from torchslam.output.results import read_results
+from torchslam.output.view import page
+from torchslam.session import Session
+from torchslam.world.map_file import read_worlds, write_worlds
+
+CAMERA = "60,61,31.5,23.5"
+IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "colour.png", "colour.jpg", "16.png")
+WEIGHTS = {"a.b": torch.zeros(3), "c": torch.ones(2, 2)}
+FRAMES = 4
+"""Frames of a sequence that are read."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """make: good input, by names in a folder; read: reads that folder; inputs: how many of 30,000 are for it"""
+
+    name: str
+    make: Callable[[], Files]
+    read: Callable[[Path], object]
+    inputs: int
+
+    @cached_property
+    def files(self) -> Files:
+        return self.make()
+
+
+@cache
+def readers() -> dict[str, Reader]:
+    """All of them by name."""
+    found = [
+        Reader("tum", goods.tum, _sequence, 2200),
+        Reader("euroc", goods.euroc, _sequence, 1700),
+        Reader("kitti", goods.kitti, _sequence, 1700),
+        Reader("kitti raw", goods.kitti_raw, partial(_sequence, name="drive_sync"), 1700),
+        Reader("7-scenes", goods.seven_scenes, partial(_sequence, camera=CAMERA), 1000),
+        Reader("tartanair", goods.tartanair, partial(_sequence, camera=CAMERA), 1000),
+        Reader("icl-nuim", goods.icl_nuim, partial(_sequence, camera=CAMERA), 800),
+        Reader("folder", goods.folder, _sequence, 1000),
+        Reader("masks", goods.masked, partial(_sequence, name="frames", camera=CAMERA, mask="masks"), 700),
+        Reader("zip", goods.zipped, partial(_sequence, name="desk.zip"), 2500),
+        Reader("camera argument", lambda: {"argument": b""}, _camera_argument, 700),
+        Reader("frame arguments", goods.folder, _frame_arguments, 700),
+        Reader("trajectory", lambda: {"t.txt": goods.trajectory_text(6).encode()}, _trajectory, 1000),
+        Reader("colmap binary", partial(_some, "colmap", "cameras.bin", "images.bin"), read_poses, 600),
+        Reader("colmap text", partial(_some, "colmap", "cameras.txt", "images.txt"), read_poses, 600),
+        Reader("transforms.json", partial(_some, "transforms", "transforms.json"), read_poses, 900),
+        Reader("map", partial(_some, "results", "map.safetensors"), _map, 2000),
+        Reader("checkpoint", partial(_some, "checkpoint", "checkpoint.safetensors"), _checkpoint, 900),
+        Reader("results", lambda: sample_files()["results"], _results, 1700),
+        Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
+        Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
+        Reader("--set", lambda: {"argument": b""}, _override, 800),
+        Reader("command line", goods.tum, _command, 300),
+    ]
+    found += [Reader(f"image {kind}", partial(_kind, goods.images, kind), _image, 250) for kind in IMAGES]
+    found += [
+        Reader(f"calibration {kind}", partial(goods.CALIBRATIONS.__getitem__, kind), _calibration, 300)
+        for kind in goods.CALIBRATIONS
+    ]
+    for kind in ("mp4", "avi"):
+        make = partial(_kind, goods.videos, kind)
+        found.append(Reader(f"video {kind}", make, partial(_sequence, name=f"v.{kind}"), 900))
+    for kind, name in (("ros1", "r.bag"), ("sqlite3", "r"), ("mcap", "r")):
+        found.append(
+            Reader(f"bag {kind}", partial(_kind, goods.bags, kind), partial(_sequence, name=name), 700)
+        )
+    return {reader.name: reader for reader in found}
+
+
+def _kind(make: Callable[[], dict[str, Files]], kind: str) -> Files:
+    return make()[kind]
+
+
+def _some(kind: str, *names: str) -> Files:
+    files = sample_files()[kind]
+    return {name: files[name][:6000] if name == "images.txt" else files[name] for name in names}
+
+
+def _sequence(root: Path, name: str = "", camera: str | None = None, mask: str | None = None) -> Sequence:
+    sequence = open_sequence(root / name, camera, mask=None if mask is None else root / mask)
+    return _frames(sequence)
+
+
+def _frames(sequence: Sequence) -> Sequence:
+    """The sequence, of which some frames were read; the first error of a frame is raised in the end."""
+    failure: FrameError | None = None
+    assert len(sequence) > 0
+    assert bool(sequence.timestamps.isfinite().all())
+    assert bool((sequence.timestamps.diff() > 0).all())
+    assert all("\n" not in line for line in (*sequence.describe().values(), *sequence.notes))
+    with contextlib.suppress(CalibrationError):
+        assert bool(sequence.camera.params.isfinite().all())
+    for index in range(min(len(sequence), FRAMES)):
+        try:
+            frame = sequence[index]
+            assert frame.image.shape[2:] == sequence.size[::-1]
+            assert bool(frame.image.isfinite().all())
+            assert frame.T_cw_groundtruth is None or bool(frame.T_cw_groundtruth.isfinite().all())
+            assert sequence.colour(index).shape[:2] == sequence.size[::-1]
+        except FrameError as error:
+            failure = failure or error
+    if failure is not None:
+        raise failure
+    return sequence
+
+
+def _argument(root: Path) -> str:
+    """What stands in the file `argument`, as the command line would have it."""
+    path = root / "argument"
+    return os.fsdecode(path.read_bytes()) if path.is_file() and not path.is_symlink() else ""
+
+
+def _camera_argument(root: Path) -> None:
+    camera = parse_camera(_argument(root), (640, 480))
+    assert bool(camera.params.isfinite().all())
+    assert bool((camera.params[:2] > 0).all())
+
+
+def _frame_arguments(root: Path) -> object:
+    key, _, value = _argument(root).partition("=")
+    options: dict[str, object] = {}
+    if key in ("fps", "stride", "limit"):
+        try:
+            options[key] = float(value) if key == "fps" else max(1, int(value))
+        except ValueError:  # argparse has said so
+            return None
+    else:
+        options["resize_to" if key == "resize" else "stop" if key == "stop" else "start"] = value
+    return _frames(open_sequence(root / "images", CAMERA, **options))  # type: ignore[arg-type]
+
+
+def _trajectory(root: Path) -> None:
+    trajectory = read_trajectory(root / "t.txt")
+    assert bool(trajectory.T_wc.isfinite().all())
+    assert bool((trajectory.timestamps.diff() > 0).all())
+
+
+def _map(root: Path) -> None:
+    saved = read_worlds(root / "map.safetensors")
+    for world in saved.worlds:
+        assert bool(world.trajectory().T_wc.isfinite().all())
+        world.history.graph(world.map, saved.camera)
+    session = Session.load(root / "map.safetensors")
+    write_worlds(root / "again", session.worlds, session.camera, session.number)
+    read_worlds(root / "again")
+
+
+def _checkpoint(root: Path) -> None:
+    eyes = simulated_extractor(CONFIG, WALK.camera, T_cw(WALK))
+    slam, so_far = read_checkpoint(root / "checkpoint.safetensors", WALK, CONFIG, extractor=eyes)
+    assert slam.last_frame is not None
+    if so_far.next < len(WALK):
+        slam.step(WALK[so_far.next])
+
+
+def _results(root: Path) -> str:
+    return page(read_results(root))
+
+
+def _weights(root: Path) -> object:
+    return XFeat(root / "w.safetensors")
+
+
+def _toml(root: Path) -> None:
+    _whole(load_config(root / "c.toml"))
+
+
+def _override(root: Path) -> None:
+    text = _argument(root)
+    if "\0" not in text:
+        _whole(load_config(None, [text]))
+
+
+def _whole(config: Config) -> None:
+    """A configuration can be written, read and scaled."""
+    assert bool(to_toml(config))
+    with contextlib.suppress(
+        ConfigError
+    ):  # of what grows, beyond its range: is said when the images are known
+        config.for_size((4000, 3000))
+
+
+def _image(root: Path) -> None:
+    path = next(root.iterdir(), root / "a")
+    grey = read_grey(path, str(path))
+    assert bool(grey.isfinite().all())
+    assert 0 <= float(grey.min()) <= float(grey.max()) <= 1
+    assert read_colour(path, str(path)).shape[2] == 3
+
+
+def _calibration(root: Path) -> None:
+    named = [path for path in sorted(root.iterdir()) if path.name.startswith("c.")]
+    calibration = read_calibration(next(iter(named), root / "c.txt"))
+    camera = calibration.camera(calibration.size or (64, 48))
+    assert bool(camera.params.isfinite().all())
+    assert bool((camera.params[:2] > 0).all())
+
+
+class CommandError(Exception):
+    """What a command said before it ended with status 2."""
+
+
+def _command(root: Path) -> None:
+    said = io.StringIO()
+    truth = str(root / "groundtruth.txt")
+    for arguments in (["info", str(root)], ["eval", truth, truth]):
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            status = main(arguments)
+        if status:
+            assert status == 2
+            (line,) = (line for line in said.getvalue().split("\n") if "error:" in line)
+            assert root.name in line
+            return

@@ -1,0 +1,55 @@
+"""What a small run leaves behind: its results, its checkpoint, its graph, and its poses for other programs."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from tests.fuzz.goods import content_of
+from tests.fuzz.mutators import Files
+from tests.walks import Walk, arc
+from torchslam import SLAM, load_config
+from torchslam.checkpoint import write_checkpoint
+from torchslam.export.colmap import write_colmap
+from torchslam.export.nerfstudio import write_nerfstudio
+from torchslam.export.scene import scene_of
+from torchslam.output.report import metrics
+from torchslam.output.results import write_results
+from torchslam.run import Progressed, run_sequence
+
+CONFIG = load_config(
+    None,
+    [
+        *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
+        *("initialization.min_matches=40", "initialization.min_points=30", "initialization.min_frames=0"),
+    ],
+)
+WALK = Walk(arc(30)[:14])
+
+
+@cache
+def sample_files() -> dict[str, Files]:
+    """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`."""
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        slam, so_far = SLAM(WALK.camera, CONFIG), Progressed()
+
+        def settled(result: object) -> None:
+            if slam.is_settled and not (root / "checkpoint").exists():
+                (root / "checkpoint").mkdir()
+                write_checkpoint(root / "checkpoint" / "checkpoint.safetensors", slam, so_far, WALK)
+
+        run = run_sequence(slam, WALK, settled, so_far)
+        assert run.main is not None
+        assert (root / "checkpoint").exists()
+        write_results(run, WALK, metrics(run) | {"source": "walk", "camera": ""}, root / "results")
+        (root / "graph").mkdir()
+        run.graph.save(root / "graph" / "graph.safetensors")
+        scene = scene_of(run.main, run.camera, 0, keyframes_alone=False)
+        write_colmap(root / "colmap", scene)
+        (root / "transforms").mkdir()
+        write_nerfstudio(root / "transforms", scene, torch.eye(3, dtype=torch.float64))
+        return {kind.name: content_of(kind) for kind in root.iterdir()}

@@ -1,0 +1,229 @@
+"""Threshold, model, kernel and weights of `estimate_relative_pose`."""
+
+import poselib
+import pytest
+import torch
+from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_views
+from torch import Tensor
+
+from torchslam.geometry import RelativePose, estimate_relative_pose
+from torchslam.geometry.robust import Kernel
+from torchslam.geometry.two_view import TwoViews, best_in_front, twisted
+
+THRESHOLDS = (0.5, 1.0, 2.0, 4.0, 8.0)
+
+
+def estimate(scene: Scene, threshold: float = 1.0, **options: object) -> RelativePose:
+    return estimate_relative_pose(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, threshold, **options)
+
+
+def errors(result: RelativePose, scene: Scene) -> tuple[float, float]:
+    """Degrees."""
+    T, T_true = result.T_21, scene.T_21
+    return (
+        float(rotation_error(T[:, :3, :3], T_true[:, :3, :3])),
+        float(direction_error(T[:, :3, 3], T_true[:, :3, 3])),
+    )
+
+
+@pytest.mark.parametrize("threshold", THRESHOLDS)
+def test_the_threshold_hardly_matters(threshold: float) -> None:
+    for seed in range(3):
+        scene = two_views(seed, noise=0.4)
+        result, usual = estimate(scene, threshold), estimate(scene)
+        assert result.success.all()
+        assert result.model == ("essential",)
+        rotation, direction = errors(result, scene)
+        assert rotation < 0.5
+        assert direction < 3
+        # The minimum goes by the level of the noise, not by the threshold.
+        torch.testing.assert_close(result.T_21, usual.T_21, atol=1e-2, rtol=0)
+
+
+@pytest.mark.parametrize("threshold", [2.0, 4.0])
+def test_little_parallax_is_neither_plane_nor_rotation_under_a_large_threshold(threshold: float) -> None:
+    by_threshold = []
+    for seed in range(3):
+        scene = two_views(seed, noise=0.2, baseline=0.06)
+        result = estimate(scene, threshold)
+        assert result.success.all()
+        assert result.model == ("essential",)
+        assert errors(result, scene)[1] < 12
+        by_threshold += estimate(scene, threshold, kernel="truncated").model
+    assert by_threshold.count("essential") < 3
+
+
+@pytest.mark.parametrize("threshold", [0.5, 2.0, 4.0])
+def test_planes_and_rotations_are_known_under_any_threshold(threshold: float) -> None:
+    for seed in range(4):
+        assert estimate(two_views(seed, plane=True), threshold).model == ("homography",)
+        rotation = estimate(two_views(seed, baseline=0.0), threshold)
+        assert rotation.model == ("rotation",)
+        assert not rotation.success.any()
+
+
+def test_the_essential_matrix_of_a_plane_has_its_pose() -> None:
+    """Where the matches in front of the cameras leave one of the two motions that explain a plane."""
+    off = []
+    for seed in range(8):
+        scene = two_views(seed, plane=True, noise=0.05)
+        if not estimate(scene).success.all():
+            continue
+        result = estimate(scene, model="essential")
+        assert result.success.all()
+        assert result.model == ("essential",)
+        assert not result.ambiguous.any()
+        off.append(max(errors(result, scene)))
+    assert len(off) >= 3
+    assert sum(error < 2 for error in off) >= len(off) - 1
+
+
+def test_only_the_model_asked_for_is_fitted() -> None:
+    scene = two_views(0)
+    asked, free = estimate(scene, model="essential"), estimate(scene)
+    assert torch.equal(asked.score_essential, free.score_essential)
+    assert not asked.score_homography.any()
+    assert not asked.score_rotation.any()
+    assert torch.equal(asked.inliers, free.inliers)
+    torch.testing.assert_close(asked.T_21, free.T_21)
+    turned = two_views(0, baseline=0.0)
+    result = estimate(turned, model="essential")
+    assert errors(result, turned)[0] < 0.5
+    torch.testing.assert_close(result.T_21[:, :3, 3].norm(dim=-1), torch.ones(1).double())
+
+
+@pytest.mark.parametrize("kernel", ["cauchy", "geman_mcclure", "huber", "truncated"])
+def test_every_kernel_finds_the_pose(kernel: Kernel) -> None:
+    scene = two_views(0, outliers=0.1 if kernel == "huber" else 0.4)
+    rotation, direction = errors(estimate(scene, kernel=kernel), scene)
+    assert rotation < 0.5
+    assert direction < 4
+
+
+def test_a_weight_of_zero_is_no_match() -> None:
+    scene = two_views(2)
+    mask = torch.rand(1, 200, generator=torch.Generator().manual_seed(0)) < 0.7
+    weights = mask.double()
+    weights[0, (~mask[0]).nonzero()[0]] = torch.nan
+    masked, weighted = estimate(scene, mask=mask), estimate(scene, weights=weights)
+    assert torch.equal(masked.T_21, weighted.T_21)
+    assert torch.equal(masked.inliers, weighted.inliers)
+
+
+def test_weights_act_as_thresholds() -> None:
+    scene = two_views(2)
+    weights = torch.full((1, 200), 0.25, dtype=torch.float64)
+    twice, weighted = estimate(scene, 2.0), estimate(scene, 1.0, weights=weights)
+    torch.testing.assert_close(twice.T_21, weighted.T_21)
+    torch.testing.assert_close(twice.score_essential, weighted.score_essential)
+    assert torch.equal(twice.inliers, weighted.inliers)
+
+
+def test_information_of_the_matches_makes_the_pose_better() -> None:
+    given, without = [], []
+    for seed in range(8):
+        scene = two_views(seed, noise=0.0)
+        generator = torch.Generator().manual_seed(seed)
+        sigmas = torch.where(torch.arange(200) % 4 == 0, 0.1, 2.0).double()[None]
+        noisy = (
+            pixels + sigmas[..., None] * torch.randn(1, 200, 2, generator=generator, dtype=torch.float64)
+            for pixels in (scene.pixels_1, scene.pixels_2)
+        )
+        noisy_scene = Scene(*noisy, scene.points_1, scene.T_21, scene.mask)
+        given.append(errors(estimate(noisy_scene, weights=sigmas**-2), scene)[1])
+        without.append(errors(estimate(noisy_scene), scene)[1])
+    assert sum(given) < 0.6 * sum(without)
+
+
+@pytest.mark.parametrize("kernel", ["cauchy", "geman_mcclure", "truncated"])
+def test_gradient_in_pixels_and_weights(kernel: Kernel) -> None:
+    """Against central differences of the whole estimator, of which the level of the noise stays the same."""
+    scene = two_views(7, count=80, outliers=0.1, noise=0.1)
+    generator = torch.Generator().manual_seed(1)
+    weights = 0.5 + torch.rand(1, 80, generator=generator, dtype=torch.float64)
+    weights[0, 20] = 0.0
+    inputs = {"pixels_1": scene.pixels_1, "weights": weights}
+    direction = {
+        name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in inputs.items()
+    }
+    direction["weights"][0, 20] = 0.0
+
+    def run(pixels_1: Tensor, weights: Tensor) -> Tensor:
+        pose = estimate_relative_pose(
+            pixels_1, scene.pixels_2, CAMERA, CAMERA, 2.0, weights=weights, kernel=kernel
+        )
+        return pose.T_21[0, :3]
+
+    leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+    factors = torch.linspace(-1, 1, 12, dtype=torch.float64).view(3, 4)
+    (run(**leaves) * factors).sum().backward()
+    for name, x in inputs.items():
+        step = 1e-3 * direction[name]
+        high, low = (run(**{**inputs, name: x + sign * step}) for sign in (1, -1))
+        expected = ((high - low) * factors).sum() / 2e-3
+        actual = (leaves[name].grad * direction[name]).sum()
+        torch.testing.assert_close(actual, expected, rtol=2e-3, atol=1e-7)
+    assert float(leaves["weights"].grad[0, 20]) == 0
+
+
+def test_a_batch_equals_a_loop_where_the_samples_do() -> None:
+    """Every problem of a batch draws its own samples: as many copies of one must agree."""
+    scene = two_views(3, noise=0.3)
+    weights = torch.linspace(0.5, 2, 200, dtype=torch.float64)[None]
+    one = estimate(scene, weights=weights)
+    three = estimate_relative_pose(
+        scene.pixels_1.repeat(3, 1, 1),
+        scene.pixels_2.repeat(3, 1, 1),
+        CAMERA,
+        CAMERA,
+        weights=weights.repeat(3, 1),
+    )
+    torch.testing.assert_close(three.T_21, one.T_21.expand(3, 4, 4), atol=1e-5, rtol=0)
+    assert torch.equal(three.inliers, one.inliers.expand(3, -1))
+
+
+def test_many_wrong_matches_do_not_pull() -> None:
+    """Half of few matches are wrong, beside poselib."""
+    model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
+    ours, theirs = [], []
+    for seed in range(10):
+        scene = two_views(seed, count=60, outliers=0.5, noise=0.5)
+        pose, _ = poselib.estimate_relative_pose(
+            scene.pixels_1[0].numpy(), scene.pixels_2[0].numpy(), model, model, {"max_epipolar_error": 2.0}
+        )
+        ours.append(errors(estimate(scene, 2.0, model="essential"), scene)[1])
+        theirs.append(float(direction_error(torch.tensor(pose.t)[None], scene.T_21[:, :3, 3])))
+    assert sum(ours) <= 1.2 * sum(theirs)
+
+
+def test_points_behind_a_camera_do_not_count() -> None:
+    scene = two_views(0, noise=0.0, outliers=0.0)
+    views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 1.0, scene.mask, None)
+    R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3] / scene.T_21[:, :3, 3].norm()
+    wrong = twisted(R, t)
+    for row in range(4):
+        R_best, t_best, cost = best_in_front(views, wrong[0][:, row : row + 1], wrong[1][:, row : row + 1])
+        torch.testing.assert_close(R_best[:, 0], R)
+        torch.testing.assert_close(t_best[:, 0], t)
+        assert float(cost) < 1e-6
+    half = torch.arange(200) % 2 == 0
+    # On the epipolar lines of a pure translation, half of them displaced to the wrong side.
+    sideways = torch.eye(3, dtype=torch.float64)[None, None], torch.tensor([[[1.0, 0.0, 0.0]]]).double()
+    level = TwoViews(
+        views.x_1,
+        views.x_1 + torch.where(half[:, None], 0.1, -0.1) * torch.tensor([1.0, 0.0], dtype=torch.float64),
+        views.scale_1,
+        views.scale_2,
+        views.mask,
+    )
+    assert float(best_in_front(level, *sideways)[2]) == pytest.approx(100, abs=1e-6)
+
+
+def test_wrong_options_are_named() -> None:
+    scene = two_views(0)
+    with pytest.raises(ValueError, match="unknown model 'plane'; known are auto, essential"):
+        estimate(scene, model="plane")
+    with pytest.raises(ValueError, match="unknown kernel 'tukey'"):
+        estimate(scene, kernel="tukey")
+    with pytest.raises(ValueError, match=r"weights must be \(1, 200\), not \(200,\)"):
+        estimate(scene, weights=torch.ones(200))

@@ -1,0 +1,148 @@
+"""Looking once and posing often: the same bytes as in one call, right gradients, cameras of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.learning.test_clip import CONFIG, FRAMES, BentEyes, clip_of, derivative
+from tests.walks import Walk, arc, still
+from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features
+from torchslam.evaluation import ate
+
+
+@pytest.fixture
+def walk() -> Walk:
+    return Walk(arc(FRAMES, length=1.0))
+
+
+def camera_with(focal: Tensor | float) -> Camera:
+    return Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
+
+
+def test_a_call_is_looking_and_posing(walk: Walk) -> None:
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.01)
+    clip_slam = ClipSLAM(eyes)
+
+    def graph() -> ClipGraph:
+        found = clip_slam.look(images, walk.camera)
+        assert (found.frames, found.batched) == (FRAMES, False)
+        return found
+
+    def of_call() -> ClipPoses:
+        return clip_slam(images, walk.camera)
+
+    def in_two() -> ClipPoses:
+        return clip_slam.pose(graph(), clip_slam.extract(images), walk.camera)
+
+    def with_graph() -> ClipPoses:
+        return clip_slam(images, walk.camera, graph())
+
+    results = []
+    for way in (of_call, in_two, with_graph):
+        eyes.bend.grad = None
+        poses = way()
+        ate(poses.T_cw, truth, poses.posed).backward()
+        results.append((poses.T_cw.detach(), poses.posed, eyes.bend.grad))
+    assert results[0][1].all()
+    for other in results[1:]:
+        assert all(torch.equal(*pair) for pair in zip(results[0], other, strict=True))
+
+
+def test_a_graph_has_no_gradient_and_no_part_in_what_is_learned(walk: Walk) -> None:
+    images, _ = clip_of(walk)
+    focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
+    camera = camera_with(focal)
+    graph = ClipSLAM(BentEyes(walk, bend=0.01)).look(images, camera)
+    (run,) = graph.runs
+    assert run is not None
+    columns = [getattr(run, name) for name in run.columns()]
+    assert not any(column.requires_grad for column in [*columns, run.camera.params])
+    with torch.no_grad():
+        camera.params.mul_(2)
+    assert graph.cameras[0].fx == 400
+
+
+def test_the_gradient_of_what_was_looked_at_once_is_that_of_finite_differences(walk: Walk) -> None:
+    images, truth = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.01)
+    clip_slam = ClipSLAM(eyes, config=CONFIG)
+    graph = clip_slam.look(images, walk.camera)
+
+    def loss(bend: float, focal: Tensor | float) -> Tensor:
+        with torch.no_grad():
+            eyes.bend.fill_(bend)
+        poses = clip_slam.pose(graph, clip_slam.extract(images), camera_with(focal))
+        return ate(poses.T_cw, truth, poses.posed)
+
+    focal = torch.tensor(405.0, dtype=torch.float64, requires_grad=True)
+    loss(0.03, focal).backward()  # far from where it was looked
+    assert eyes.bend.grad is not None
+    assert focal.grad is not None
+    assert float(eyes.bend.grad) == pytest.approx(derivative(lambda x: loss(x, 405.0), 0.03, 1e-5), rel=1e-3)
+    assert float(focal.grad) == pytest.approx(derivative(lambda x: loss(0.03, x), 405.0, 1e-2), rel=1e-3)
+
+
+def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
+    images, truth = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    params = torch.stack([camera_with(focal).params for focal in (400.0, 410.0)]).requires_grad_()
+    poses = clip_slam(torch.stack([images, images]), walk.camera.with_params(params))
+    alone = [clip_slam(images, camera_with(focal)) for focal in (400.0, 410.0)]
+    assert torch.equal(poses.T_cw, torch.stack([each.T_cw for each in alone]))
+    assert not torch.equal(poses.T_cw[0], poses.T_cw[1])
+    ate(poses.T_cw, truth.expand(2, -1, -1, -1), poses.posed)[1].backward()
+    assert params.grad is not None
+    assert (params.grad[0] == 0).all()
+    assert (params.grad[1] != 0).all()
+    with pytest.raises(ValueError, match=r"\(K,\) or \(1, K\)"):
+        clip_slam(images[None], walk.camera.with_params(params))
+
+
+def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    graphs = [clip_slam.look(images, camera_with(focal)) for focal in (400.0, 410.0)]
+    features = clip_slam.extract(torch.stack([images, images]))
+    poses = clip_slam.pose(ClipGraph.stack(graphs), features)
+    one = clip_slam.pose(graphs[1], clip_slam.extract(images))
+    assert torch.equal(poses.T_cw[1], one.T_cw)
+    assert clip_slam.pose(ClipGraph.stack(graphs[:1]), features[:1]).T_cw.shape == (1, FRAMES, 4, 4)
+    with pytest.raises(ValueError, match="one clip each"):
+        ClipGraph.stack([ClipGraph.stack(graphs), graphs[0]])
+    with pytest.raises(ValueError, match="equally many frames"):
+        ClipGraph.stack([graphs[0], replace(graphs[1], frames=4)])
+    with pytest.raises(ValueError, match=f"2 clips of {FRAMES} frames"):
+        clip_slam.pose(ClipGraph.stack(graphs), features[:1])
+
+
+def test_keypoints_that_are_gone_do_not_count(walk: Walk) -> None:
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0, noise_px=0.0))
+    graph, features = clip_slam.look(images, walk.camera), clip_slam.extract(images)
+    assert isinstance(features, Features)
+    gone = torch.zeros_like(features.mask)
+    gone[:, ::4] = True
+    spoilt = torch.where(gone[..., None], features.keypoints + 50.0, features.keypoints)
+    poses = clip_slam.pose(graph, features)
+    partial = clip_slam.pose(graph, replace(features, keypoints=spoilt, mask=features.mask & ~gone))
+    torch.testing.assert_close(partial.T_cw, poses.T_cw, atol=1e-5, rtol=0)
+    (seen,), (left,) = poses.graphs, partial.graphs
+    assert seen is not None
+    assert left is not None
+    assert 0 < len(left.pixels) < len(seen.pixels)
+
+
+def test_what_started_no_map_has_no_pose_later() -> None:
+    walk = Walk(still(4))
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    graph = clip_slam.look(images, walk.camera)
+    assert graph.runs == (None,)
+    poses = clip_slam.pose(graph, clip_slam.extract(images))
+    assert (poses.reason, poses.T_cw.shape) == (("no map started",), (4, 4, 4))
+    assert poses.T_cw.requires_grad

@@ -1,0 +1,150 @@
+"""Which of three models explains two views, an essential matrix, a homography or a pure rotation, and its pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.homography import decompose_homography
+from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant
+from torchslam.geometry.two_view import (
+    TwoViews,
+    ahead_and_parallax,
+    best_of,
+    fit_homography,
+    fit_rotation,
+    propose_homography,
+    propose_rotation,
+    sampson_squared,
+    transfer_squared,
+    twisted,
+)
+
+MODELS = ("essential", "homography", "rotation")
+ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
+
+FINAL_ITERATIONS = 12
+FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
+NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
+_HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
+_TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
+_CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
+_LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
+_LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
+
+
+@dataclass(frozen=True)
+class Fits:
+    """The best fit of each model. R, t: (B, ...) of the essential matrix; H; R_only; squared: (3, B, N) errors."""
+
+    R: Tensor
+    t: Tensor
+    H: Tensor
+    R_only: Tensor
+    squared: Tensor
+
+    def with_mappings(self, views: TwoViews) -> Fits:
+        """The same with the errors of homography and rotation brought up to date."""
+        mapped = transfer_squared(views, torch.stack((self.H, self.R_only), dim=1)).transpose(0, 1)
+        return replace(self, squared=torch.cat((self.squared[:1], mapped)).nan_to_num(torch.inf))
+
+    def finished(self, views: TwoViews, width: float) -> Fits:
+        """The same with homography and rotation at their minimum, over the matches within so many thresholds."""
+        (H,), _ = fit_homography(views, self.H[:, None], FINAL_ITERATIONS, width)
+        (R_only,), _ = fit_rotation(views, self.R_only[:, None], FINAL_ITERATIONS, width)
+        return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
+
+
+def fit_models(views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator) -> Fits:
+    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain."""
+    essential = sampson_squared(views, R[:, None], t[:, None])
+    # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
+    near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
+    R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
+    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
+    H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
+    H = torch.cat((H, (R_only / R_only[:, 2:, 2:])[:, None]), dim=1)
+    (H,), _ = best_of(*fit_homography(views, H, _TRIAL_ITERATIONS, FINAL_WIDTH))
+    return Fits(R, t, H, R_only, essential[:, 0].expand(3, -1, -1)).with_mappings(views)
+
+
+def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
+    """(B,) variance of the noise, in squared thresholds, by the squared Sampson errors (B, N) of a pose."""
+    near = (squared < NOISE_WIDTH**2) & mask
+    return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
+
+
+def choose(fits: Fits, mask: Tensor, chance: Tensor) -> Tensor:
+    """The index of the simplest model that no significant number of matches contradicts. (B,)"""
+    essential, homography, rotation = fits.squared
+    # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
+    # does not touch, show how large it is.
+    noise = noise_variance(essential, mask).clamp_min(1.0)[:, None]
+    explained = (torch.minimum(essential, homography) < noise) & mask
+
+    def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
+        off = (simple > _CLEARLY_OFF**2 * noise) & mask
+        against = (off & (rich < noise)).sum(-1)
+        accident = ~is_significant(against, off.sum(-1), 2, chance * noise[:, 0].sqrt(), 1)
+        return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
+
+    plane = ~contradicted(homography, essential)
+    still = ~contradicted(rotation, essential)
+    return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL))
+
+
+def pose_of(views: TwoViews, fits: Fits, model: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """R (B, 3, 3), t (B, 3), plane normal (B, 3), and whether a plane leaves two motions (B,)."""
+    inliers = fits.squared < 1
+    R_E, t_E = in_front(views, fits.R, fits.t, views.mask & inliers[ESSENTIAL])
+    R_H, t_H, normals = decompose_homography(fits.H)
+    # All of the plane must be in front of the first camera, and then is in front of the second.
+    plane = views.mask & inliers[HOMOGRAPHY]
+    ahead = ((views.h_1 @ normals.mT) > 0) & plane[..., None]
+    share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
+    length = t_H.norm(dim=-1, keepdim=True)
+    direction = t_H / length.clamp_min(1e-12)
+    squared = sampson_squared(views, R_H, direction)
+    support = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+    support = torch.where(share > 0.9, support, -1.0)
+    (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
+    ambiguous = second > 0.8 * first.clamp_min(0.0)
+    index = torch.arange(len(model), device=model.device)
+    best = order[0]
+    flat = model == HOMOGRAPHY
+    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > 1e-3
+    R = torch.where(flat[:, None, None], R_H[index, best], R_E)
+    t = torch.where(flat[:, None], direction[index, best], t_E)
+    still = model == ROTATION
+    R = torch.where(still[:, None, None], fits.R_only, R)
+    t = torch.where(still[:, None], 0.0, t)
+    return R, t, (normals * length)[index, best], flat & ambiguous & apart
+
+
+def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
+    """Whether the inliers leave a line in both images, by some thresholds. (B,)"""
+    weights = inliers[..., None].to(views.x_1.dtype)
+    weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
+    spread = torch.ones_like(inliers[:, 0])
+    for x, scale in ((views.x_1, views.scale_1), (views.x_2, views.scale_2)):
+        centred = (x - (weights * x).sum(1, keepdim=True)) * scale[..., None]
+        xx, xy, _, yy = ((weights * centred).mT @ centred).flatten(1).unbind(-1)
+        smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy).square() + xy.square()).sqrt()
+        spread = spread & (smaller > _LEAST_SPREAD**2)
+    return spread
+
+
+def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the poses with the essential matrix of R (B, 3, 3), t (B, 3), that with most inliers in front of both cameras.
+
+    A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
+    """
+    R, t = twisted(R, t)
+    is_ahead, parallax = ahead_and_parallax(views, R, t)
+    weight = torch.where(inliers[:, None], parallax.clamp_max(1.0), 0.0)
+    ahead = torch.where(is_ahead, weight, 0.0).sum(-1)
+    best = ahead.argmax(-1)
+    index = torch.arange(len(best), device=best.device)
+    return R[index, best], t[index, best]

@@ -1,0 +1,173 @@
+"""The scout in a process of its own: it follows, and looks for features, while this one tracks and maps.
+
+It goes no further than a fixed number of frames before this one, and knows at each frame what it would know here: the
+bytes are the same.
+"""
+
+from __future__ import annotations
+
+import pickle
+import traceback
+from collections import deque
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Protocol
+
+import torch
+
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence
+from torchslam.errors import TorchslamError
+from torchslam.front_end import check_order, check_size, image_extractor
+from torchslam.parcel import Arrays, as_arrays, from_arrays, packed, unpacked
+from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.anchors import Anchors
+from torchslam.tracking.scout import Scout
+from torchslam.values import Anchor, Followed, Frame
+from torchslam.worker import READY, Worker
+
+
+class System(Protocol):
+    """What the scout has to do with: of `torchslam.slam.SLAM`."""
+
+    config: Config
+    clock: Stopwatch
+    scout: Scout
+    anchors: Anchors
+    news: tuple[int, Anchor | None]
+    last_frame: tuple[int, float] | None
+
+    def will_do(self, followed: Followed) -> bool: ...
+
+
+class Scouting:
+    """The frames of a sequence, followed or with their features; each is to be asked for once, in order.
+
+    Until the process has started, the system's own scout goes before it, and then hands over what it knows; it begins
+    anew where the process is ended by somebody else. There is a process while this is entered.
+    """
+
+    def __init__(self, sequence: Sequence, slam: System) -> None:
+        self._sequence, self._slam = sequence, slam
+        self._is_away = False
+        self._told = -1  # frame of the newest news that it knows
+        self._frames: deque[Arrays | BaseException] = deque()  # what has arrived before its turn
+
+    def __enter__(self) -> Scouting:
+        self._worker = Worker(_work)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._worker.end()
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""
+        slam = self._slam
+        if not self._is_away and self._worker.is_there():
+            # Not by multiprocessing's own pickling, which would move tensors to shared memory.
+            task = self._sequence, slam.config, slam.scout, slam.last_frame, torch.get_num_threads(), index
+            self._is_away = self._worker.send(pickle.dumps(task))
+            self._told = slam.news[0]
+        if self._is_away:
+            with slam.clock("features"):
+                frame = self._ask(index)
+            if frame is not None:
+                return frame
+            self._is_away = False
+            slam.scout.forget()
+            slam.anchors.clear()
+        return self._sequence[index]
+
+    def _ask(self, index: int) -> Frame | None:
+        """A frame of which the system can make something; None where there is nobody to answer."""
+        slam, news = self._slam, None
+        if slam.news[0] != self._told:
+            self._told, news = slam.news[0], (slam.news[0], packed(slam.news[1]))
+        if not self._worker.send(pickle.dumps((index, news, False))):
+            return None
+        answer = self._frames.popleft() if self._frames else self._worker.receive()
+        if isinstance(answer, BaseException):
+            raise answer
+        if answer is None:
+            return None
+        frame = from_arrays(answer)
+        if frame.features is not None or (frame.followed is not None and slam.will_do(frame.followed)):
+            return frame
+        if not self._worker.send(pickle.dumps((index, None, True))):
+            return None
+        while (answer := self._worker.receive()) is not None:
+            if isinstance(answer, dict) and answer["index"] == index:
+                return from_arrays(answer)
+            self._frames.append(answer)
+        return None
+
+
+def _work(connection: Connection) -> None:
+    """A process: say that there is somebody, take the task, then go ahead until nobody asks any more."""
+    try:
+        connection.send_bytes(READY)
+        sequence, config, scout, last_frame, threads, start = pickle.loads(connection.recv_bytes())
+        torch.set_num_threads(threads)
+        with torch.inference_mode():
+            _Away(connection, sequence, config, scout, last_frame, start).go()
+    except (EOFError, OSError):
+        return
+
+
+class _Away:
+    """What the scout does away from home."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        sequence: Sequence,
+        config: Config,
+        scout: Scout,
+        last_frame: tuple[int, float] | None,
+        start: int,
+    ) -> None:
+        self.connection, self.sequence, self.scout = connection, sequence, scout
+        self.extract = image_extractor(config)
+        self.delay = config.patches.delay
+        self.last_frame = last_frame
+        self.next = start
+        self.wanted = start - 1  # the frame that is wanted at home: those before it are done with
+        self.images: dict[int, Frame] = {}  # of the last frames
+
+    def go(self) -> None:
+        while True:
+            is_far = self.next > self.wanted + self.delay or self.next >= len(self.sequence)
+            if is_far or self.connection.poll():
+                self.hear(*pickle.loads(self.connection.recv_bytes()))
+            else:
+                self.send(self.look(self.next))
+                self.next += 1
+
+    def hear(self, index: int, news: tuple[int, Arrays | None] | None, wants_features: bool) -> None:
+        """A frame is wanted, or its features after all; news of a frame before it."""
+        if wants_features:
+            self.send(as_arrays(self.images[index], None, self.extract(self.images[index])))
+            return
+        self.wanted = index
+        self.images = {i: frame for i, frame in self.images.items() if i >= index}
+        if news is not None:
+            self.scout.learn(news[0], unpacked(Anchor, news[1]))
+
+    def look(self, index: int) -> Arrays | BaseException:
+        """What there is to say of a frame; an error is an answer too, and raised where it was asked for."""
+        try:
+            frame = self.sequence[index]
+            check_order(frame, self.last_frame)
+            check_size(frame, self.scout.camera)
+            followed = self.scout.follow(frame)
+            self.last_frame, self.images[index] = (frame.index, frame.timestamp), frame
+            return as_arrays(frame, followed, self.extract(frame) if followed.why_not else None)
+        except Exception as error:
+            if not isinstance(error, TorchslamError):
+                error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
+            return error
+
+    def send(self, answer: Arrays | BaseException) -> None:
+        self.connection.send_bytes(pickle.dumps(answer))
