@@ -173,17 +173,28 @@ class TrackingConfig(Settings, section="tracking"):
 class PatchesConfig(Settings, section="patches"):
     """When a frame is followed by patches of an earlier one, without features of its own."""
 
-    enabled: bool = False
-    count: int = setting(300, low=20)  # patches that are followed
-    min_similarity: float = setting(0.8, low=0, high=1)  # normalised cross-correlation with the earlier frame
-    min_share: float = setting(0.6, above=0, high=1)  # of the patches, that must agree with the pose
-    # median squared error of the pose, as a multiple of that of the frame that they are from
-    max_error_growth: float = setting(2.5, above=0)
-    max_frames: int = setting(5, low=1)  # followed one after the other
-    # of the overlap at which a frame becomes a keyframe: patches are lost sooner than matches
-    overlap_share: float = setting(0.8, above=0)
-    # frames after which is known what came of one that was found by its features: it is mapped meanwhile
-    delay: int = setting(2, low=0, high=64)
+    enabled: bool = setting(False, "whether frames are followed")
+    count: int = setting(300, "patches that are followed", low=20, high=MOST)
+    min_similarity: float = setting(
+        0.8, "normalised cross-correlation of a patch with the earlier frame", low=0, high=1
+    )
+    min_share: float = setting(0.6, "of the patches, that must agree with the pose", above=0, high=1)
+    max_error_growth: float = setting(
+        2.5, "median squared error, as a multiple of that in the earlier frame", above=0, high=1e6
+    )
+    max_frames: int = setting(5, "followed one after the other", low=1, high=MOST)
+    overlap_share: float = setting(
+        0.8,
+        "of the overlap at which a frame becomes a keyframe: patches are lost sooner than matches",
+        above=0,
+        high=10,
+    )
+    delay: int = setting(
+        2,
+        "frames after which is known what came of one with features: it is mapped meanwhile",
+        low=0,
+        high=64,
+    )
 
 
 @dataclass(frozen=True)

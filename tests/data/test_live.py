@@ -64,7 +64,7 @@ def numbers_of(frames) -> list[int]:
 
 def test_a_slow_reader_gets_the_newest_frames(clip: Path) -> None:
     capture, began = Played(clip), time.time()
-    sequence = LiveSequence("clip", capture, parse_calibration("f=0.8w"))
+    sequence = LiveSequence("clip", capture, parse_calibration("f=0.8w"), backlog=1)
     frames = []
     for frame in sequence:
         frames.append(frame)
@@ -80,6 +80,16 @@ def test_a_slow_reader_gets_the_newest_frames(clip: Path) -> None:
     assert times - times[0] == pytest.approx((np.array(numbers) - numbers[0]) / RATE, abs=1e-3)
     assert began - 0.1 < times[0] < time.time()
     assert capture.released.wait(1.0)
+
+
+def test_a_reader_that_is_slow_once_gets_them_all(clip: Path) -> None:
+    sequence = LiveSequence("clip", Played(clip), parse_calibration("f=0.8w"))
+    frames = []
+    for frame in sequence:
+        frames.append(frame)
+        time.sleep(0.12 if frame.index == 5 else 0.0)  # six frames
+    assert numbers_of(frames) == list(range(FRAMES))
+    assert sequence.dropped == 0
 
 
 def test_a_quick_reader_gets_them_all(clip: Path) -> None:
@@ -128,7 +138,7 @@ def test_the_end_can_be_chosen(clip: Path) -> None:
 
 
 def test_what_comes_after_the_last_frame_is_not_counted(clip: Path) -> None:
-    sequence = LiveSequence("clip", Played(clip), None).part(stop=2)
+    sequence = LiveSequence("clip", Played(clip), None, backlog=1).part(stop=2)
     for _ in sequence:
         time.sleep(0.1)
     dropped = sequence.dropped

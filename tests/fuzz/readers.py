@@ -30,6 +30,7 @@ from torchslam.front_end import simulated_extractor
 from torchslam.output.results import read_results
 from torchslam.output.view import page
 from torchslam.session import Session
+from torchslam.world.history import RunGraph
 from torchslam.world.map_file import read_worlds, write_worlds
 
 CAMERA = "60,61,31.5,23.5"
@@ -75,6 +76,7 @@ def readers() -> dict[str, Reader]:
         Reader("transforms.json", partial(_some, "transforms", "transforms.json"), read_poses, 900),
         Reader("map", partial(_some, "results", "map.safetensors"), _map, 2000),
         Reader("checkpoint", partial(_some, "checkpoint", "checkpoint.safetensors"), _checkpoint, 900),
+        Reader("graph", lambda: sample_files()["graph"], _graph, 1200),
         Reader("results", lambda: sample_files()["results"], _results, 1700),
         Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
@@ -180,6 +182,11 @@ def _checkpoint(root: Path) -> None:
     assert slam.last_frame is not None
     if so_far.next < len(WALK):
         slam.step(WALK[so_far.next])
+
+
+def _graph(root: Path) -> object:
+    graph = RunGraph.load(root / "graph.safetensors")
+    return [graph.part(world) for world in graph.worlds]
 
 
 def _results(root: Path) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -171,10 +172,16 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     processes = 1 if plan.view or plan.video else plan.processes  # images are wanted here, not elsewhere
     with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
+        is_live, latencies = (
+            not len(sequence.timestamps),
+            list[float](),
+        )  # of a live source: from the capture of a frame to its pose
         bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
+                if is_live:
+                    latencies.append(1e3 * (time.time() - result.timestamp))
                 checkpoints.offer(at_once=stopping.is_wanted)
                 watching.show(result)
                 progress.update(result)
@@ -184,7 +191,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan, found)
+        figures = _write(finished, sequence, plan, found, latencies)
         watching.end(finished)
     written = {"results": plan.output, "view": plan.output / VIEW}
     written |= {"video": plan.output / VIDEO} if plan.video else {}
@@ -269,8 +276,13 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
     return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
 
 
-def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[str, object]:
-    """Evaluate, colour the map, write, draw; returns the figures. camera: what there is to say of it before the run."""
+def _write(
+    finished: Run, sequence: Sequence, plan: Plan, camera: str, latencies: list[float]
+) -> dict[str, object]:
+    """Evaluate, colour the map, write, draw; returns the figures.
+
+    camera: what there is to say of it before the run; latencies: milliseconds, of a live source
+    """
     figures = metrics(
         finished,
         _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
@@ -278,6 +290,9 @@ def _write(finished: Run, sequence: Sequence, plan: Plan, camera: str) -> dict[s
     )
     figures["camera"] = judged(finished, camera)
     figures["dropped"] = sequence.dropped
+    if latencies:
+        median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
+        figures["latency_ms"] = {"median": median, "p95": p95}
     figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
     paint([world.map for world in finished.worlds], sequence, finished.session)
     write_results(finished, sequence, figures, plan.output)

@@ -1,10 +1,11 @@
-"""A camera by its number, or a stream by its address: frames that come while nobody has time for them are gone."""
+"""A camera by its number, or a stream by its address: frames that nobody has time for are gone after a while."""
 
 from __future__ import annotations
 
 import re
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Protocol
 
@@ -23,6 +24,8 @@ LOOKS_FOR = "a camera's number, or an rtsp:// or http:// address"
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
 """Seconds without a frame after which a stream is taken to have ended."""
+BACKLOG = 10
+"""Frames that wait while one takes long, as one that is mapped does; the oldest goes when there are more."""
 STEADY = 1.0
 """Seconds by which a source's own clock may run off from ours before it is not believed."""
 
@@ -40,7 +43,7 @@ class Capture(Protocol):
 
 
 class LiveSequence(Sequence):
-    """Frames as they come, by a thread that keeps the newest one; `image` waits for one that is newer than the last.
+    """Frames as they come, by a thread that keeps the newest few; `image` waits for one that is newer than the last.
 
     Frames are numbered as they are given, without gaps, whatever was dropped between them. Nobody knows how many there
     will be, so that there is no `len`; behind the last frame comes `EndOfSequence`. Timestamps are seconds since 1970
@@ -48,14 +51,19 @@ class LiveSequence(Sequence):
     """
 
     def __init__(
-        self, name: str, capture: Capture, camera: GivenCamera | None, patience: float = PATIENCE
+        self,
+        name: str,
+        capture: Capture,
+        camera: GivenCamera | None,
+        patience: float = PATIENCE,
+        backlog: int = BACKLOG,
     ) -> None:
         """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
         self._capture = capture
         self._patience = patience
         self._clock = CaptureClock()
         self._fresh = threading.Condition()
-        self._newest: tuple[float, np.ndarray] | None = None
+        self._arrived: deque[tuple[float, np.ndarray]] = deque(maxlen=backlog)
         self._ended = self._closing = False
         self._dropped = self._replaced = 0
         self._limit: int | None = None
@@ -63,12 +71,12 @@ class LiveSequence(Sequence):
         self._thread = threading.Thread(target=self._watch, name=f"torchslam {name}", daemon=True)
         self._thread.start()
         with self._fresh:
-            self._fresh.wait_for(lambda: self._newest is not None or self._ended, patience)
-            newest = self._newest
-        if newest is None:
+            self._fresh.wait_for(lambda: self._arrived or self._ended, patience)
+            first = self._arrived[0][1] if self._arrived else None
+        if first is None:
             self.close()
             raise SequenceError(f"{name}: no frame came within {patience:g} s: is it there, and free?")
-        size = (newest[1].shape[1], newest[1].shape[0])
+        size = (first.shape[1], first.shape[0])
         super().__init__(
             name,
             "live",
@@ -99,19 +107,19 @@ class LiveSequence(Sequence):
         return self
 
     def image(self, index: int) -> Tensor:
-        """The newest frame. Raises EndOfSequence where the source has ended, FrameError for a frame that is gone."""
+        """The next frame. Raises EndOfSequence where the source has ended, FrameError for a frame that is gone."""
         if index < self._given:
             raise FrameError(
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
             )
         with self._fresh:
-            self._fresh.wait_for(lambda: self._newest is not None or self._ended, self._patience)
-            if self._newest is None:
+            self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
+            if not self._arrived:
                 self.close()
                 raise EndOfSequence(f"{self.name}: ended after {self._given} frames")
-            self._time, frame = self._newest
+            self._time, frame = self._arrived.popleft()
             self._dropped += self._replaced  # what comes after the last frame that is asked for is not missed
-            self._newest, self._replaced = None, 0
+            self._replaced = 0
         self._given = index + 1
         if (frame.shape[1], frame.shape[0]) != self.size:
             raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
@@ -137,7 +145,7 @@ class LiveSequence(Sequence):
         self._closing = True
 
     def _watch(self) -> None:
-        """Keep the newest frame, until the source ends or is closed."""
+        """Keep the newest frames, until the source ends or is closed."""
         try:
             while not self._closing and self._capture.grab():
                 captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
@@ -145,8 +153,8 @@ class LiveSequence(Sequence):
                 if not decoded:
                     continue
                 with self._fresh:
-                    self._replaced += self._newest is not None
-                    self._newest = (captured, frame)
+                    self._replaced += len(self._arrived) == self._arrived.maxlen
+                    self._arrived.append((captured, frame))
                     self._fresh.notify_all()
         finally:
             self._capture.release()

@@ -141,6 +141,8 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
     if figures.get("dropped"):
         rows["dropped"] = f"{figures['dropped']} frames that came while there was no time for them"
+    if latency := figures.get("latency_ms"):
+        rows["latency"] = f"{latency['median']:.0f} ms in the median, {latency['p95']:.0f} ms at 95 %"
     if figures["initialised_at"] is None:
         return rows | {"map": "none"}
     rows |= {

@@ -28,7 +28,6 @@ from torchslam.solvers.residuals import (
     variance_factor,
 )
 from torchslam.solvers.schur import (
-    FactorizedEquations,
     Marginals,
     NormalEquations,
     Tangent,
@@ -124,13 +123,9 @@ class Bundle:
     def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
         return new if bool(accept) else old
 
-    def factorized(self, model: BundleModel) -> FactorizedEquations:
-        """The undamped equations of a model at a minimum, ready to be solved; frames in the axes of the world."""
-        return model.equations.factorized(gauge=self._gauge(model.estimate))
-
     def definite(self, model: BundleModel) -> Tensor:
         """(1,) whether all that moves is determined, up to the gauge."""
-        return self.factorized(model).reduced.definite[None]
+        return model.equations.factorized(gauge=self._gauge(model.estimate)).reduced.definite[None]
 
     def ordered(self, estimate: Estimate) -> Estimate:
         """The estimate of a batch of one in the layout's order."""

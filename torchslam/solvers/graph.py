@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import safetensors.torch
 import torch
@@ -21,12 +21,17 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
+from torchslam.regular_file import check_regular
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust, refine_pose
 from torchslam.solvers.implicit import Backward
 from torchslam.solvers.levenberg import Progress
 from torchslam.values import Trajectory
 
 _FRAMES_AT_ONCE = 64
+_MAX_BYTES = 1 << 34
+
+Schema = dict[str, tuple[str, tuple[int, ...], type]]
+"""Of whom each column has a row - F frames, P points, O observations -, the shape of a row and the kind of numbers."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,18 @@ class ObservationGraph:
     camera: Camera
     is_keyframe: Tensor
     world: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+
+    _SCHEMA: ClassVar[Schema] = {
+        "timestamps": ("F", (), float),
+        "T_cw": ("F", (4, 4), float),
+        "is_keyframe": ("F", (), bool),
+        "world": ("F", (), int),
+        "points_w": ("P", (3,), float),
+        "frame_index": ("O", (), int),
+        "point_index": ("O", (), int),
+        "pixels": ("O", (2,), float),
+        "weights": ("O", (), float),
+    }
 
     def __post_init__(self) -> None:
         if len(self.world) == 0:
@@ -86,15 +103,48 @@ class ObservationGraph:
         has one.
         """
         try:
-            with safe_open(path, framework="pt") as file:
+            check_regular(path, _MAX_BYTES, "a graph that is read")
+            with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
                 names = [name for name in cls.columns() if name in known or name != "world"]
                 tensors = {name: file.get_tensor(name) for name in (*names, "camera")}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
-            return cls(camera=camera, **{name: tensors[name] for name in names})
-        except (SafetensorError, KeyError, ValueError) as error:
+            graph = cls(camera=camera, **{name: tensors[name] for name in names})
+            graph._check()
+            return graph
+        except (
+            OSError,
+            SafetensorError,
+            KeyError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RuntimeError,
+        ) as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
+
+    def _check(self) -> None:
+        """Raises ValueError where a column does not fit the others, or names rows that there are not."""
+        rows = {"F": len(self.T_cw), "P": len(self.points_w), "O": len(self.pixels)}
+        for name, (owner, shape, kind) in self._SCHEMA.items():
+            column = getattr(self, name)
+            if tuple(column.shape) != (rows[owner], *shape):
+                raise ValueError(f"{name} is {tuple(column.shape)}, not {(rows[owner], *shape)}")
+            is_float = kind is float and column.is_floating_point()
+            if not is_float and column.dtype != {int: torch.int64, bool: torch.bool}.get(kind):
+                raise ValueError(f"{name} is of type {column.dtype}")
+            if not bool(column.isfinite().all()):
+                raise ValueError(f"{name} is not finite")
+        for name, owner in (("frame_index", "F"), ("point_index", "P")):
+            index = getattr(self, name)
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < rows[owner]:
+                raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {rows[owner]}")
+        params = self.camera.params
+        if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
+            raise ValueError("the camera's parameters are none")
+        if min(self.camera.size) < 1 or bool((self.weights < 0).any()):
+            raise ValueError("an image without pixels, or a negative weight")
 
     @classmethod
     def columns(cls) -> list[str]:

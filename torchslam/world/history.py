@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.solvers.graph import GraphSolution, ObservationGraph
+from torchslam.solvers.graph import GraphSolution, ObservationGraph, Schema
 from torchslam.values import Tracked, Trajectory, View
 from torchslam.world.map import NO_KEYPOINT, Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
@@ -30,6 +31,13 @@ class RunGraph(ObservationGraph):
     sessions: Tensor
     point_ids: Tensor
     keypoint_index: Tensor
+
+    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
+        "frame_ids": ("F", (), int),
+        "sessions": ("F", (), int),
+        "point_ids": ("P", (), int),
+        "keypoint_index": ("O", (), int),
+    }
 
 
 class History:

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from torchslam.commands.run import frames_of
-from torchslam.config import Config
+from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.trajectory_file import write_trajectory
 from torchslam.run import run_sequence
@@ -28,10 +28,11 @@ def main() -> None:
     parser.add_argument("trajectory", type=Path)
     parser.add_argument("--processes", type=int)
     parser.add_argument("--limit", type=int)
+    parser.add_argument("--config", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     sequence = open_sequence(arguments.sequence, limit=arguments.limit)
-    slam = SLAM(sequence.camera, Config())
+    slam = SLAM(sequence.camera, load_config(arguments.config))
     ends: list[float] = []
 
     def after_frame(result: StepResult) -> None:

@@ -21,6 +21,8 @@ from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 
 OURS, ALONE, PEER = "ours", "ours, one process", "ORB-SLAM3"
+FAST, FAST_ALONE = "ours, fast", "ours, fast, one process"
+FAST_CONFIG = Path(__file__).parents[3] / "configs" / "fast.toml"
 HEADER = ["sequence", "system", "ms, median", "ms, 95 %", "frames/s", "CPU ms a frame", "ATE, m", "posed"]
 
 
@@ -84,7 +86,7 @@ def main() -> None:
 
 def systems(recording: Recording, with_peer: bool) -> list[str]:
     """Which ones run a recording: of a short one, ours has one process anyway."""
-    ours = [OURS, ALONE] if recording.frames >= WORTH else [OURS]
+    ours = [OURS, ALONE, FAST, FAST_ALONE] if recording.frames >= WORTH else [OURS, FAST]
     return [*ours, PEER] if with_peer else ours
 
 
@@ -110,7 +112,8 @@ def measured(system: str, recording: Recording, peer: list[str] | None) -> Figur
         else:
             line = [sys.executable, "-m", "experiments.benchmarks.slam.ours", str(source)]
             line += [str(folder / "trajectory.txt"), "--limit", str(recording.frames)]
-            line += ["--processes", "1"] if system == ALONE else []
+            line += ["--processes", "1"] if system in (ALONE, FAST_ALONE) else []
+            line += ["--config", str(FAST_CONFIG)] if system in (FAST, FAST_ALONE) else []
         said, seconds = with_cpu_time(line)
         figures = json.loads(said.strip().split("\n")[-1])
         ate, posed = accuracy(folder / "trajectory.txt", source, recording.frames)
