@@ -164,6 +164,7 @@ def test_a_failure_is_its_own(bundle_scene):
     pixels = batch.pixels.clone().requires_grad_()
     solution = bundle_adjust(replace(batch, pixels=pixels))
     assert solution.success.tolist() == [True, False, False]
+    assert bundle_adjust(batch, check=False).success.tolist() == [True, False, True]
     assert solution.T_cw.isfinite().all()
     assert solution.points_w.isfinite().all()
     (solution.T_cw.sum() + solution.points_w.sum()).backward()

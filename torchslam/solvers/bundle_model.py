@@ -164,6 +164,8 @@ class Bundle:
         """What the priors on free frames (F') and the cameras add, in the axes of the world."""
         frames, inputs = self.layout.free_frames, self.inputs
         poses = inputs.pose_prior
+        if poses is None and inputs.camera_prior is None:
+            return None
         if poses is not None:
             T_cw, information = (x.index_select(0, frames) for x in (poses.T_cw, poses.information))
             inputs = inputs._replace(prior_T_cw=T_cw, prior_information=information)
