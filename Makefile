@@ -54,6 +54,10 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 	$(BIN)/python -m experiments.benchmarks.geometry
 	$(BIN)/python -m experiments.benchmarks.solvers
 	$(BIN)/python -m experiments.benchmarks.pose_graph
+	$(BIN)/python -m experiments.benchmarks.bundle
+	$(BIN)/python -m experiments.benchmarks.relative_pose
+	$(BIN)/python -m experiments.benchmarks.mapping
+	$(BIN)/python -m experiments.benchmarks.clips
 
 profile: $(INSTALLED)  ## milliseconds by stage of the run in RESULTS (results/demo)
 	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)

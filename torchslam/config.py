@@ -175,6 +175,9 @@ class PatchesConfig(Settings, section="patches"):
 
     enabled: bool = setting(False, "whether frames are followed")
     count: int = setting(300, "patches that are followed", low=20, high=MOST)
+    min_agreeing: int = setting(
+        150, "that must agree with the pose: a thin map is in need of every frame", low=20, high=MOST
+    )
     min_similarity: float = setting(
         0.8, "normalised cross-correlation of a patch with the earlier frame", low=0, high=1
     )
@@ -190,7 +193,7 @@ class PatchesConfig(Settings, section="patches"):
         high=10,
     )
     delay: int = setting(
-        2,
+        0,
         "frames after which is known what came of one with features: it is mapped meanwhile",
         low=0,
         high=64,

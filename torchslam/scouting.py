@@ -135,11 +135,16 @@ class _Away:
         self.next = start
         self.wanted = start - 1  # the frame that is wanted at home: those before it are done with
         self.images: dict[int, Frame] = {}  # of the last frames
+        self.read: Frame | Exception | None = None  # the next frame, if there was time
 
     def go(self) -> None:
         while True:
-            is_far = self.next > self.wanted + self.delay or self.next >= len(self.sequence)
-            if is_far or self.connection.poll():
+            is_over = self.next >= len(self.sequence)
+            is_far = is_over or self.next > self.wanted + self.delay
+            is_idle = is_far and not is_over and self.read is None
+            if is_idle and not self.connection.poll():
+                self.read = self.ahead(self.next)
+            elif is_far or self.connection.poll():
                 self.hear(*pickle.loads(self.connection.recv_bytes()))
             else:
                 self.send(self.look(self.next))
@@ -155,12 +160,23 @@ class _Away:
         if news is not None:
             self.scout.learn(news[0], unpacked(Anchor, news[1]))
 
-    def look(self, index: int) -> Arrays | BaseException:
-        """What there is to say of a frame; an error is an answer too, and raised where it was asked for."""
+    def ahead(self, index: int) -> Frame | Exception:
+        """A frame, and all that can be done before it is its turn."""
         try:
             frame = self.sequence[index]
-            check_order(frame, self.last_frame)
             check_size(frame, self.scout.camera)
+            self.scout.prepare(frame)
+            return frame
+        except Exception as error:
+            return error
+
+    def look(self, index: int) -> Arrays | BaseException:
+        """What there is to say of a frame; an error is an answer too, and raised where it was asked for."""
+        frame, self.read = self.read or self.ahead(index), None
+        try:
+            if isinstance(frame, Exception):
+                raise frame
+            check_order(frame, self.last_frame)
             followed = self.scout.follow(frame)
             self.last_frame, self.images[index] = (frame.index, frame.timestamp), frame
             return as_arrays(frame, followed, self.extract(frame) if followed.why_not else None)

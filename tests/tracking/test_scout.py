@@ -68,7 +68,12 @@ def anchor(index: int, keyframes: Tensor | None = None, overlap: float = 1.0) ->
 
 
 def scout(*settings: str) -> Scout:
-    return Scout(CAMERA, load_config(None, ["patches.delay=0", "keyframes.max_translation=10", *settings]))
+    return Scout(
+        CAMERA,
+        load_config(
+            None, ["patches.delay=0", "patches.min_agreeing=40", "keyframes.max_translation=10", *settings]
+        ),
+    )
 
 
 def follow_from(found: Scout, first: Anchor, frames: int) -> list[Followed]:
@@ -213,3 +218,16 @@ def test_points_of_age_have_the_say() -> None:
     followed = follow_from(found, Anchor(**{**vars(first), **told}), 6)[-1]
     check_pose(followed, 6)
     assert not young[followed.rows].any()
+
+
+def test_a_thin_map_needs_every_frame() -> None:
+    found, covered = scout("patches.min_agreeing=100"), picture(pose(1))
+    covered[..., :100] = 0.5
+    found.follow(frame(0))
+    found.learn(0, anchor(0))
+    followed = found.follow(frame(1, covered))
+    assert followed.why_not == f"only {len(followed.rows)} patches agree with the pose"
+    check_pose(followed, 1)
+    (followed,) = follow_from(scout("patches.min_agreeing=109"), anchor(0), 1)
+    assert followed.why_not == "there is too little to follow it by"
+    assert followed.T_ca is None

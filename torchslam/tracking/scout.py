@@ -57,6 +57,7 @@ class Scout:
         """Begin anew: there is nothing to follow."""
         self._news: deque[tuple[int, Anchor | None]] = deque()
         self._pyramids: dict[int, Pyramid] = {}  # of the last frames: one may become an anchor
+        self._prepared: tuple[int, Pyramid] = (-1, ())
         self._leave()
 
     def _leave(self) -> None:
@@ -68,15 +69,26 @@ class Scout:
         """A frame was found by its features: what to follow the next ones from, or that they are not to be followed."""
         self._news.append((index, anchor))
 
+    def prepare(self, frame: Frame) -> None:
+        """Do what can be done of a frame before its turn, while there is time."""
+        self._prepared = frame.index, self._pyramid(frame)
+
+    def _pyramid(self, frame: Frame) -> Pyramid:
+        image, _ = reduced(frame.image.to(self.camera.params.device), None, self.reduction)
+        return pyramid(image)
+
     def follow(self, frame: Frame) -> Followed:
         """Where the next frame is, and whether that will do."""
         while self._news and self._news[0][0] < frame.index - self.settings.delay:
             self._go_to(self._news.popleft()[1])
-        image, _ = reduced(frame.image.to(self.camera.params.device), None, self.reduction)
-        self._pyramids[frame.index] = images = pyramid(image)
+        images = self._pyramid(frame) if self._prepared[0] != frame.index else self._prepared[1]
+        self._pyramids[frame.index] = images
         self._pyramids = dict(list(self._pyramids.items())[-(self.settings.delay + 2) :])
         if self._held is None:
             return Followed(-1, "nothing to follow it from")
+        if len(self._held.anchor.points_a) < self.settings.min_agreeing:
+            self._found.append(frame.index)
+            return Followed(self._held.anchor.index, "there is too little to follow it by")
         followed = self._follow(self._held, frame.index, images)
         if followed.T_ca is not None:
             self._poses[frame.index] = followed.T_ca
@@ -194,6 +206,8 @@ class Scout:
         anchor = held.anchor
         points_c = transform(T_ca, anchor.points_a[rows])
         errors = squared_reprojection_errors(points_c, pixels[rows], self.camera) / anchor.scales[rows] ** 2
+        if len(rows) < self.settings.min_agreeing:
+            return f"only {len(rows)} patches agree with the pose"
         worse = float(errors.median()) / max(held.error, LEAST_ERROR)
         if worse > self.settings.max_error_growth:
             return f"patches miss the map by {worse**0.5:.1f} times what they did"
