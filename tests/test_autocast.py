@@ -18,7 +18,14 @@ from tests.solvers.test_graph import simulated
 from tests.solvers.test_pose_graph import make_scene
 from torchslam import Features, evaluation, geometry, solvers
 from torchslam.geometry import Camera, rigid, se3_exp, sim3_exp, so3_exp
-from torchslam.solvers import BundleProblem, PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
+from torchslam.solvers import (
+    BundleProblem,
+    PosePrior,
+    bundle_adjust,
+    minimize,
+    pose_graph_optimize,
+    refine_pose,
+)
 from torchslam.solvers.graph import solve
 
 Case = tuple[Callable[..., Any], tuple[Tensor, ...]]
@@ -169,7 +176,14 @@ def solver_cases() -> dict[str, Case]:
         camera = replace(graph.camera, params=params)
         return solve(replace(cast(graph, pixels), pixels=pixels, camera=camera))
 
+    def align(start: Tensor, points: Tensor, targets: Tensor) -> Any:
+        def residual(T: Tensor, points: Tensor, targets: Tensor) -> Tensor:
+            return geometry.transform(T, points) - targets
+
+        return minimize(residual, start.detach(), (points, targets), "se3", kernel="cauchy")
+
     return {
+        "minimize": (align, (start, points_w, points_w + 0.1 * normal(*points_w.shape, seed=8))),
         "refine_pose": (refine, (start, points_w, pixels, params, spd(6)[:1])),
         "bundle_adjust": (bundle, (graph.T_cw, graph.points_w, graph.pixels, graph.camera.params)),
         "solve": (solve_graph, (graph.pixels, graph.camera.params)),
@@ -241,7 +255,7 @@ def test_autocast_changes_no_bit(name: str) -> None:
         assert torch.equal(found.nan_to_num(), expected.nan_to_num())
 
 
-@pytest.mark.parametrize("name", ["refine_pose", "bundle_adjust", "solve", "pose_graph_optimize"])
+@pytest.mark.parametrize("name", ["refine_pose", "bundle_adjust", "solve", "pose_graph_optimize", "minimize"])
 def test_autocast_does_not_reach_the_backward_pass_of_a_minimum(name: str) -> None:
     function, inputs = CASES[name]
     gradients = []

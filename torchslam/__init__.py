@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torchslam.learning.clip import ClipGraph, ClipPoses, ClipSLAM, clip_loss
     from torchslam.run import Run
     from torchslam.slam import SLAM
-    from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
+    from torchslam.solvers import BundleProblem, bundle_adjust, minimize, refine_pose
     from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
     from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
 
@@ -62,6 +62,7 @@ __all__ = [
     "load_config",
     "match",
     "match_projected",
+    "minimize",
     "open_sequence",
     "refine_pose",
     "solve",
@@ -79,7 +80,7 @@ HOMES = {
     "torchslam.learning.clip": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.run": "Run",
     "torchslam.slam": "SLAM",
-    "torchslam.solvers": "BundleProblem bundle_adjust refine_pose",
+    "torchslam.solvers": "BundleProblem bundle_adjust minimize refine_pose",
     "torchslam.solvers.graph": "GraphSolution ObservationGraph solve",
     "torchslam.values": "Features Frame Matches State StepResult Trajectory",
 }

@@ -11,8 +11,8 @@ from torch import Tensor
 from experiments.match_weights.problems import RANSAC_PX, Problems
 from experiments.match_weights.weighting import MatchWeights, propagated_variances, refine, refine_learned
 from torchslam.geometry import transform
+from torchslam.geometry.robust import Kernel
 from torchslam.learning.losses import pose_errors
-from torchslam.solvers.robust import Kernel
 
 KERNELS: tuple[Kernel, ...] = ("huber", "cauchy", "geman_mcclure", "truncated")
 SCALES = (1.0, 2.0, 4.0)

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from experiments.match_weights.problems import Problems
 from torchslam.geometry import innovation_covariances, mahalanobis_squared, transform
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.solvers.robust import Kernel
 
 NUM_FEATURES = 21
 ROUNDS = 2

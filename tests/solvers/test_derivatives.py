@@ -67,7 +67,7 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
 
 
 def graph_problem() -> Problem:
-    _, graph = simulated(frames=7, points=12)
+    _, graph = simulated(frames=7, points=16)
 
     def poses(x: Tensor) -> Tensor:
         ramp = torch.linspace(-1, 1, len(graph.pixels), dtype=torch.float64)[:, None]

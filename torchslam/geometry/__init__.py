@@ -3,6 +3,7 @@
 from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.camera_tree import register
 from torchslam.geometry.essential import (
     decompose_essential,
     epipolar_offsets,
@@ -57,6 +58,8 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
+
+register()
 
 __all__ = [
     "CHI_SQUARE_95",

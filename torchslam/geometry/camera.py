@@ -5,8 +5,10 @@ Camera frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,13 +20,14 @@ Scalar = float | Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera. Without batch dimensions it broadcasts over any batch of points.
+    """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
     model:  "pinhole", "radial_tangential" or "fisheye"
-    params: (..., P) fx, fy, cx, cy in pixels, then the distortion: none; k1, k2, p1, p2, k3; or k1, k2, k3,
-    k4 size:   (width, height) in pixels
+    params: (..., P) fx, fy, cx, cy in pixels, then the distortion: none; k1, k2, p1, p2, k3; or k1, k2, k3, k4
+    size:   (width, height) in pixels
 
-    Coefficients as in OpenCV. Every method is differentiable with respect to points, pixels and `params`.
+    Coefficients as in OpenCV. Every method is differentiable with respect to points, pixels and `params`. It is a
+    pytree of `params`: `torch.func` and `torch.utils.data.default_collate` take it.
     """
 
     model: str
@@ -128,9 +131,27 @@ class Camera:
         """The same model and size with other parameters."""
         return replace(self, params=params)
 
-    def to(self, target: torch.device | torch.dtype | str) -> Camera:
-        """The same camera on another device or in another dtype."""
-        return replace(self, params=self.params.to(target))
+    def __getitem__(self, index: Any) -> Camera:
+        """Of many cameras (..., P) some, as indexing a tensor of their leading dimensions does."""
+        if self.params.ndim == 1:
+            raise IndexError("this is one camera: its parameters have no leading dimension")
+        index = index if isinstance(index, tuple) else (index,)
+        chosen = self.with_params(self.params[(*index, ..., slice(None))])
+        if self.model != "pinhole":  # found once for each camera, not for each time that it is chosen
+            chosen.__dict__["limit"] = self.limit[index]
+        return chosen
+
+    @staticmethod
+    def stack(cameras: Sequence[Camera]) -> Camera:
+        """Cameras as one with a leading dimension. Raises ValueError unless they have one model and one size."""
+        kinds = sorted({(camera.model, tuple(camera.size)) for camera in cameras})
+        if len(kinds) != 1:
+            raise ValueError(f"cameras of a batch must have one model and one size, not {kinds}")
+        return cameras[0].with_params(torch.stack([camera.params for camera in cameras]))
+
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
+        """The same camera on another device or in another dtype; arguments as of `Tensor.to`."""
+        return replace(self, params=self.params.to(*args, **kwargs))
 
     def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of points in the camera frame.

@@ -263,7 +263,7 @@ def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
         raise ValueError(
             f"params of the camera must be (K,) or ({clips}, K), not {tuple(camera.params.shape)}"
         )
-    return tuple(camera.with_params(params) for params in camera.params)
+    return tuple(camera[row] for row in range(clips))
 
 
 def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:

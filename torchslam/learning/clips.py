@@ -107,10 +107,10 @@ def stack_cameras(cameras: Several[Camera]) -> Camera:
     if models == {"pinhole", "radial_tangential"}:
         width = max(camera.params.shape[-1] for camera in cameras)
         padded = [torch.nn.functional.pad(c.params, (0, width - c.params.shape[-1])) for c in cameras]
-        return Camera("radial_tangential", torch.stack(padded), cameras[0].size)
-    if len(models) > 1:
-        raise ValueError(f"cameras of the models {', '.join(sorted(models))} cannot be in one batch")
-    return cameras[0].with_params(torch.stack([camera.params for camera in cameras]))
+        cameras = [
+            Camera("radial_tangential", params, c.size) for c, params in zip(cameras, padded, strict=True)
+        ]
+    return Camera.stack(cameras)
 
 
 def frames_in(seconds: float, sequence: Sequence) -> int:
@@ -218,8 +218,7 @@ class Looking:
         numbers = clips.number.tolist()
         for row, number in enumerate(numbers):
             if number not in self._graphs:
-                camera = clips.camera.with_params(clips.camera.params[row])
-                self._graphs[number] = self._clip_slam.look(clips.images[row], camera)
+                self._graphs[number] = self._clip_slam.look(clips.images[row], clips.camera[row])
         return ClipGraph.stack([self._graphs[number] for number in numbers])
 
 

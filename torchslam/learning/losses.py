@@ -26,8 +26,8 @@ from torchslam.geometry import (
     triangulate_many,
 )
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.robust import Kernel, robustify
 from torchslam.learning.clip import ClipPoses
-from torchslam.solvers.robust import Kernel, robustify
 
 __all__ = [
     "ate",

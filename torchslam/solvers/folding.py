@@ -1,17 +1,42 @@
-"""How a function of batches takes the further dimensions of `torch.func.vmap`."""
+"""Parts of batches, and how a function of batches takes the further dimensions of `torch.func.vmap`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.func import vmap
+from torch.utils._pytree import tree_map
 
 Tensors = tuple[Tensor, ...]
 InDims = Sequence[int | None]
 """The dimension of each tensor along which the elements run; None where all share it."""
+
+
+Tree = TypeVar("Tree")
+"""Named tuples of batched tensors, also within one another."""
+
+
+def taken(tree: Tree, rows: Tensor) -> Tree:
+    """Some elements of a batch."""
+    return tree_map(lambda tensor: tensor.index_select(0, rows), tree)
+
+
+def chosen(first: Tensor, one: Tree, other: Tree) -> Tree:
+    """Per element, `one` where `first` (B,) and `other` elsewhere."""
+
+    def choose(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return tree_map(choose, one, other)
+
+
+def joined(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
+    """The batch of which each tree has the elements in its rows (b,)."""
+    order = torch.argsort(torch.cat(list(rows)))
+    return tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *trees)
 
 
 def many_times(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:

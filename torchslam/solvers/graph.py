@@ -20,11 +20,11 @@ from torch import Tensor
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.robust import Kernel
 from torchslam.regular_file import check_regular
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust, refine_pose
 from torchslam.solvers.implicit import Backward
 from torchslam.solvers.levenberg import Progress
-from torchslam.solvers.robust import Kernel
 from torchslam.values import Trajectory
 
 _FRAMES_AT_ONCE = 64

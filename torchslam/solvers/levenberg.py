@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
+
+from torchslam.solvers.folding import joined, taken
 
 _INITIAL_DAMPING = 1e-4
 _DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
@@ -41,8 +43,10 @@ X = TypeVar("X")
 class LeastSquares(Protocol[X, M]):
     """What the loop asks of a problem with estimate X and local models M."""
 
-    solvable: Tensor
-    """(B,) bool, which elements to minimise; the others stay at their start."""
+    @property
+    def solvable(self) -> Tensor:
+        """(B,) bool, which elements to minimise; the others stay at their start."""
+        ...
 
     def evaluate(self, estimate: X, near: Tensor) -> M:
         """The cost and its quadratic model at an estimate. near: (B,) bool, the optimum is close."""
@@ -57,6 +61,15 @@ class LeastSquares(Protocol[X, M]):
 
     def select(self, accept: Tensor, new: M, old: M) -> M:
         """Per element, `new` where `accept` (B,) and `old` elsewhere."""
+        ...
+
+
+@runtime_checkable
+class Divisible(Protocol):
+    """A problem whose models are named tuples of batched tensors: elements that have converged leave the batch."""
+
+    def part(self, rows: Tensor) -> Self:
+        """The problems of some elements."""
         ...
 
 
@@ -89,12 +102,13 @@ def minimize(
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
-    initial_cost = model.cost.detach()
+    initial_cost = initial = model.cost.detach()
     # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
-    rounding = torch.finfo(initial_cost.dtype).eps
+    rounding = torch.finfo(initial.dtype).eps
     slack = 1 + 100 * rounding
-    damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
+    damping = torch.full_like(initial, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
+    rows, resting = torch.arange(len(active), device=active.device), []
     for iteration in range(iterations):
         if progress is not None:
             progress(iteration, iterations)
@@ -102,10 +116,19 @@ def minimize(
         share = decrease.detach() / model.cost.detach()
         trial = problem.evaluate(estimate, share < _NEAR)
         accept = active & (share < torch.inf) & (trial.cost <= slack * model.cost)
-        steps = steps + active
-        active = active & (share > tolerance) & (model.cost.detach() > rounding**1.5 * initial_cost)
+        steps = steps.index_add(0, rows, active.long())
+        active = active & (share > tolerance) & (model.cost.detach() > rounding**1.5 * initial)
         model = problem.select(accept, trial, model)
         damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():
             break
-    return model, Convergence(steps, ~active, initial_cost, model.cost.detach())
+        if isinstance(problem, Divisible) and not active.all():
+            rest, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
+            resting.append((rows[rest], taken(model, rest)))
+            problem, model = problem.part(stay), taken(model, stay)
+            rows, active, damping, initial = taken((rows, active, damping, initial), stay)
+    converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
+    if resting:
+        where, models = zip(*resting, (rows, model), strict=True)
+        model = joined(models, where)
+    return model, Convergence(steps, converged, initial_cost, model.cost.detach())

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.folding import Tensors
 from torchslam.solvers.implicit import Backward, Ndims, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence, minimize
@@ -25,7 +26,6 @@ from torchslam.solvers.residuals import (
     usable,
     variance_factor,
 )
-from torchslam.solvers.robust import Kernel
 from torchslam.solvers.tangent import move, point_jacobian, pull_back, push, retract
 
 _MIN_POINTS = 3

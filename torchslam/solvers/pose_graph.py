@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.implicit import Backward, check_backward, minimum
 from torchslam.solvers.levenberg import Convergence
 from torchslam.solvers.pose_graph_minimization import PoseGraphMinimization
 from torchslam.solvers.pose_graph_model import Inputs
-from torchslam.solvers.robust import Kernel
 
 # 95 % of the norms of seven standard normal numbers lie below.
 _SCALE = 3.75

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers.folding import Tensors
 from torchslam.solvers.implicit import Ndims
 from torchslam.solvers.levenberg import minimize
 from torchslam.solvers.pose_graph_layout import Layout, build_layout
 from torchslam.solvers.pose_graph_model import Inputs, PoseGraphProblem, linearize, pull_back, push, retract
-from torchslam.solvers.robust import Kernel
 
 
 class PoseGraphMinimization:

@@ -22,8 +22,8 @@ from torchslam.geometry.lie import (
     sim3_log,
     skew,
 )
+from torchslam.geometry.robust import Kernel, Robustified, robustify
 from torchslam.solvers.pose_graph_layout import Layout
-from torchslam.solvers.robust import Kernel, Robustified, robustify
 from torchslam.solvers.sparse_cholesky import SparseFactor, factorize_sparse
 
 # A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.

@@ -1,4 +1,4 @@
-"""A Gaussian prior on poses: half of e^T information e, e = (t, log R) of T_cw @ T_prior^-1."""
+"""Gaussian priors: half of e^T information e; e = (t, log R) of T_cw @ T_prior^-1 for poses."""
 
 from __future__ import annotations
 
@@ -23,8 +23,20 @@ class PosePrior:
     information: Tensor
 
 
+@dataclass(frozen=True)
+class CameraPrior:
+    """Where the parameters of a camera are expected, and how surely.
+
+    params:      (K,) as `Camera.params`; (C, K) of several cameras
+    information: (K, K) inverse covariance, symmetric; (C, K, K) of several cameras
+    """
+
+    params: Tensor
+    information: Tensor
+
+
 def prior_error(prior: PosePrior, T_cw: Tensor) -> tuple[Tensor, Tensor]:
-    """e = (t, log R) of T_cw @ T_prior^-1, and d e / d xi. (B, 4, 4) -> (B, 6), (B, 6, 6)."""
+    """e = (t, log R) of T_cw @ T_prior^-1, and d e / d xi. (..., 4, 4) -> (..., 6), (..., 6, 6)."""
     E = T_cw @ se3_inverse(prior.T_cw)
     translation, rotation = E[..., :3, 3], so3_log(E[..., :3, :3])
     J_rotation = torch.linalg.inv(so3_left_jacobian(rotation))
@@ -36,11 +48,11 @@ def prior_error(prior: PosePrior, T_cw: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def prior_expansion(prior: PosePrior, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost (B,), gradient (B, 6) and Gauss-Newton Hessian (B, 6, 6) at poses (B, 4, 4)."""
+    """Cost (...), gradient (..., 6) and Gauss-Newton Hessian (..., 6, 6) at poses (..., 4, 4)."""
     error, J = prior_error(prior, T_cw)
     pulled = J.mT @ prior.information
     gradient = (pulled @ error[..., None]).squeeze(-1)
-    return 0.5 * torch.einsum("bi,bij,bj->b", error, prior.information, error), gradient, pulled @ J
+    return 0.5 * torch.einsum("...i,...ij,...j->...", error, prior.information, error), gradient, pulled @ J
 
 
 def prior_hessian(prior: PosePrior, T_cw: Tensor) -> Tensor:

@@ -11,14 +11,14 @@ an error of the image's diagonal and pulls nowhere: no step gains by pushing a p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.solvers.robust import Kernel, robustify
+from torchslam.geometry.robust import Kernel, robustify
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,25 @@ def linearize(observations: Observations, points_c: Tensor, free_camera: bool = 
     return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
 
 
+def linearize_each(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
+    """`linearize` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
+    if observations.camera.params.ndim == 1:
+        return linearize(observations, points_c, free_camera)
+    lin = linearize(_apart(observations), points_c[:, None], free_camera)
+    return Linearization(*(part.squeeze(1) for part in lin))
+
+
+def _apart(observations: Observations) -> Observations:
+    """Observations (N,) as a batch of one each; their scale is a scalar or (N,)."""
+    scale = observations.scale
+    return replace(
+        observations,
+        pixels=observations.pixels[:, None],
+        weights=observations.weights[:, None],
+        scale=scale[:, None] if scale.ndim else scale,
+    )
+
+
 class Weighed(NamedTuple):
     """`cost`, `weight` and `bend` of a `Linearization`, all (..., N)."""
 
@@ -124,6 +143,12 @@ def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, 
     return normalized * focal + centre, valid[..., 0], J_points
 
 
+def flat_along(weight: Tensor, bend: Tensor, squared: Tensor, near: Tensor) -> Tensor:
+    """The bend (..., N) that `gauss_newton_expansion` takes for residuals of these squares, px^2."""
+    flat = -weight / torch.where(squared > 0, squared, 1.0)
+    return torch.maximum(bend, flat) * near
+
+
 class Expansion(NamedTuple):
     """The second-order expansion of the cost in points_c and, where it is free, camera.params.
 
@@ -133,19 +158,23 @@ class Expansion(NamedTuple):
     gradient: Tensor
     hessian: Tensor
 
+    def along(self, columns: Tensor) -> Expansion:
+        """The expansion in the coefficients of columns (..., D, n)."""
+        gradient = (self.gradient[..., None, :] @ columns).squeeze(-2)
+        return Expansion(gradient, columns.mT @ self.hessian @ columns)
+
 
 def gauss_newton_expansion(lin: Linearization, J: Tensor, near: Tensor) -> Expansion:
-    """Gradient (D, N) and Hessian (D, D, N) in what moves pixels by J (2, D, N), without the bend of the projection.
+    """Gradient (D, ..., N) and Hessian (D, D, ..., N) in what moves pixels by J (2, D, ..., N), without the bend of the
+    projection.
 
-    `near`, broadcastable to (N,), says where the kernel's curvature counts. Across the residual of an outlier the
+    `near`, broadcastable to (..., N), says where the kernel's curvature counts. Across the residual of an outlier the
     Hessian is positive, along it negative: the negative part then counts as flat, which keeps the matrix positive
     semi-definite and converges several times faster close to the optimum. Elsewhere the curvature counts as zero
     (iteratively reweighted least squares), which descends from afar.
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
     """
-    squared = lin.residual.square().sum(-1)
-    flat = -lin.weight / torch.where(squared > 0, squared, 1.0)
-    bend = torch.maximum(lin.bend, flat) * near
+    bend = flat_along(lin.weight, lin.bend, lin.residual.square().sum(-1), near)
     pulled = (J[0] * lin.residual[..., 0]).addcmul(J[1], lin.residual[..., 1])  # J^T r
     weighted = lin.weight * J
     hessian = (weighted[0][:, None] * J[0]).addcmul(weighted[1][:, None], J[1])
@@ -163,6 +192,16 @@ def exact_expansion(observations: Observations, points_c: Tensor, free_camera: b
     hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
     hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
     return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
+
+
+def exact_expansion_of_each(
+    observations: Observations, points_c: Tensor, free_camera: bool = False
+) -> Expansion:
+    """`exact_expansion` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
+    if observations.camera.params.ndim == 1:
+        return exact_expansion(observations, points_c, free_camera)
+    expansion = exact_expansion(_apart(observations), points_c[:, None], free_camera)
+    return Expansion(*(part.squeeze(1) for part in expansion))
 
 
 def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_camera: bool) -> Tensor:
@@ -184,7 +223,9 @@ def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_ca
     return torch.cat(rows, dim=-1).movedim(0, -2)
 
 
-def variance_factor(observations: Observations, linearization: Linearization, num_parameters: int) -> Tensor:
+def variance_factor(
+    observations: Observations, linearization: Linearization, num_parameters: int | Tensor
+) -> Tensor:
     """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate. -> (...).
 
     From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, psi = rho' r,

@@ -40,6 +40,11 @@ def push(T: Tensor, xi: Tensor) -> Tensor:
     return torch.nn.functional.pad(changed, (0, 0, 0, 1))
 
 
+def turned(R: Tensor, values: Tensor) -> Tensor:
+    """Both halves of tangent vectors (..., 6, n) turned by R (..., 3, 3)."""
+    return (R[..., None, :, :] @ values.unflatten(-2, (2, 3))).flatten(-3, -2)
+
+
 def move(points_c: Tensor, xi: Tensor) -> Tensor:
     """The velocity of points in the camera frame when the pose moves along xi: v + omega x p.
 

@@ -17,8 +17,8 @@ from torchslam.features.patches import RADIUS, Aligned, Patches, Pyramid, align,
 from torchslam.front_end import reduced
 from torchslam.geometry import Camera, fits, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.motion import apart
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.solvers.robust import Kernel
 from torchslam.tracking.spread import voices
 from torchslam.values import Anchor, Followed, Frame
 

@@ -19,8 +19,8 @@ from torchslam.geometry import (
     squared_reprojection_errors,
     transform,
 )
+from torchslam.geometry.robust import Kernel
 from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.solvers.robust import Kernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
 from torchslam.values import Tracked, View

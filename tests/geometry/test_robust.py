@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.solvers.robust import Kernel, robustify
+from torchslam.geometry.robust import Kernel, robustify
 
 KERNELS = get_args(Kernel)
 

@@ -1,5 +1,0 @@
-"""The robust kernels, which `torchslam.geometry.robust` defines."""
-
-from torchslam.geometry.robust import Kernel, Robustified, robustify
-
-__all__ = ["Kernel", "Robustified", "robustify"]
