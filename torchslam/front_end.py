@@ -33,10 +33,10 @@ def image_extractor(config: Config, device: torch.device | str = "cpu") -> Extra
         wanted = None if frame.mask is None else frame.mask.to(device)
         height, width = image.shape[-2:]
         factor = settings.reduction((width, height))
-        image, wanted = reduced(image, wanted, factor)
-        features = module(image, wanted)
+        small, wanted_there = reduced(image, wanted, factor)
+        features = module(small, wanted_there)
         if factor > 1:
-            ratio = width / image.shape[-1], height / image.shape[-2]
+            ratio = width / small.shape[-1], height / small.shape[-2]
             features = _enlarged(features, ratio, factor)
         # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
         return features if wanted is None else only_where(features, wanted)

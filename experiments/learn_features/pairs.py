@@ -79,8 +79,10 @@ def matched(features: Features) -> tuple[Tensor, Tensor]:
 
 
 def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
-    """The motion that matches (M, 2) tell."""
-    return estimate_relative_pose(pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX)
+    """The motion that matches (M, 2) tell, as the system's start does: by those within a threshold."""
+    return estimate_relative_pose(
+        pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX, kernel="truncated", min_samples=64
+    )
 
 
 def _failed(motion: RelativePose) -> float:

@@ -48,7 +48,7 @@ def test_a_shift_is_found(dx: float, dy: float, seed: int) -> None:
     assert found.mask.float().mean() > 0.8
     error = (found.pixels - pixels - shift).norm(dim=-1)[found.mask & (found.similarity > 0.9)]
     assert len(error) > 15
-    assert error.median() < 0.05
+    assert error.median() < 0.1
 
 
 def test_gain_and_offset_make_no_difference() -> None:

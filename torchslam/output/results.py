@@ -161,7 +161,8 @@ _FIGURES: dict[str, Callable[[Any], bool]] = {
     "worlds": _are_worlds,
     "ate_m": _is_number,
     **dict.fromkeys(("session", "posed", "keyframes"), _is_count),
-    **dict.fromkeys(("source", "failure"), lambda value: isinstance(value, str)),
+    "failure": lambda value: isinstance(value, str),
+    "source": lambda value: value is None or isinstance(value, str),
 }
 
 

@@ -77,8 +77,7 @@ def grow(slam_map: Map, camera: Camera, config: Config) -> None:
     """What the first matches missed: new points along epipolar lines, and points found again by their projections."""
     for keyframe in range(slam_map.num_keyframes):
         neighbours = slam_map.covisible(keyframe, 2 * config.mapping.neighbours)
-        for neighbour in neighbours[: config.mapping.neighbours].tolist():
-            triangulate_against(slam_map, keyframe, neighbour, camera, config)
+        triangulate_against(slam_map, keyframe, neighbours[: config.mapping.neighbours], camera, config)
         slam_map.refresh(slam_map.ids(keyframe))
         fuse(slam_map, keyframe, neighbours, camera, config)
     adjust_all(slam_map, camera, config.bundle)

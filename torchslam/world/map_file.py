@@ -145,7 +145,8 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         check_regular(path, MAX_BYTES, "a map that is read")
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # In memory of their own: a sum over rows that lie elsewhere in a cache line may have other last bits.
+            tensors: dict[str, Tensor] = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise ResultsError(f"{path}: no map file") from None
     except OSError as error:

@@ -1,0 +1,89 @@
+"""Does a live run keep up? A recording is played at the rate of its camera, whether anybody looks or not.
+
+python -m experiments.benchmarks.slam.live redkitchen --config configs/fast.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from experiments.common import DATA_DIR
+from torchslam.config import load_config
+from torchslam.data import open_sequence
+from torchslam.data.live import LiveSequence
+from torchslam.data.sequence import Sequence
+from torchslam.evaluation import evaluate
+from torchslam.run import run_sequence
+from torchslam.slam import SLAM
+from torchslam.values import StepResult, Trajectory
+
+
+class Player:
+    """The images of a recording as a camera gives them: one that is not taken when it is due is gone."""
+
+    def __init__(self, sequence: Sequence, rate: float) -> None:
+        self.paths = [sequence.image_name(index) for index in range(len(sequence))]
+        self.rate = rate
+        self.start: float | None = None
+        self.frame = -1
+
+    def grab(self) -> bool:
+        self.start = time.monotonic() if self.start is None else self.start
+        self.frame += 1
+        time.sleep(max(0.0, self.start + self.frame / self.rate - time.monotonic()))
+        return self.frame < len(self.paths)
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        image = cv2.imread(self.paths[self.frame], cv2.IMREAD_GRAYSCALE)
+        return image is not None, np.empty(0) if image is None else image
+
+    def get(self, property_id: int) -> float:
+        return 1e3 * self.frame / self.rate if property_id == cv2.CAP_PROP_POS_MSEC else 0.0
+
+    def release(self) -> None:
+        pass
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name")
+    parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--limit", type=int)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    recording = open_sequence(DATA_DIR / options.name, limit=options.limit)
+    slam = SLAM(recording.camera, load_config(options.config))
+    live = LiveSequence(options.name, Player(recording, options.rate), recording.camera)
+    latencies: list[float] = []
+    times: list[float] = []
+
+    def after_frame(result: StepResult) -> None:
+        latencies.append(1e3 * (time.time() - result.timestamp))
+        times.append(result.timestamp)
+
+    finished = run_sequence(slam, live, after_frame)
+    median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
+    print(
+        f"{options.name} at {options.rate:g} Hz: {len(finished.results)} frames, {live.dropped} dropped "
+        f"({live.dropped / len(recording):.1%}), latency {median:.0f} ms in the median, {p95:.0f} ms at 95 %, "
+        f"posed {len(finished.trajectory)}, ATE {ate(finished.trajectory, recording, times[0], options.rate):.4f} m"
+    )
+
+
+def ate(trajectory: Trajectory, recording: Sequence, begin: float, rate: float) -> float:
+    """ATE of poses at the times of the player, in metres; NaN without ground truth."""
+    if recording.groundtruth is None:
+        return float("nan")
+    frames = ((trajectory.timestamps - begin) * rate).round().long()
+    return evaluate(Trajectory(recording.timestamps[frames], trajectory.T_wc), recording.groundtruth).ate_m
+
+
+if __name__ == "__main__":
+    main()
