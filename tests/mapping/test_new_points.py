@@ -291,3 +291,18 @@ def test_a_window_reaches_over_the_end_of_a_turn() -> None:
     assert torch.equal(shows, SCENE.shows(1)[second])
     both = set(SCENE.shows(0)[rows[0]].tolist()) & set(SCENE.shows(1)[rows[1]].tolist())
     assert len(first) == len(both) > 50
+
+
+def test_keypoints_that_see_a_point_are_left_alone_where_others_have_more_free_ones() -> None:
+    slam_map = half_known(sideways(3, step=0.3))
+    table = slam_map.keyframes["point_ids"]
+    known = torch.nonzero(table[0] >= 0)[:40, 0]
+    slam_map.forget(torch.zeros_like(known), known)  # the first keyframe has 40 free keypoints more
+    before = table.clone()
+    free = FreeKeypoints.of(slam_map, torch.tensor([0, 1]), CAMERA)
+    for row in range(2):
+        rows = free.rows[row, free.features.mask[0 + row]]
+        assert bool((before[row, rows] < 0).all())
+        assert len(rows) == int(((before[row] < 0) & slam_map.keyframes["mask"][row]).sum())
+    assert len(triangulated(slam_map, keyframe=2, neighbours=(0, 1))) > 80
+    assert torch.equal(table[before >= 0], before[before >= 0])

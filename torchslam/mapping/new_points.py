@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ class FreeKeypoints:
         free, rows = torch.sort(free, dim=1, descending=True, stable=True)
         free = free[:, : int(free.sum(1).max())]
         rows = rows[:, : free.shape[1]]
-        features = slam_map.features(keyframes, rows)
+        features = replace(slam_map.features(keyframes, rows), mask=free)
         return cls(features, rows, camera.normalize(features.keypoints))
 
 
