@@ -142,9 +142,9 @@ def aligned(image: Tensor, other: Tensor, pixels: Tensor) -> tuple[Tensor, Tenso
 
 
 def test_gradients_with_respect_to_both_images() -> None:
-    image = texture(30, 32, seed=7).double()
+    image = texture(20, 22, seed=7).double()
     other = warped(image, torch.eye(2).double(), torch.tensor([0.4, -0.3]).double(), torch.zeros(2).double())
-    pixels = torch.tensor([[[14.3, 15.1], [17.6, 13.2]]], dtype=torch.float64)
+    pixels = torch.tensor([[[9.3, 10.1], [11.6, 9.2]]], dtype=torch.float64)
     inputs = (image.requires_grad_(), other.detach().requires_grad_(), pixels)
     assert torch.autograd.gradcheck(aligned, inputs, eps=1e-7, atol=1e-5)
 
