@@ -1,4 +1,4 @@
-"""Following by patches: a camera moves before a textured wall that is slightly folded."""
+"""Following by patches: a camera moves before a textured wall."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Anchors:
     def add(self, world: World, view: View, tracked: Tracked) -> Anchor | None:
         """Make the last frame of a world an anchor; None where it sees too little."""
         slam_map, track = world.map, world.track
-        ids, keypoints = self._seen(world, view, tracked)
+        ids, keypoints = seen_by(world, view, tracked)
         alive = slam_map.points["alive"][ids]
         ids, keypoints = ids[alive], keypoints[alive]
         if len(ids) < LEAST or track.velocity is None:
@@ -72,17 +72,6 @@ class Anchors:
             velocity=track.velocity,
             overlap=min(1.0, tracked.inliers / max(track.reference_size, 1)),
         )
-
-    def _seen(self, world: World, view: View, tracked: Tracked) -> tuple[Tensor, Tensor]:
-        """(m,), (m,) points that a frame sees, and its keypoints: of a keyframe the new ones, too."""
-        slam_map = world.map
-        keyframe = slam_map.num_keyframes - 1
-        kept = slam_map.keyframes
-        if (int(kept["frame_index"][keyframe]), int(kept["session"][keyframe])) != (view.index, view.session):
-            return tracked.point_ids, tracked.keypoints
-        point_ids = kept["point_ids"][keyframe]
-        keypoints = torch.nonzero(point_ids >= 0)[:, 0]
-        return point_ids[keypoints], keypoints
 
     def renumber(self, renumbering: Renumbering) -> None:
         """Rows of the map went elsewhere; anchors whose reference keyframe is gone go as well."""
@@ -119,3 +108,15 @@ class Anchors:
         rows = torch.arange(len(ids), device=ids.device)
         depth = float(transform(world.T_cw, slam_map.positions_w[ids])[:, 2].median()) if len(ids) else 0.0
         return view, Tracked(world.T_cw, ids, rows, followed.expected, followed.covariance, depth)
+
+
+def seen_by(world: World, view: View, tracked: Tracked) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) points that a frame sees, and its keypoints: of a keyframe the new ones, too."""
+    slam_map = world.map
+    keyframe = slam_map.num_keyframes - 1
+    kept = slam_map.keyframes
+    if (int(kept["frame_index"][keyframe]), int(kept["session"][keyframe])) != (view.index, view.session):
+        return tracked.point_ids, tracked.keypoints
+    point_ids = kept["point_ids"][keyframe]
+    keypoints = torch.nonzero(point_ids >= 0)[:, 0]
+    return point_ids[keypoints], keypoints
