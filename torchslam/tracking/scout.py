@@ -18,12 +18,12 @@ from torchslam.front_end import reduced
 from torchslam.geometry import Camera, fits, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.motion import apart
 from torchslam.geometry.robust import Kernel
-from torchslam.solvers import RefinedPose, refine_pose
+from torchslam.solvers import RefinedPose
 from torchslam.tracking.spread import voices
+from torchslam.tracking.tracker import refine_one
 from torchslam.values import Anchor, Followed, Frame
 
 ATTEMPTS = 2  # a pose from some of the patches leads to the others
-NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
 LEAST = 20  # patches that a pose needs
 LEAST_ERROR = 0.05  # squared, in units of the variance of a keypoint: what the alignment of a patch adds
 
@@ -181,19 +181,7 @@ class Scout:
         if int(mask.sum()) < LEAST:
             mask = good
         for kernel in kernels:
-            refined = refine_pose(
-                T_ca[None],
-                anchor.points_a[None],
-                pixels[None],
-                self.camera,
-                weights=weights[None],
-                mask=mask[None],
-                kernel=kernel,
-                scale=2.0,
-                backward="detached",
-                iterations=10,
-                tolerance=NEGLIGIBLE,
-            )
+            refined = refine_one(T_ca, anchor.points_a, pixels, self.camera, weights, mask, kernel)
             T_ca = refined.T_cw[0]
             errors = squared_reprojection_errors(transform(T_ca, anchor.points_a), pixels, self.camera)
             mask = good & fits(errors, anchor.scales, self.chi_square) & refined.success

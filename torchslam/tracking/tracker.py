@@ -205,19 +205,7 @@ class Tracker:
         weights = scales**-2 * voices(pixels, self.camera.size)
         kernels: tuple[Kernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
-            refined = refine_pose(
-                T_cw[None],
-                points_w[None],
-                pixels[None],
-                self.camera,
-                weights=weights[None],
-                mask=mask[None],
-                kernel=kernel,
-                scale=2.0,
-                backward="detached",
-                iterations=10,
-                tolerance=NEGLIGIBLE,
-            )
+            refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
             T_cw = refined.T_cw[0]
             mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
             if int(mask.sum()) < 6:
@@ -282,6 +270,31 @@ class Tracker:
         """The points that a frame saw remember when that was."""
         if self.counts:
             slam_map.points["last_seen"][tracked.point_ids] = view.index
+
+
+def refine_one(
+    T_cw: Tensor,
+    points_w: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    weights: Tensor,
+    mask: Tensor,
+    kernel: Kernel,
+) -> RefinedPose:
+    """The pose of one frame (4, 4) by points (n, 3) at pixels (n, 2), as exactly as its noise is worth."""
+    return refine_pose(
+        T_cw[None],
+        points_w[None],
+        pixels[None],
+        camera,
+        weights=weights[None],
+        mask=mask[None],
+        kernel=kernel,
+        scale=2.0,
+        backward="detached",
+        iterations=10,
+        tolerance=NEGLIGIBLE,
+    )
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
