@@ -22,7 +22,7 @@ from tests.data.mp4 import write_mp4
 from tests.test_cli import write_tum_folder
 from torchslam import Features, Frame, load_config
 from torchslam import ahead as module
-from torchslam.ahead import WORTH, Ahead, why_alone
+from torchslam.ahead import WORTH, WORTH_AT_ONCE, Ahead, why_alone
 from torchslam.cli import main
 from torchslam.commands.run import frames_of
 from torchslam.data import open_sequence
@@ -56,9 +56,13 @@ def sequence(tmp_path: Path) -> Sequence:
     return open_sequence(folder, "100,100,79.5,59.5", mask=tmp_path / "mask.png")
 
 
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for the processes, so that a short sequence is theirs."""
+@pytest.fixture(params=["copied", "begun anew"])
+def patient(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the processes, however they start, so that a short sequence is theirs."""
+    is_copied = request.param == "copied"
+    if is_copied and sys.platform != "linux":
+        pytest.skip("processes are copied on Linux alone")
+    monkeypatch.setattr("torchslam.worker.starts_at_once", lambda: is_copied)
     enter = Ahead.__enter__
 
     def wait(self: Ahead) -> Ahead:
@@ -127,7 +131,10 @@ def test_no_more_than_a_few_frames_are_asked_for() -> None:
         assert sorted(frames._asked) == [12, 13, 14, 15]
 
 
-def test_a_process_that_has_not_started_is_not_waited_for(sequence: Sequence) -> None:
+def test_a_process_that_has_not_started_is_not_waited_for(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.worker.starts_at_once", lambda: False)
     with ahead(sequence) as frames:
         start = time.monotonic()
         assert not check_same(frames, sequence, 0)
@@ -190,8 +197,15 @@ def test_when_there_is_a_second_process(
     long, short = (open_sequence(f"synthetic:room?frames={count}&blank=1") for count in (WORTH, WORTH - 1))
     slam = SLAM(long.camera, CONFIG)
     for processors, expected in ((1, False), (2, True), (8, True)):
-        monkeypatch.setattr("torchslam.commands.run.processors", lambda count=processors: count)
-        assert isinstance(frames_of(long, slam, None, 0), Ahead) is expected
+        monkeypatch.setattr("torchslam.ahead.processors", lambda count=processors: count)
+        for at_once in (False, True):
+            monkeypatch.setattr("torchslam.ahead.starts_at_once", lambda is_copy=at_once: is_copy)
+            assert isinstance(frames_of(long, slam, None, 0), Ahead) is expected
+            assert isinstance(frames_of(short, slam, None, 0), Ahead) is (expected and at_once)
+            few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
+            assert isinstance(frames_of(short, slam, None, few), Ahead) is (expected and at_once)
+            assert not isinstance(frames_of(short, slam, None, few + 1), Ahead)
+    monkeypatch.setattr("torchslam.ahead.starts_at_once", lambda: False)
     several = frames_of(short, slam, 4, 0)
     assert isinstance(several, Ahead)
     assert several._count == 3
@@ -310,3 +324,13 @@ def test_a_signal_to_all_ends_the_run_with_results(
     assert "interrupted; the results up to here are written" in said
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["interrupted"]
     wait_for_end(child.pid)
+
+
+def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
+    code = (
+        "import threading; from torchslam.worker import starts_at_once; alone = starts_at_once(); "
+        "wait = threading.Event(); threading.Thread(target=wait.wait).start(); print(alone, starts_at_once()); wait.set()"
+    )
+    one_thread = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=one_thread, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(sys.platform == "linux"), "False"]

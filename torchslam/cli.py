@@ -52,6 +52,8 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
+    # Before NumPy is imported: its threads would stand idle, and keep a second process from being a copy of this one.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     options = build_parser(next(iter(arguments), "")).parse_args(arguments)
     import torch  # not before the arguments are known to be right

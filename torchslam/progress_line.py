@@ -12,8 +12,8 @@ INTERVAL = 5.0
 def stream() -> dict[str, Any]:
     """Arguments of tqdm for where it writes, and how often."""
     if sys.stderr.isatty():
-        return {"file": sys.stderr, "dynamic_ncols": True}
-    return {"file": Lines(sys.stderr), "mininterval": INTERVAL, "maxinterval": INTERVAL}
+        return {"file": sys.stderr, "dynamic_ncols": True, "miniters": 1}
+    return {"file": Lines(sys.stderr), "mininterval": INTERVAL, "maxinterval": INTERVAL, "miniters": 1}
 
 
 class Lines:

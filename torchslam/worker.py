@@ -1,28 +1,52 @@
-"""A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended."""
+"""A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended.
+
+It is a copy of this one where that is safe, and then there at once; elsewhere a new interpreter has to import everything.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import pickle
 import signal
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any
 
+import torch
+
 READY = b""  # what a process says when it is there
+THREADS = Path("/proc/self/task")  # one entry each, on Linux
+
+
+def starts_at_once() -> bool:
+    """Whether a process may be a copy of this one: a lock that another thread holds would stay locked in the copy.
+
+    That a process computes on a GPU does not survive being copied either. Elsewhere than on Linux the system's own
+    libraries may hold such locks.
+    """
+    return sys.platform == "linux" and len(list(THREADS.iterdir())) == 1 and not torch.cuda.is_initialized()
 
 
 class Worker:
     """A process that does `work` at the other end of a pipe, after it has said READY."""
 
     def __init__(self, work: Callable[[Connection], None]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._ours, theirs = context.Pipe()
+        self._ours, theirs = multiprocessing.Pipe()
         # What it needs comes through the pipe: `start` would wait for ever for a process that dies before it reads.
-        self._process = context.Process(target=work, args=(theirs,), name="torchslam ahead", daemon=True)
+        name = "torchslam ahead"
+        self._process: BaseProcess
+        if starts_at_once():
+            fork = multiprocessing.get_context("fork")
+            self._process = fork.Process(target=_copied, args=(work, theirs, self._ours), name=name, daemon=True)
+        else:
+            spawn = multiprocessing.get_context("spawn")
+            self._process = spawn.Process(target=work, args=(theirs,), name=name, daemon=True)
         self._is_there = self._has_ended = False
         with _without_interrupts():
             self._process.start()
@@ -69,6 +93,13 @@ class Worker:
                 f"a process that reads ahead has ended ({status}): going on without it", stacklevel=2
             )
         self._is_there, self._has_ended = False, True
+
+
+def _copied(work: Callable[[Connection], None], theirs: Connection, ours: Connection) -> None:
+    """A process that begins as a copy of the one that started it, whose ends of pipes and signals are not its own."""
+    ours.close()  # so that the other's end is noticed
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what `end` sends
+    work(theirs)
 
 
 @contextmanager

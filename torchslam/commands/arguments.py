@@ -112,7 +112,7 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
         type=_positive,
         metavar="N",
         help="with 2 or more, features are found ahead by others than the one that tracks: the same results, sooner "
-        "(default: 2 for long recordings where there are two processors, else 1)",
+        "(default: 2 where there are two processors and the recording is worth it, else 1)",
     )
 
 

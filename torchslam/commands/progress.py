@@ -14,6 +14,9 @@ from torchslam.commands.stopping import Stopping
 from torchslam.progress_line import stream
 from torchslam.values import StepResult
 
+# No thread that looks after bars which wait for their turn: a second process could not be a copy of this one.
+tqdm.monitor_interval = 0
+
 
 class ProgressBar:
     """Frame, rate, state and points on one line of stderr, in a log on one every few seconds; warnings are printed

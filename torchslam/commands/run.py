@@ -19,7 +19,7 @@ from typing import TypeVar
 
 import torch
 
-from torchslam.ahead import WORTH, Ahead, processors, why_alone
+from torchslam.ahead import Ahead, is_worth_it, why_alone
 from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
 from torchslam.commands.camera import find_camera, judged
@@ -215,8 +215,7 @@ def frames_of(
     """The frames of a sequence from `start` on, read ahead where they can be, and if so wanted or worth it."""
     alone = why_alone(sequence, slam.config, slam.camera.params.device)
     if processes is None:
-        is_worth_it = not alone and len(sequence) - start >= WORTH
-        processes = min(2, processors()) if is_worth_it else 1
+        processes = 2 if not alone and is_worth_it(len(sequence) - start) else 1
     elif processes > 1 and alone:
         print(f"torchslam: one process: {alone}", file=sys.stderr)
     if alone or processes == 1:

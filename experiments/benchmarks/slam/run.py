@@ -14,7 +14,7 @@ from pathlib import Path
 
 from experiments.benchmarks.problems import PEERS
 from experiments.common import DATA_DIR, table, write_between
-from torchslam.ahead import WORTH
+from torchslam.ahead import is_worth_it
 from torchslam.data import open_sequence
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.errors import TrajectoryError
@@ -86,7 +86,7 @@ def main() -> None:
 
 def systems(recording: Recording, with_peer: bool) -> list[str]:
     """Which ones run a recording: of a short one, ours has one process anyway."""
-    ours = [OURS, ALONE, FAST, FAST_ALONE] if recording.frames >= WORTH else [OURS, FAST]
+    ours = [OURS, ALONE, FAST, FAST_ALONE] if is_worth_it(recording.frames) else [OURS, FAST]
     return [*ours, PEER] if with_peer else ours
 
 
