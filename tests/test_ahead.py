@@ -21,15 +21,12 @@ import torch
 from tests.data.mp4 import write_mp4
 from tests.test_cli import write_tum_folder
 from torchslam import Features, Frame, load_config
-from torchslam import ahead as module
-from torchslam.ahead import WORTH, WORTH_AT_ONCE, Ahead, why_alone
+from torchslam.ahead import Ahead
 from torchslam.cli import main
-from torchslam.commands.run import frames_of
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
 from torchslam.front_end import image_extractor
-from torchslam.slam import SLAM
 from torchslam.stopwatch import Stopwatch
 
 SETTINGS = ["features.kind=opencv-orb", "features.num_keypoints=300"]
@@ -191,40 +188,6 @@ def test_same_bytes_with_one_process_or_two(
     assert multiprocessing.active_children() == []
 
 
-def test_when_there_is_a_second_process(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    long, short = (open_sequence(f"synthetic:room?frames={count}&blank=1") for count in (WORTH, WORTH - 1))
-    slam = SLAM(long.camera, CONFIG)
-    for processors, expected in ((1, False), (2, True), (8, True)):
-        monkeypatch.setattr("torchslam.ahead.processors", lambda count=processors: count)
-        for at_once in (False, True):
-            monkeypatch.setattr("torchslam.ahead.starts_at_once", lambda is_copy=at_once: is_copy)
-            assert isinstance(frames_of(long, slam, None, 0), Ahead) is expected
-            assert isinstance(frames_of(short, slam, None, 0), Ahead) is (expected and at_once)
-            few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
-            assert isinstance(frames_of(short, slam, None, few), Ahead) is (expected and at_once)
-            assert not isinstance(frames_of(short, slam, None, few + 1), Ahead)
-    monkeypatch.setattr("torchslam.ahead.starts_at_once", lambda: False)
-    several = frames_of(short, slam, 4, 0)
-    assert isinstance(several, Ahead)
-    assert several._count == 3
-    for nothing in (
-        frames_of(short, slam, None, 0),
-        frames_of(long, slam, None, 1),
-        frames_of(long, slam, 1, 0),
-    ):
-        assert not isinstance(nothing, Ahead)
-    assert capsys.readouterr().err == ""
-    simulated = SLAM(long.camera, load_config(None, ["features.kind=simulated"]))
-    assert not isinstance(frames_of(long, simulated, 2, 0), Ahead)
-    assert "one process: simulated features need no images" in capsys.readouterr().err
-    assert "on cuda" in why_alone(long, CONFIG, torch.device("cuda"))
-    long.timestamps = long.timestamps[:0]
-    assert "live" in why_alone(long, CONFIG, torch.device("cpu"))
-    assert module.processors() >= 1
-
-
 def test_videos_and_archives_travel(tmp_path: Path, sequence: Sequence) -> None:
     images = [cv2.cvtColor(picture(index), cv2.COLOR_GRAY2BGR) for index in range(5)]
     write_mp4(tmp_path / "film.mp4", images)
@@ -324,13 +287,3 @@ def test_a_signal_to_all_ends_the_run_with_results(
     assert "interrupted; the results up to here are written" in said
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["interrupted"]
     wait_for_end(child.pid)
-
-
-def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
-    code = (
-        "import threading; from torchslam.worker import starts_at_once; alone = starts_at_once(); "
-        "wait = threading.Event(); threading.Thread(target=wait.wait).start(); print(alone, starts_at_once()); wait.set()"
-    )
-    one_thread = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=one_thread, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == [str(sys.platform == "linux"), "False"]

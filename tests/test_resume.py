@@ -111,6 +111,25 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path
     assert torch.equal(resumed.online.T_wc, whole.online.T_wc)
 
 
+def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path) -> None:
+    config = load_config(None, [*SETTINGS, "bundle.delay=3"])
+    whole = SLAM(WALK.camera, config).run(WALK)
+    slam, so_far = SLAM(WALK.camera, config), Progressed()
+
+    def cut(result: StepResult) -> None:
+        if slam.is_settled and slam.mapper.adjusting.due == result.index + 2:
+            raise PowerCut
+
+    with pytest.raises(PowerCut):
+        run_sequence(slam, WALK, cut, so_far)
+    write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
+    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, config)
+    assert resumed.mapper.adjusting.due == slam.mapper.adjusting.due
+    run = run_sequence(resumed, WALK, None, loaded)
+    assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
+    assert torch.equal(run.online.T_wc, whole.online.T_wc)
+
+
 def test_same_state_same_bytes(checkpoint: Path, tmp_path: Path) -> None:
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
     write_checkpoint(tmp_path / "again", slam, so_far, WALK)

@@ -15,12 +15,12 @@ import torch
 from tests.tracking.test_scout import frame
 from torchslam import load_config
 from torchslam import scouting as module
-from torchslam.commands.run import frames_of
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
 from torchslam.evaluation import evaluate
 from torchslam.parcel import as_arrays, from_arrays
+from torchslam.processes import helped
 from torchslam.run import Run, run_sequence
 from torchslam.scouting import Scouting
 from torchslam.slam import SLAM
@@ -54,7 +54,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
 def run(sequence: Sequence, processes: int, after: object = None) -> tuple[Run, SLAM]:
     slam = SLAM(sequence.camera, CONFIG)
     with (
-        frames_of(sequence, slam, processes, 0) as frames,
+        helped(sequence, slam, processes) as frames,
         pytest.warns(UserWarning, match="skipped a frame"),
     ):
         return run_sequence(slam, sequence, after, frames=frames), slam  # type: ignore[arg-type]
@@ -126,14 +126,14 @@ def test_the_same_with_a_process_that_comes_later(
 @pytest.mark.usefixtures("patient")
 def test_a_process_that_is_killed_is_done_without(sequence: Sequence) -> None:
     slam = SLAM(sequence.camera, CONFIG)
-    with frames_of(sequence, slam, 2, 0) as frames:
+    with helped(sequence, slam, 2) as frames:
         assert isinstance(frames, Scouting)
 
         def kill(result: StepResult) -> None:
             if result.index == 20:
                 os.kill(frames._worker._process.pid or 0, signal.SIGKILL)
 
-        with pytest.warns(UserWarning, match="a process that reads ahead has ended"):
+        with pytest.warns(UserWarning, match="another process of this run has ended"):
             finished = run_sequence(slam, sequence, kill, frames=frames)
     assert [result.state for result in finished.results[21:]] == [State.TRACKING] * (FRAMES - 22)
 

@@ -6,7 +6,6 @@ while this one tracks and maps.
 
 from __future__ import annotations
 
-import os
 import pickle
 import traceback
 from multiprocessing.connection import Connection
@@ -22,35 +21,10 @@ from torchslam.geometry import Camera
 from torchslam.parcel import as_arrays, from_arrays
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Frame
-from torchslam.worker import READY, Worker, starts_at_once
+from torchslam.worker import READY, Worker
 
 AHEAD = 4
 """Frames that a process is asked for before their turn: about as many as it reads while a keyframe is mapped."""
-WORTH, WORTH_AT_ONCE = 100, 10
-"""Frames of a run for which a second process is worth its start: one that has to import everything costs as much as some
-40 frames; a copy of this process starts at once."""
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    known = getattr(os, "sched_getaffinity", None)  # not on every system
-    return os.cpu_count() or 1 if known is None else len(known(0))
-
-
-def is_worth_it(frames: int) -> bool:
-    """Whether a run of so many frames is sooner done with a second process."""
-    return processors() > 1 and frames >= (WORTH_AT_ONCE if starts_at_once() else WORTH)
-
-
-def why_alone(sequence: Sequence, config: Config, device: torch.device) -> str:
-    """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
-    if config.features.kind == "simulated":
-        return "simulated features need no images"
-    if not len(sequence.timestamps):
-        return "a live source is read as it comes"
-    if device.type != "cpu":
-        return f"features are found on {device}"
-    return ""
 
 
 class Ahead:

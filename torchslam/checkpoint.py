@@ -55,6 +55,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "world": world.number,
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
+        "adjusting": slam.mapper.adjusting.due,
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
@@ -132,6 +133,8 @@ def _go_on(
     slam.enter(session, world, (int(index), float(timestamp)))
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
+    if run["adjusting"] is not None:  # of the newest keyframe, around which the map is as it was then
+        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, int(run["adjusting"]))
 
 
 def _check_track(track: Track) -> None:

@@ -342,6 +342,12 @@ class BundleConfig(Settings, section="bundle"):
     window: int = setting(8, "keyframes whose poses are free", low=2, high=MOST)
     max_fixed: int = setting(12, "keyframes that hold them", low=1, high=MOST)
     iterations: int = setting(6, "of it", low=1, high=10_000)
+    delay: int = setting(
+        2,
+        "frames that are tracked before its outcome is taken over, so that it can be found beside them",
+        low=0,
+        high=MOST,
+    )
     final: bool = setting(True, "one bundle adjustment over the whole map when the run ends")
     final_iterations: int = setting(15, "of that one", low=1, high=10_000)
 

@@ -50,6 +50,7 @@ from torchslam.world.worlds import Worlds
 STARTED = "started the map"
 STARTED_ANEW = "later frames contradict the start: started the map anew"
 FOUND_AGAIN = "found again"
+STAYS = "some of the image does not move with the scene and is left out"
 
 
 class SLAM:
@@ -124,6 +125,7 @@ class SLAM:
         # the last frame that was found by its features, and what the next ones can be followed from
         self.news: tuple[int, Anchor | None] = (-1, None)
         self.waiting = Waiting(self.config.initialization.max_waiting)
+        self.mapper.adjusting.drop()
         # frames that are looked at while one is mapped may refer to as many anchors
         patches = self.config.patches
         self.anchors = Anchors(self.camera, patches.count, patches.delay + 2)
@@ -235,6 +237,7 @@ class SLAM:
             view, tracked = self.anchors.place(world, frame, self.session.number, followed)
             self.tracker.see(world.map, tracked)
             world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        world = self._take_over(world, frame.index)
         return self._result(view, "", world, tracked)
 
     # --- following a world -----------------------------------------------------------------------------------
@@ -257,36 +260,62 @@ class SLAM:
         if doubt or moves.is_doubt or self.probation:
             return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
         self.state, recalls = State.TRACKING, len(self.memory.recalls)
-        why = self._take(world, view, tracked)
+        why = self._take(
+            world, view, tracked, is_later=self.youth is None and self.mapper.may_wait(world.map)
+        )
         is_keyframe = bool(why)
-        if is_keyframe:
-            world = self._recall(world)
-            self._tidy(world)
-        stays = ""
-        if self.mapping and self.foreign.stays(world.T_cw, tracked.depth):
+        if is_keyframe and not self.mapper.adjusting:
+            world = self._look_back(world)
+        stays = self.mapping and self.foreign.stays(world.T_cw, tracked.depth)
+        if stays:
+            self.mapper.adjusting.hurry(view.index)
+            world = self._take_over(world, view.index)
             drop_covered(world, self.foreign.stillness.covers)
-            stays = "some of the image does not move with the scene and is left out"
-        why = "; ".join(filter(None, [why, stays, moves.words]))
         if self.youth is not None:
             self.youth.grow(view)
             if self._replace(self.youth):
                 return self._result(view, STARTED_ANEW, self.world, is_keyframe=True)
             if self.youth.age >= self.config.initialization.min_frames:
                 self.settle()
-        if self.config.patches.enabled and self.youth is None and len(self.memory.recalls) == recalls:
+        if self.config.patches.enabled and not (stays or self.youth or len(self.memory.recalls) > recalls):
             self.news = view.index, self.anchors.add(world, view, tracked)
+        world = self._take_over(world, view.index)
+        why = "; ".join(filter(None, [why, STAYS * stays, moves.words]))
         return self._result(view, why, world, tracked, is_keyframe=is_keyframe)
 
-    def _take(self, world: World, view: View, tracked: Tracked) -> str:
-        """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing."""
+    def _take(self, world: World, view: View, tracked: Tracked, is_later: bool = False) -> str:
+        """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing.
+
+        is_later: what is around a keyframe is adjusted while the next frames are tracked; there is no other until then
+        """
         why = why_keyframe(view, tracked, world, self.config.keyframes) if self.mapping else ""
+        if why and self.mapper.adjusting:
+            self.mapper.adjusting.hurry(view.index)
+            why = ""
         if why:
-            keyframe = self.mapper.insert(world.map, view, tracked)
+            keyframe = self.mapper.insert(world.map, view, tracked, is_later)
             self.memory.add(world.map, keyframe)
             self.tracker.follow(world, keyframe)
         self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
+
+    def _take_over(self, world: World, frame: int) -> World:
+        """If it is time, put the map to where the adjustment around the newest keyframe has it, and look back."""
+        if not self.mapper.adjusting.is_due(frame):
+            return world
+        self.mapper.take_over(world.map)
+        return self._look_back(world)
+
+    def _look_back(self, world: World) -> World:
+        """What the newest keyframe has to do with those before it; nobody holds rows of the map now but anchors."""
+        recalls = len(self.memory.recalls)
+        world = self._recall(world)
+        self._tidy(world)
+        if len(self.memory.recalls) > recalls:
+            self.anchors.clear()
+            self.news = self.news[0], None
+        return world
 
     def _recall(self, world: World) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
@@ -302,7 +331,7 @@ class SLAM:
         return self.world
 
     def _tidy(self, world: World) -> None:
-        """Let go of what the map can do without; nobody holds rows of it now."""
+        """Let go of what the map can do without."""
         keys = world.map.keys
         renumbering = self.mapper.tidy(world)
         if renumbering is not None:
@@ -327,6 +356,8 @@ class SLAM:
 
     def _lose(self, world: World, view: View) -> StepResult:
         """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
+        self.mapper.adjusting.hurry(view.index)
+        self._take_over(world, view.index)
         self.waiting.add(*self.probation.views(), view)
         reason = "lost"
         if self.youth is not None and self.youth.age < self.config.initialization.min_frames:
@@ -427,6 +458,9 @@ class SLAM:
         for held in self.probation.hand_over():
             assert self.world is not None  # nothing is held back without one
             self.world.history.add(*held)
+        if self.world is not None and self.last_frame is not None:
+            self.mapper.adjusting.hurry(self.last_frame[0])
+            self._take_over(self.world, self.last_frame[0])
 
     def _track_back(self, world: World, view: View, tracked: Tracked) -> None:
         """Pose the frames that were lost before a frame that was found again."""

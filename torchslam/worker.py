@@ -1,6 +1,6 @@
 """A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended.
 
-It is a copy of this one where that is safe, and then there at once; elsewhere a new interpreter has to import everything.
+It is a copy of this one where that is safe, and then there at once; elsewhere a new interpreter has to import all.
 """
 
 from __future__ import annotations
@@ -39,11 +39,13 @@ class Worker:
     def __init__(self, work: Callable[[Connection], None]) -> None:
         self._ours, theirs = multiprocessing.Pipe()
         # What it needs comes through the pipe: `start` would wait for ever for a process that dies before it reads.
-        name = "torchslam ahead"
+        name = "torchslam helper"
         self._process: BaseProcess
         if starts_at_once():
             fork = multiprocessing.get_context("fork")
-            self._process = fork.Process(target=_copied, args=(work, theirs, self._ours), name=name, daemon=True)
+            self._process = fork.Process(
+                target=_copied, args=(work, theirs, self._ours), name=name, daemon=True
+            )
         else:
             spawn = multiprocessing.get_context("spawn")
             self._process = spawn.Process(target=work, args=(theirs,), name=name, daemon=True)
@@ -90,7 +92,7 @@ class Worker:
             self._process.join()
             status = self._process.exitcode
             warnings.warn(
-                f"a process that reads ahead has ended ({status}): going on without it", stacklevel=2
+                f"another process of this run has ended ({status}): going on without it", stacklevel=2
             )
         self._is_there, self._has_ended = False, True
 

@@ -111,8 +111,8 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
         "--processes",
         type=_positive,
         metavar="N",
-        help="with 2 or more, features are found ahead by others than the one that tracks: the same results, sooner "
-        "(default: 2 where there are two processors and the recording is worth it, else 1)",
+        help="with 2 or more, others than the one that tracks find features ahead, and with 3 adjust the map beside "
+        "it: the same results, sooner (default: 3 where there are two processors and enough frames, else 1)",
     )
 
 

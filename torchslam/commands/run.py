@@ -12,14 +12,12 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 
-from torchslam.ahead import Ahead, is_worth_it, why_alone
 from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
 from torchslam.commands.camera import find_camera, judged
@@ -41,8 +39,8 @@ from torchslam.output.report import doubts, metrics, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.output.view import VIEW, write_view
 from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
-from torchslam.run import Frames, Progressed, Run, run_sequence
-from torchslam.scouting import Scouting
+from torchslam.processes import helped
+from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
 
@@ -186,7 +184,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                 watching.show(result)
                 progress.update(result)
 
-            with frames_of(watching.sequence, slam, processes, so_far.next) as frames:
+            with helped(watching.sequence, slam, processes, so_far.next) as frames:
                 finished = run_sequence(
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
@@ -207,22 +205,6 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
         print(f"torchslam: {finished.failure}", file=sys.stderr)
         return NO_MAP
     return DONE
-
-
-def frames_of(
-    sequence: Sequence, slam: SLAM, processes: int | None, start: int
-) -> AbstractContextManager[Frames]:
-    """The frames of a sequence from `start` on, read ahead where they can be, and if so wanted or worth it."""
-    alone = why_alone(sequence, slam.config, slam.camera.params.device)
-    if processes is None:
-        processes = 2 if not alone and is_worth_it(len(sequence) - start) else 1
-    elif processes > 1 and alone:
-        print(f"torchslam: one process: {alone}", file=sys.stderr)
-    if alone or processes == 1:
-        return nullcontext(sequence)
-    if slam.config.patches.enabled:
-        return Scouting(sequence, slam)
-    return Ahead(sequence, slam.camera, slam.config, slam.clock, processes - 1)
 
 
 def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:

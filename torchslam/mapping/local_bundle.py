@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
+from torchslam.solvers.schur import Marginals
 from torchslam.values import Observations
 from torchslam.world.map import Map
 from torchslam.world.observers import most
@@ -17,21 +20,54 @@ NEGLIGIBLE = 1e-4  # share of the cost that a step must promise: the next keyfra
 HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
 
 
+@dataclass(frozen=True)
+class Part:
+    """A part of the map that is adjusted at once.
+
+    keyframes: (k,) rows, ascending; point_ids: (p,) rows; seen: the observations of these by those
+    problem:   the same as a problem of its own
+    """
+
+    keyframes: Tensor
+    point_ids: Tensor
+    seen: Observations
+    problem: BundleProblem
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Where a part belongs: T_cw (k, 4, 4), points_w (p, 3), and how certain that is, where it was asked for."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    marginals: Marginals | None
+
+
 def adjust(
     slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig, covariances: bool = False
 ) -> None:
-    """Adjust a keyframe, the ones that see most of its points, and all points that these see.
+    """Adjust what is around a keyframe; if `covariances`, the map learns how certain all this is."""
+    part = around(slam_map, keyframe, camera, settings)
+    if part is not None:
+        take(slam_map, part, solve_around(part.problem, settings.iterations, covariances), camera)
+
+
+def around(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig) -> Part | None:
+    """A keyframe, the ones that see most of its points, and all points that these see; None where that is nothing.
 
     Other keyframes that see these points take part with fixed poses, and so does the first keyframe of the map.
-    If `covariances`, the map learns how certain all this is, what is fixed taken as exact.
     """
     near = slam_map.covisible(keyframe, settings.window - 1)
     free = torch.cat([near.new_tensor([keyframe]), near])
     free = free[free != 0]
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
-    fixed = most(shared, settings.max_fixed, least=1)
-    adjust_keyframes(slam_map, free, fixed, camera, settings.iterations, covariances, tolerance=NEGLIGIBLE)
+    return part_of(slam_map, free, most(shared, settings.max_fixed, least=1), camera)
+
+
+def solve_around(problem: BundleProblem, iterations: int, covariances: bool) -> Adjusted:
+    """Adjust what is around a keyframe, as exactly as the next one leaves it; what is fixed is taken as exact."""
+    return solve(problem, iterations, covariances, tolerance=NEGLIGIBLE)
 
 
 def adjust_all(
@@ -43,13 +79,7 @@ def adjust_all(
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
-        slam_map,
-        everyone[1:],
-        everyone[:1],
-        camera,
-        settings.final_iterations,
-        covariances=False,
-        progress=progress,
+        slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, progress=progress
     )
 
 
@@ -59,18 +89,24 @@ def adjust_keyframes(
     fixed: Tensor,
     camera: Camera,
     iterations: int,
-    covariances: bool,
+    covariances: bool = False,
     progress: Progress | None = None,
-    tolerance: float = 1e-8,
 ) -> None:
     """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
+    part = part_of(slam_map, free, fixed, camera)
+    if part is not None:
+        take(slam_map, part, solve(part.problem, iterations, covariances, progress), camera)
+
+
+def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part | None:
+    """The free keyframes (k,), what they see, and the fixed ones that see some of it; None where that is nothing."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
     seen = select(seen, torch.isin(seen.point_index, slam_map.points_seen_by(free)))
     _, which, counts = torch.unique(seen.point_index, return_inverse=True, return_counts=True)
     seen = select(seen, counts[which] >= 2)
     if len(seen) == 0:
-        return
+        return None
     point_ids, point_index = torch.unique(seen.point_index, return_inverse=True)
     problem = BundleProblem(
         slam_map.T_cw[keyframes],
@@ -82,6 +118,17 @@ def adjust_keyframes(
         weights=seen.scales**-2,
         fixed_frames=torch.isin(keyframes, fixed),
     )
+    return Part(keyframes, point_ids, seen, problem)
+
+
+def solve(
+    problem: BundleProblem,
+    iterations: int,
+    covariances: bool = False,
+    progress: Progress | None = None,
+    tolerance: float = 1e-8,
+) -> Adjusted:
+    """The least reprojection error of a part. A pure function: it may be called anywhere."""
     solution = bundle_adjust(
         problem,
         kernel="huber",
@@ -92,12 +139,20 @@ def adjust_keyframes(
         progress=progress,
         check=False,
     )
-    slam_map.keyframes["T_cw"][keyframes] = solution.T_cw
-    slam_map.points["positions_w"][point_ids] = solution.points_w
-    if covariances:
-        slam_map.take_covariances(keyframes, point_ids, solution.covariance())
-    drop_outliers(slam_map, seen, camera)
-    slam_map.refresh(keyframes)
+    return Adjusted(solution.T_cw, solution.points_w, solution.covariance() if covariances else None)
+
+
+def take(slam_map: Map, part: Part, adjusted: Adjusted, camera: Camera) -> None:
+    """Put a part of the map to where it belongs, and forget what disagrees with that.
+
+    The map must be as it was when the part was taken from it, but for what frames count in it.
+    """
+    slam_map.keyframes["T_cw"][part.keyframes] = adjusted.T_cw
+    slam_map.points["positions_w"][part.point_ids] = adjusted.points_w
+    if adjusted.marginals is not None:
+        slam_map.take_covariances(part.keyframes, part.point_ids, adjusted.marginals)
+    drop_outliers(slam_map, part.seen, camera)
+    slam_map.refresh(part.keyframes)
 
 
 def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:

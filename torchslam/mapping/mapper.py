@@ -7,9 +7,9 @@ import torch
 from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, se3_inverse, triangulation_covariance
+from torchslam.mapping.adjusting import Adjusting
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
-from torchslam.mapping.local_bundle import adjust
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Start, Tracked, View
@@ -27,6 +27,7 @@ class Mapper:
         self.camera = camera
         self.config = config
         self.clock = clock
+        self.adjusting = Adjusting(camera, config.bundle, config.measurement.gate == "mahalanobis")
 
     def start(self, slam_map: Map, start: Start) -> tuple[int, int]:
         """Make the first map of two views, at the configured scale; returns the two keyframes."""
@@ -46,8 +47,11 @@ class Mapper:
         slam_map.refresh(slam_map.ids(first, second))
         return first, second
 
-    def insert(self, slam_map: Map, view: View, tracked: Tracked) -> int:
-        """Make a tracked frame a keyframe; returns its index."""
+    def insert(self, slam_map: Map, view: View, tracked: Tracked, is_later: bool = False) -> int:
+        """Make a tracked frame a keyframe; returns its index.
+
+        is_later: what is around it is not adjusted at once: `adjusting` has to be taken over before the map changes
+        """
         settings = self.config.mapping
         with self.clock("mapping"):
             keyframe = slam_map.add_keyframe(view, tracked.T_cw)
@@ -64,9 +68,19 @@ class Mapper:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)
         if self.config.bundle.enabled:
             with self.clock("bundle"):
-                wanted = self.config.measurement.gate == "mahalanobis"
-                adjust(slam_map, keyframe, self.camera, self.config.bundle, covariances=wanted)
+                self.adjusting.ask(slam_map, keyframe, view.index + self.config.bundle.delay)
+            if not is_later:
+                self.take_over(slam_map)
         return keyframe
+
+    def may_wait(self, slam_map: Map) -> bool:
+        """Whether the adjustment around a keyframe may be found later: not while each of them moves the whole map."""
+        return self.config.bundle.delay > 0 and slam_map.num_keyframes >= self.config.bundle.window
+
+    def take_over(self, slam_map: Map) -> None:
+        """Put the map to where the adjustment that was asked for has it."""
+        with self.clock("bundle"):
+            self.adjusting.take_over(slam_map)
 
     def tidy(self, world: World) -> Renumbering | None:
         """Take out what the world can do without: redundant keyframes, rows of dead points; returns where rows went.

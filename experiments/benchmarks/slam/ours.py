@@ -13,10 +13,10 @@ from pathlib import Path
 
 import torch
 
-from torchslam.commands.run import frames_of
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.trajectory_file import write_trajectory
+from torchslam.processes import helped
 from torchslam.run import run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult
@@ -39,7 +39,7 @@ def main() -> None:
         ends.append(time.perf_counter())
 
     start_up, begin = cpu_seconds(), time.perf_counter()
-    with frames_of(sequence, slam, arguments.processes, 0) as frames:
+    with helped(sequence, slam, arguments.processes) as frames:
         finished = run_sequence(slam, sequence, after_frame, frames=frames)
     write_trajectory(arguments.trajectory, finished.trajectory)
     totals = torch.tensor([result.stage_ms["total"] for result in finished.results])

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from experiments.benchmarks.problems import PEERS
 from experiments.common import DATA_DIR, table, write_between
-from torchslam.ahead import is_worth_it
 from torchslam.data import open_sequence
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.errors import TrajectoryError
@@ -74,7 +73,7 @@ def main() -> None:
             continue
         runs: dict[str, list[Figures]] = {}
         for _ in range(arguments.rounds):
-            for system in systems(recording, peer is not None):
+            for system in systems(peer is not None):
                 runs.setdefault(system, []).append(measured(system, recording, peer))
                 print(recording.name, system, runs[system][-1], flush=True)
         rows += [row(recording, system, figures) for system, figures in runs.items()]
@@ -84,9 +83,9 @@ def main() -> None:
         write_between(Path(__file__).parent / "README.md", text)
 
 
-def systems(recording: Recording, with_peer: bool) -> list[str]:
-    """Which ones run a recording: of a short one, ours has one process anyway."""
-    ours = [OURS, ALONE, FAST, FAST_ALONE] if is_worth_it(recording.frames) else [OURS, FAST]
+def systems(with_peer: bool) -> list[str]:
+    """Which ones run a recording."""
+    ours = [OURS, ALONE, FAST, FAST_ALONE]
     return [*ours, PEER] if with_peer else ours
 
 

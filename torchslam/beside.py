@@ -1,0 +1,109 @@
+"""The adjustment around a keyframe in a process of its own, while this one tracks the next frames: the same bytes.
+
+What is adjusted and when its outcome counts is `mapping.adjusting`'s to say; here it is only computed elsewhere.
+"""
+
+from __future__ import annotations
+
+import pickle
+import traceback
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchslam.geometry import Camera
+from torchslam.mapping.adjusting import Answer
+from torchslam.mapping.local_bundle import Adjusted, solve_around
+from torchslam.solvers import BundleProblem
+from torchslam.solvers.schur import Marginals
+from torchslam.worker import READY, Worker
+
+SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
+"""What tells one problem around a keyframe from another of the same run."""
+
+
+class Beside:
+    """Solves with another process, see `mapping.adjusting.Solver`; here until it has started, or where it was ended.
+
+    There is a process while this is entered.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._has_task = False
+        self._number = 0  # of the last problem that was sent
+
+    def __enter__(self) -> Beside:
+        self._worker = Worker(_work)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._worker.end()
+
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+        number = self._send(problem, iterations, covariances)
+
+        def answer() -> Adjusted:
+            found = None if number is None else self._receive(number)
+            return solve_around(problem, iterations, covariances) if found is None else found
+
+        return answer
+
+    def _send(self, problem: BundleProblem, iterations: int, covariances: bool) -> int | None:
+        """The number under which an answer will come; None where there is nobody to answer."""
+        if not self._worker.is_there():
+            return None
+        if not self._has_task:
+            # Not by multiprocessing's own pickling, which would move tensors to shared memory.
+            self._has_task = self._worker.send(pickle.dumps((self._camera, torch.get_num_threads())))
+        self._number += 1
+        arrays = {name: getattr(problem, name).numpy() for name in SENT}
+        message = pickle.dumps((self._number, arrays, iterations, covariances))
+        return self._number if self._worker.send(message) else None
+
+    def _receive(self, number: int) -> Adjusted | None:
+        """The answer of a number; those before it were not wanted in the end. None where there is nobody to answer."""
+        while (answer := self._worker.receive()) is not None:
+            answered, outcome = answer
+            if answered == number:
+                return _adjusted(outcome)
+        return None
+
+
+def _adjusted(outcome: list[np.ndarray] | BaseException) -> Adjusted:
+    """What `_arrays` packed. Raises what was raised on the other side."""
+    if isinstance(outcome, BaseException):
+        raise outcome
+    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in outcome)
+    return Adjusted(T_cw, points_w, Marginals(*covariances) if covariances else None)
+
+
+def _arrays(adjusted: Adjusted) -> list[np.ndarray]:
+    """For the way between processes: tensors are slow to pickle."""
+    return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
+
+
+def _work(connection: Connection) -> None:
+    """A process: say that there is somebody, take the task, then solve until the one that asks has gone."""
+    try:
+        connection.send_bytes(READY)
+        camera, threads = pickle.loads(connection.recv_bytes())
+        torch.set_num_threads(threads)
+        while True:
+            number, arrays, iterations, covariances = pickle.loads(connection.recv_bytes())
+            try:
+                with torch.inference_mode():
+                    columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
+                    problem = BundleProblem(camera=camera, **columns)
+                    outcome: object = _arrays(solve_around(problem, iterations, covariances))
+            except Exception as error:  # raised where the outcome is wanted
+                error.add_note(f"in the process that adjusts:\n{traceback.format_exc()}")
+                outcome = error
+            connection.send_bytes(pickle.dumps((number, outcome)))
+    except (EOFError, OSError):
+        return

@@ -1,0 +1,85 @@
+"""The adjustment around the newest keyframe, while frames go on being tracked: asked for now, taken over later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from torchslam.config import BundleConfig
+from torchslam.geometry import Camera
+from torchslam.mapping.local_bundle import Adjusted, Part, around, solve_around, take
+from torchslam.solvers import BundleProblem
+from torchslam.world.map import Map
+
+Answer = Callable[[], Adjusted]
+"""Waits until an adjustment is found."""
+
+
+class Solver(Protocol):
+    """Finds adjustments: (problem, iterations, covariances) -> what gives the outcome when that is wanted."""
+
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> Answer: ...
+
+
+def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+    """A solver that begins when the outcome is wanted."""
+    return lambda: solve_around(problem, iterations, covariances)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """An adjustment to be taken over at frame `due`; of nothing where there is nothing to adjust."""
+
+    due: int
+    part: Part | None
+    answer: Answer | None
+
+
+class Adjusting:
+    """One adjustment at a time; the map must stay as it is, but for what frames count in it, until it is taken over.
+
+    solver: may find it elsewhere; the outcome is the same
+    """
+
+    solver: Solver = staticmethod(solve_here)
+
+    def __init__(self, camera: Camera, settings: BundleConfig, covariances: bool) -> None:
+        self.camera, self.settings, self.covariances = camera, settings, covariances
+        self._asked: Asked | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is one to be taken over."""
+        return self._asked is not None
+
+    @property
+    def due(self) -> int | None:
+        """The last frame that is tracked before the outcome is taken over; None where nothing was asked for."""
+        return None if self._asked is None else self._asked.due
+
+    def is_due(self, frame: int) -> bool:
+        """Whether the outcome is to be taken over after a frame."""
+        return self._asked is not None and frame >= self._asked.due
+
+    def hurry(self, frame: int) -> None:
+        """Take the outcome over after this frame already: the map is to change."""
+        if self._asked is not None:
+            self._asked = replace(self._asked, due=frame)
+
+    def ask(self, slam_map: Map, keyframe: int, due: int) -> None:
+        """Have what is around a keyframe adjusted, to be taken over after frame `due`."""
+        assert self._asked is None  # the map was to stay as it is
+        part = around(slam_map, keyframe, self.camera, self.settings)
+        find = self.solver
+        answer = None if part is None else find(part.problem, self.settings.iterations, self.covariances)
+        self._asked = Asked(due, part, answer)
+
+    def take_over(self, slam_map: Map) -> None:
+        """Put the map to where it belongs, if that was asked for."""
+        asked, self._asked = self._asked, None
+        if asked is not None and asked.part is not None and asked.answer is not None:
+            take(slam_map, asked.part, asked.answer(), self.camera)
+
+    def drop(self) -> None:
+        """The map is gone: nothing is to be taken over."""
+        self._asked = None
