@@ -58,8 +58,12 @@ def reduced(image: Tensor, wanted: Tensor | None, factor: float) -> tuple[Tensor
 
 def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> Features:
     """Features in pixels of an image that is wider and higher by a ratio."""
-    keypoints = (features.keypoints + 0.5) * features.keypoints.new_tensor(ratio) - 0.5
-    return replace(features, keypoints=keypoints, scales=factor * features.scales)
+    size = features.keypoints.new_tensor(ratio)
+    keypoints, information = (features.keypoints + 0.5) * size - 0.5, features.information
+    if information is not None:
+        is_matrix = information.ndim == 4
+        information = information / (size[:, None] * size if is_matrix else size.prod())
+    return replace(features, keypoints=keypoints, scales=factor * features.scales, information=information)
 
 
 def check_size(frame: Frame, camera: Camera) -> None:

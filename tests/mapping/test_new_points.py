@@ -20,7 +20,7 @@ from torchslam.mapping.new_points import (
     match_along_epipolar_lines,
     triangulate_against,
 )
-from torchslam.values import Features, View
+from torchslam.values import View
 from torchslam.world.map import Map
 
 SCENE = Scene.of(300)
@@ -172,7 +172,7 @@ ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
 
 def free(view: View, rows: Tensor) -> FreeKeypoints:
     """Some keypoints (n,) of a view."""
-    features = Features(*(x[:, rows] for x in vars(view.features).values()))
+    features = view.features.rows(rows)
     return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints))
 
 

@@ -8,7 +8,6 @@ Keypoints, scores and descriptors carry gradients to the weights.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import torch
@@ -136,7 +135,7 @@ class ALIKED(nn.Module):
             )
             for one in found
         ]
-        features = Features(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(Features)))
+        features = Features.cat(rows)
         return features if wanted is None else only_where(features, wanted)
 
 

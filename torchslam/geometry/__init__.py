@@ -13,10 +13,13 @@ from torchslam.geometry.essential import (
 )
 from torchslam.geometry.gating import (
     CHI_SQUARE_95,
+    Noise,
     fits,
     innovation_covariances,
     mahalanobis_squared,
+    packed_information,
     squared_reprojection_errors,
+    unpacked_information,
 )
 from torchslam.geometry.homography import (
     decompose_homography,
@@ -66,6 +69,7 @@ __all__ = [
     "AbsolutePose",
     "Camera",
     "MultiViewTriangulation",
+    "Noise",
     "RelativePose",
     "Similarity",
     "Triangulation",
@@ -84,6 +88,7 @@ __all__ = [
     "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
+    "packed_information",
     "quaternion_from_matrix",
     "rigid",
     "rotation_from_matches",
@@ -111,5 +116,6 @@ __all__ = [
     "triangulate_many",
     "triangulation_covariance",
     "umeyama",
+    "unpacked_information",
     "vee",
 ]

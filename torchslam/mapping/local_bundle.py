@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import BundleConfig
-from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.values import Observations
@@ -79,7 +79,7 @@ def adjust_keyframes(
         point_index,
         seen.pixels,
         camera,
-        weights=seen.scales**-2,
+        weights=seen.noise.weights,
         fixed_frames=torch.isin(keyframes, fixed),
     )
     solution = bundle_adjust(
@@ -103,7 +103,7 @@ def adjust_keyframes(
 def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    wrong = ~fits(squared_reprojection_errors(points_c[:, 0], seen.pixels, camera), seen.scales)
+    wrong = ~fits(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
     slam_map.drop(seen, wrong)
 
 

@@ -35,8 +35,9 @@ class Mapper:
         T_cw[:3, 3] *= factor
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         points_w, camera = start.points_w * factor, self.camera
-        scales_1, scales_2 = start.reference.scales[start.keypoints_1], start.view.scales[start.keypoints_2]
-        covariances_w = triangulation_covariance(T_1w, T_cw, points_w, scales_1, scales_2, camera, camera)
+        spread_1 = start.reference.noise[start.keypoints_1].spread
+        spread_2 = start.view.noise[start.keypoints_2].spread
+        covariances_w = triangulation_covariance(T_1w, T_cw, points_w, spread_1, spread_2, camera, camera)
         first = slam_map.add_keyframe(start.reference, T_1w)
         second = slam_map.add_keyframe(start.view, T_cw)
         descriptors = start.view.descriptors[start.keypoints_2]

@@ -13,6 +13,7 @@ from torchslam.config import Config, MatchingConfig
 from torchslam.features import expand_runs, match_pairs
 from torchslam.geometry import (
     Camera,
+    Noise,
     fits,
     se3_inverse,
     transform,
@@ -29,12 +30,14 @@ from torchslam.world.observers import first_of_each
 class FreeKeypoints:
     """The keypoints of k keyframes that see no point yet; where one has fewer than others, rows are masked out.
 
-    features: (k, n, ...); rows: (k, n) of the keyframes' keypoints; normalized: (k, n, 2) undistorted
+    features: (k, n, ...); rows: (k, n) of the keyframes' keypoints; normalized: (k, n, 2) undistorted;
+    noise: (k, n)
     """
 
     features: Features
     rows: Tensor
     normalized: Tensor
+    noise: Noise
 
     @classmethod
     def of(cls, slam_map: Map, keyframes: Tensor, camera: Camera) -> FreeKeypoints:
@@ -45,7 +48,8 @@ class FreeKeypoints:
         free = free[:, : int(free.sum(1).max())]
         rows = rows[:, : free.shape[1]]
         features = replace(slam_map.features(keyframes, rows), mask=free)
-        return cls(features, rows, camera.normalize(features.keypoints))
+        noise = slam_map.noise(keyframes[:, None], rows)
+        return cls(features, rows, camera.normalize(features.keypoints), noise)
 
 
 def triangulate_against(
@@ -71,7 +75,11 @@ def triangulate_against(
     normalized = here.normalized[seen_1], there.normalized[seen_2]
     scale_1, scale_2 = here.features.scales[seen_1], there.features.scales[seen_2]
     seen = triangulate(T_1w, T_2w, *pixels, camera, camera, normalized=normalized)
-    good = seen.mask & fits(seen.errors_1**2, scale_1, limit) & fits(seen.errors_2**2, scale_2, limit)
+    noise_1, noise_2 = here.noise[seen_1], there.noise[seen_2]
+    good = seen.mask
+    for T_cw, noise, seen_at in ((T_1w, noise_1, pixels[0]), (T_2w, noise_2, pixels[1])):
+        points_c = transform(T_cw, seen.points_w)
+        good &= fits(noise.squared_reprojection(points_c, seen_at, camera), limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
     sizes = tuple(size[which] for size in slam_map.scale_ranges(neighbours))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
@@ -79,7 +87,7 @@ def triangulate_against(
     keep = keep[first_of_each(at_1[keep])]
     points_w = seen.points_w[keep]
     covariances_w = triangulation_covariance(
-        T_1w, T_2w[keep], points_w, scale_1[keep], scale_2[keep], camera, camera
+        T_1w, T_2w[keep], points_w, noise_1[keep].spread, noise_2[keep].spread, camera, camera
     )
     which, at_1, at_2 = which[keep], at_1[keep], at_2[keep]
     descriptors = here.features.descriptors[0, at_1]

@@ -11,15 +11,16 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
+    Noise,
     estimate_absolute_pose,
     fits,
     innovation_covariances,
     mahalanobis_squared,
     se3_inverse,
-    squared_reprojection_errors,
     transform,
 )
 from torchslam.geometry.robust import Kernel
+from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
@@ -153,7 +154,7 @@ class Tracker:
         ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
         if len(ids) < settings.min_inliers:
             return None
-        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
+        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.noise[at])
         if int(inliers.sum()) < settings.min_inliers:
             return None
         T_cw, seen = refined.T_cw[0], ids[inliers]
@@ -189,7 +190,7 @@ class Tracker:
         return torch.cat([near.new_tensor([keyframe]), near])
 
     def _refine(
-        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
+        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise
     ) -> tuple[RefinedPose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
@@ -197,23 +198,23 @@ class Tracker:
         on all that agrees with that.
         """
         points_w = slam_map.positions_w[ids]
-        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
-        mask = fits(errors, scales, FAR * self.measurement.chi_square)
+        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
+        mask = fits(errors, FAR * self.measurement.chi_square)
         old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = scales**-2 * voices(pixels, self.camera.size)
+        weights = times(noise.weights, voices(pixels, self.camera.size))
         kernels: tuple[Kernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
             refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
             T_cw = refined.T_cw[0]
-            mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
+            mask = self.agrees(slam_map, T_cw, ids, pixels, noise)
             if int(mask.sum()) < 6:
                 break
-        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
-        return refined, errors / scales**2, mask
+        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
+        return refined, errors, mask
 
-    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
+    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
 
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
@@ -221,9 +222,9 @@ class Tracker:
         chi_square, points = self.measurement.chi_square, slam_map.points
         points_c = transform(T_cw, points["positions_w"][ids])
         if self.measurement.gate == "chi_square":
-            return fits(squared_reprojection_errors(points_c, pixels, self.camera), scales, chi_square)
+            return fits(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
-        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], scales)
+        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.spread)
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
     def accept(self, world: World, view: View, tracked: Tracked) -> None:

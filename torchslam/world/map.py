@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry import se3_inverse
+from torchslam.geometry import Noise, se3_inverse
 from torchslam.solvers import Marginals
 from torchslam.values import Features, Observations, View
 from torchslam.world.observers import Observers, first_of_each, most
@@ -94,6 +94,11 @@ class Map:
         keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
 
+    def noise(self, keyframes: Tensor, keypoints: Tensor) -> Noise:
+        """Of keypoints (n,) of a keyframe each, (n,)."""
+        table = self.keyframes
+        return Noise(table["scales"][keyframes, keypoints], table["information"][keyframes, keypoints])
+
     def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """(k, 1), (k, 1) the finest and the coarsest scale among the keypoints of keyframes (k,)."""
         scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
@@ -118,6 +123,7 @@ class Map:
             angles=view.angles[None],
             descriptors=view.descriptors[None],
             mask=view.mask[None],
+            information=view.information[None],
             point_ids=torch.full((1, len(view.mask)), NO_POINT, device=T_cw.device),
         )
         return int(ids[0])
@@ -203,6 +209,7 @@ class Map:
             table[row, keypoint],
             self.keyframes["keypoints"][keyframe, keypoint],
             self.keyframes["scales"][keyframe, keypoint],
+            self.keyframes["information"][keyframe, keypoint],
         )
 
     def observers(self, point_ids: Tensor, keyframes: Tensor | None = None) -> Tensor:
@@ -220,7 +227,7 @@ class Map:
     def view(self, keyframe: int) -> View:
         """What a keyframe saw."""
         row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
-        names = ("keypoints", "scales", "angles", "descriptors", "mask")
+        names = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
         return View(
             index=int(row["frame_index"]),
             timestamp=float(row["timestamp"]),
