@@ -14,6 +14,7 @@ from torchslam.geometry import (
     mahalanobis_squared,
     unpacked_information,
 )
+from torchslam.geometry.gating import MARGIN
 from torchslam.geometry.whitening import whitening
 
 
@@ -57,10 +58,12 @@ def test_noise_is_the_same_however_it_is_said(kind: str, generator: torch.Genera
     weights, spread = (sigmas**-2, sigmas) if kind != "matrix" else (sigmas**-2, sigmas**2)
     if kind == "matrix":
         weights, spread = weights[:, None, None] * eye, spread[:, None, None] * eye
-    wanted = errors.square().sum(-1) / sigmas**2
+    margin = 1.0 if kind == "scale" else MARGIN
+    wanted = errors.square().sum(-1) / (margin * sigmas) ** 2
     torch.testing.assert_close(noise.weights, weights)
     torch.testing.assert_close(noise.spread, spread)
     torch.testing.assert_close(noise.sigmas, sigmas)
+    torch.testing.assert_close(noise.tolerance, margin * sigmas)
     torch.testing.assert_close(noise.squared(errors), wanted)
     wanted[3] = torch.inf  # behind the camera
     torch.testing.assert_close(noise.squared_reprojection(points_c, pixels, camera), wanted)
@@ -82,11 +85,13 @@ def test_the_gate_keeps_95_percent_of_noise_that_has_a_direction(generator: torc
     ]
     information = axes @ torch.diag(lengths**-2) @ axes.mT
     noise = Noise.of(torch.ones(count, dtype=torch.float64), information)
-    assert abs(float(fits(noise.squared(errors)).double().mean()) - 0.95) < 0.01
+    assert abs(float(fits(noise.squared(MARGIN * errors)).double().mean()) - 0.95) < 0.01
     torch.testing.assert_close(noise.sigmas, torch.full_like(turn, math.sqrt(3.0 * 0.3)))
     torch.testing.assert_close(noise.spread, axes @ torch.diag(lengths**2) @ axes.mT)
-    S = innovation_covariances(torch.zeros(count, 2, 3).double(), torch.zeros(count, 3, 3).double(), noise.spread)
-    torch.testing.assert_close(mahalanobis_squared(errors, S), noise.squared(errors))
+    S = innovation_covariances(
+        torch.zeros(count, 2, 3).double(), torch.zeros(count, 3, 3).double(), noise.spread
+    )
+    torch.testing.assert_close(mahalanobis_squared(errors, S), noise.squared(MARGIN * errors))
 
 
 def test_a_root_of_an_information_whitens_and_has_gradients(generator: torch.Generator) -> None:

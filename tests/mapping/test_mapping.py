@@ -13,7 +13,7 @@ from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.front_end import simulated_extractor
-from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
@@ -194,7 +194,10 @@ def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
 def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
     one, two = (
         FreeKeypoints(
-            view.features, torch.arange(len(view.mask))[None], slam.camera.normalize(view.keypoints)[None]
+            view.features,
+            torch.arange(len(view.mask))[None],
+            slam.camera.normalize(view.keypoints)[None],
+            Noise(view.scales[None], view.information[None]),
         )
         for view in (view_of(slam, i) for i in (4, 9))
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
-from torchslam.geometry import se3_inverse, so3_exp, transform, triangulation_covariance
+from torchslam.geometry import Noise, se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.mapping.new_points import (
     FreeKeypoints,
     around,
@@ -173,7 +173,8 @@ ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
 def free(view: View, rows: Tensor) -> FreeKeypoints:
     """Some keypoints (n,) of a view."""
     features = view.features.rows(rows)
-    return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints))
+    noise = Noise(view.scales[rows][None], view.information[rows][None])
+    return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints), noise)
 
 
 def matched(

@@ -20,6 +20,11 @@ CHI_SQUARE_95 = 5.991
 """95 % of a chi-square distribution of two degrees of freedom."""
 
 
+MARGIN = 2.0
+"""Times the standard deviation that a front end states: what a test takes for granted that compares a keypoint with
+the map, which has errors of its own. A scale, where nothing is stated, has that margin: ORB is right to half of it."""
+
+
 @dataclass(frozen=True)
 class Noise:
     """What is known of the errors of keypoints (...).
@@ -72,14 +77,19 @@ class Noise:
             torch.where(first[..., None], self.information, other.information),
         )
 
+    @property
+    def tolerance(self) -> Tensor:
+        """(...) px, the standard deviation that tests take for granted: `sigmas`, with MARGIN where they are stated."""
+        return self.sigmas if self.information.shape[-1] == 0 else MARGIN * self.sigmas
+
     def squared(self, errors: Tensor) -> Tensor:
-        """(...) squared errors (..., 2), px, in units of the noise."""
+        """(...) squared errors (..., 2), px, in units of the noise, with MARGIN where it is stated: for `fits`."""
         if self.information.shape[-1] < 3:
             return self._squared(errors.square().sum(-1))
-        return (errors[..., None, :] @ self.weights @ errors[..., None]).flatten(-3).squeeze(-1)
+        return (errors[..., None, :] @ self.weights @ errors[..., None])[..., 0, 0] / MARGIN**2
 
     def squared_reprojection(self, points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-        """(...) squared errors in units of the noise between projections of points_c (..., 3) and pixels (..., 2).
+        """(...) what `squared` says of the errors between projections of points_c (..., 3) and pixels (..., 2).
 
         Infinite behind the camera.
         """
@@ -89,7 +99,7 @@ class Noise:
         return self.squared(projected - pixels).where(valid, torch.inf)
 
     def _squared(self, squared_px: Tensor) -> Tensor:
-        return squared_px / self.scales**2 if self.information.shape[-1] == 0 else squared_px * self.weights
+        return squared_px / self.tolerance**2
 
 
 def packed_information(information: Tensor | None, like: Tensor) -> Tensor:
@@ -113,7 +123,7 @@ def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera
 
 
 def fits(squared: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
-    """(...) bool: squared errors (...), in units of the noise, that keypoints may well have."""
+    """(...) bool: squared errors (...), as `Noise` says them, that keypoints may well have."""
     return squared < chi_square
 
 

@@ -154,8 +154,8 @@ def _first_guess(
         view_2.keypoints[rows_2][None],
         camera,
         camera,
-        view_1.noise[rows_1].sigmas[None],
-        view_2.noise[rows_2].sigmas[None],
+        view_1.noise[rows_1].tolerance[None],
+        view_2.noise[rows_2].tolerance[None],
         seed=config.seed,
     )
     if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:

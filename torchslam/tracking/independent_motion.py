@@ -194,7 +194,7 @@ class IndependentMotion:
         pixels, valid = self.camera.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
         distances = distances_to_segments(view.keypoints[second], pixels[:-1], pixels[1:])
         errors = distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
-        return errors / torch.maximum(seen.noise.sigmas[first], view.noise.sigmas[second])
+        return errors / torch.maximum(seen.noise.tolerance[first], view.noise.tolerance[second])
 
     def _together(self, earlier: View, view: View, first: Tensor, second: Tensor, among: Tensor) -> Tensor:
         """(m,) rows of the matches (n,), (n,) that one rigid motion explains, if it explains enough of those among

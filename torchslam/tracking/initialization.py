@@ -153,7 +153,7 @@ class Initializer:
         seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)
-        good = is_good(seen, errors.amax(0), noise.sigmas, self.camera, settings)
+        good = is_good(seen, errors.amax(0), noise.tolerance, self.camera, settings)
         reason = why_not(good, seen, len(first), settings, least_share)
         if reason:
             return None, reason
