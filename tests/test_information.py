@@ -14,10 +14,11 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, ClipSLAM, Features, Run, evaluate, load_config, solve
 from torchslam.checkpoint import read_checkpoint, write_checkpoint
+from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
-from torchslam.front_end import Extractor, simulated_extractor
+from torchslam.front_end import Simulated, WithFeatures
 from torchslam.run import Progressed, run_sequence
 from torchslam.values import Frame
 
@@ -43,20 +44,20 @@ def by_matrix(features: Features) -> Tensor:
     return features.scales[..., None, None] ** -2 * torch.eye(2, dtype=torch.float64)
 
 
-def eyes(say: Say) -> Extractor:
+def told_by(say: Say) -> Sequence:
     """Simulated features that say something of their errors."""
-    seen = simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK))
+    seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
 
     def extract(frame: Frame) -> Features:
         features = seen(frame)
         return replace(features, information=say(features))
 
-    return extract
+    return WithFeatures(WALK, extract)
 
 
 def run_with(say: Say) -> tuple[SLAM, Run]:
-    slam = SLAM(WALK.camera, CONFIG, eyes(say))
-    return slam, slam.run(WALK)
+    slam = SLAM(WALK.camera, CONFIG)
+    return slam, slam.run(told_by(say))
 
 
 @pytest.fixture(scope="module", params=[by_number, by_matrix], ids=["number", "matrix"])
@@ -86,25 +87,28 @@ def test_a_number_is_the_matrix_that_it_stands_for(told: tuple[SLAM, Run, Say]) 
 def test_a_map_keeps_what_is_said(told: tuple[SLAM, Run, Say], tmp_path: Path) -> None:
     slam, _, say = told
     slam.save(tmp_path / "map")
-    loaded = SLAM.load(tmp_path / "map", CONFIG, eyes(say), mapping=False)
+    loaded = SLAM.load(tmp_path / "map", CONFIG, mapping=False)
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == (tmp_path / "map").read_bytes()
-    assert len(loaded.run(WALK).trajectory) > 10
-    mute = SLAM.load(tmp_path / "map", CONFIG, eyes(lambda features: None))
+    assert len(loaded.run(told_by(say)).trajectory) > 10
+    mute = SLAM.load(tmp_path / "map", CONFIG)
     with pytest.raises(ConfigError, match=r"its keypoints have .* as information, the frame's none"):
-        mute.step(WALK[0])
+        mute.step(told_by(lambda features: None)[0])
+
+
+SAID = told_by(by_matrix)
 
 
 def test_a_checkpoint_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     whole = run_with(by_matrix)[1]
-    slam, so_far = SLAM(WALK.camera, CONFIG, eyes(by_matrix)), Progressed()
+    slam, so_far = SLAM(WALK.camera, CONFIG), Progressed()
     for index in range(12):
-        so_far.results.append(slam.step(WALK[index]))
+        so_far.results.append(slam.step(SAID[index]))
         so_far.next = index + 1
     slam.settle()
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
-    slam, so_far = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG, extractor=eyes(by_matrix))
-    resumed = run_sequence(slam, WALK, so_far=so_far)
+    slam, so_far = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
+    resumed = run_sequence(slam, SAID, so_far=so_far)
     assert resumed.map.keyframes["information"].shape[-1] == 3
     torch.testing.assert_close(resumed.trajectory.T_wc, whole.trajectory.T_wc, atol=1e-3, rtol=0)
 
@@ -122,8 +126,10 @@ def test_keypoints_of_which_some_are_known_badly_are_worth_what_is_said() -> Non
             information = 1 / ((0.3 * features.scales) ** 2 + torch.where(bad, 4.0, 0.0))
             return replace(features, keypoints=keypoints, information=information if told else None)
 
-        seen = simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK))
-        run = SLAM(WALK.camera, CONFIG, lambda frame, seen=seen: blurred(seen(frame))).run(WALK)  # type: ignore[misc]
+        seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
+        run = SLAM(WALK.camera, CONFIG).run(
+            WithFeatures(WALK, lambda frame, seen=seen, blurred=blurred: blurred(seen(frame)))
+        )
         assert len(run.trajectory) == len(WALK), name
         errors[name] = evaluate(run.trajectory, WALK.groundtruth).ate_m
     assert errors["told"] < 0.6 * errors["hidden"]

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from torchslam.plugins import FRONT_ENDS
 from torchslam.settings import Settings, choices, enlarged, merged, setting, to_toml
 
 __all__ = ["CHOICES", "Config", "load_config", "to_toml"]
@@ -32,6 +33,7 @@ class FeaturesConfig(Settings, section="features"):
         "orb",
         "front end: what finds and describes keypoints",
         choices=("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
+        group=FRONT_ENDS,
     )
     num_keypoints: int = setting(1000, "of an image, at most", low=1, high=100_000)
     image_pixels: int = setting(

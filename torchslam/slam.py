@@ -18,7 +18,7 @@ from torchslam.config import Config
 from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.front_end import Extractor, check_order, check_size, image_extractor
+from torchslam.front_end import FrontEnd, check_order, check_size, image_extractor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.loops.memory import Memory
 from torchslam.mapping.culling import drop_covered
@@ -58,18 +58,20 @@ class SLAM:
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
     `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
 
-    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones; set it
-    to 0 for an extractor of one's own that does not reduce them.
+    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones.
+
+    extractor: front end, from images to `Features`, such as ORB(); the configured one if None. Frames that bring
+               features of their own, as those of `front_end.Simulated`, are not shown to it.
     """
 
     def __init__(
-        self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
+        self, camera: Camera, config: Config | None = None, extractor: FrontEnd | None = None
     ) -> None:
         self.config = config or Config()
         self.camera = camera.to(torch.float64)
-        if extractor is None and self.config.features.kind != "simulated":
-            extractor = image_extractor(self.config, self.camera.params.device)
-        self._image_extractor = extractor
+        self.extractor = None  # where frames bring their features
+        if extractor is not None or self.config.features.kind != "simulated":
+            self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
         self.clock = Stopwatch()
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
         self.tracker = Tracker(self.camera, scaled)
@@ -80,8 +82,6 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget everything and wait for a new start."""
-        # None: `run` makes simulated features from the true poses of the sequence
-        self.extractor = self._image_extractor
         self.enter(Session(self.camera, Worlds(self.camera.params)))
 
     @classmethod
@@ -89,7 +89,7 @@ class SLAM:
         cls,
         path: str | Path,
         config: Config | None = None,
-        extractor: Extractor | None = None,
+        extractor: FrontEnd | None = None,
         mapping: bool = True,
         device: torch.device | str = "cpu",
     ) -> SLAM:
@@ -147,7 +147,7 @@ class SLAM:
         """
         self._check(frame)
         followed, scouts = frame.followed, self.config.patches.enabled and frame.followed is None
-        scouts = scouts and frame.features is None and self._image_extractor is not None
+        scouts = scouts and frame.features is None and self.extractor is not None
         if scouts:
             with self.clock("patches"):
                 followed = self.scout.follow(frame)
@@ -194,18 +194,21 @@ class SLAM:
         return History() if world is None else world.history
 
     def _check(self, frame: Frame) -> None:
-        if self.extractor is None:
+        if self.extractor is None and frame.features is None:
             raise ConfigError(
-                "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
+                "simulated features need true poses: use SLAM.run(sequence), or frames that bring features"
             )
         check_order(frame, self.last_frame)
-        if self._image_extractor is not None and frame.features is None and frame.followed is None:
+        is_whole = frame.image.numel() > 0 or frame.features is None  # else only its features came
+        if is_whole and frame.followed is None:
             check_size(frame, self.camera)
 
     def _look(self, frame: Frame) -> View:
-        assert self.extractor is not None  # as `_check` saw to
         with self.clock("features"):
-            features = self.extractor(frame) if frame.features is None else frame.features
+            features = frame.features
+            if features is None:
+                assert self.extractor is not None  # as `_check` saw to
+                features = self.extractor(frame)
             view = View.of(frame, features, self.camera.params)
             self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:

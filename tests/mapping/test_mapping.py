@@ -12,7 +12,7 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.front_end import simulated_extractor
+from torchslam.front_end import Simulated
 from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
@@ -36,13 +36,15 @@ OVERRIDES = [
 ]
 CONFIG = load_config(None, OVERRIDES)
 WALK = Walk(arc(30))
+EYES = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
+SEEN = EYES.of(WALK)
 
 
 @pytest.fixture(scope="module")
 def slam_after_20() -> SLAM:
-    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    slam = SLAM(WALK.camera, CONFIG)
     for i in range(20):
-        slam.step(WALK[i])
+        slam.step(SEEN[i])
     return slam
 
 
@@ -53,8 +55,7 @@ def slam(slam_after_20: SLAM) -> SLAM:
 
 
 def view_of(slam: SLAM, index: int) -> View:
-    assert slam.extractor is not None
-    return View.of(WALK[index], slam.extractor(WALK[index]), WALK.camera.params.double())
+    return View.of(WALK[index], EYES(WALK[index]), WALK.camera.params.double())
 
 
 def walk_from_start(slam: SLAM, index: int) -> torch.Tensor:
@@ -220,7 +221,7 @@ def test_scale_consistency() -> None:
 
 
 def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[Start | None, str]:
-    extract = simulated_extractor(config, walk.camera, true_T_cw(walk))
+    extract = Simulated(config, walk.camera, true_T_cw(walk))
     initializer = Initializer(walk.camera, config)
     for i in indices:
         result = initializer.step(View.of(walk[i], extract(walk[i]), walk.camera.params.double()))
@@ -285,7 +286,7 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
 def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
     start, _ = start_of((0, 5), WALK, CONFIG)
     assert start is not None
-    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    slam = SLAM(WALK.camera, CONFIG)
     slam_map = Map()
     first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
     seen = [slam_map.points_seen_by(torch.tensor([k])) for k in (first, second)]

@@ -251,8 +251,11 @@ class ClipSLAM(nn.Module):
     def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
         """What the system makes of the features of one clip; None where no map starts."""
         features = features.to(camera.params.device)
-        slam = SLAM(camera, self.config, lambda frame: features[frame.index : frame.index + 1])
-        frames = [Frame(index, float(index), image[None]) for index, image in enumerate(images)]
+        slam = SLAM(camera, self.config, self.extractor)
+        frames = [
+            Frame(index, float(index), image[None], features=features[index : index + 1])
+            for index, image in enumerate(images)
+        ]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
         return None if run.main is None else run.main.history.graph(run.map, run.camera)
 
