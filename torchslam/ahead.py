@@ -44,6 +44,8 @@ def why_alone(sequence: Sequence, config: Config, device: torch.device) -> str:
         return "a live source is read as it comes"
     if device.type != "cpu":
         return f"features are found on {device}"
+    if config.matching.matcher != "descriptors":
+        return "the matcher may want images"
     return ""
 
 

@@ -34,6 +34,7 @@ from torchslam.tracking.foreign import Foreign
 from torchslam.tracking.independent_motion import NOTHING
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.matcher import Matcher, as_wanted, matcher_of
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.tracking.scout import Scout
@@ -62,10 +63,15 @@ class SLAM:
 
     extractor: front end, from images to `Features`, such as ORB(); the configured one if None. Frames that bring
                features of their own, as those of `front_end.Simulated`, are not shown to it.
+    matcher:   who matches two views, see `tracking.matcher.Matcher`; the configured one if None
     """
 
     def __init__(
-        self, camera: Camera, config: Config | None = None, extractor: FrontEnd | None = None
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        extractor: FrontEnd | None = None,
+        matcher: Matcher | None = None,
     ) -> None:
         self.config = config or Config()
         self.camera = camera.to(torch.float64)
@@ -74,9 +80,10 @@ class SLAM:
             self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
         self.clock = Stopwatch()
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
-        self.tracker = Tracker(self.camera, scaled)
+        self.matcher = matcher_of(scaled.matching, matcher)
+        self.tracker = Tracker(self.camera, scaled, self.matcher)
         self.relocalizer = Relocalizer(self.tracker, scaled)
-        self.mapper = Mapper(self.camera, scaled, self.clock)
+        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher)
         self.founder = Founder(self.tracker, self.mapper, self.config.initialization.min_explained)
         self.reset()
 
@@ -92,6 +99,7 @@ class SLAM:
         extractor: FrontEnd | None = None,
         mapping: bool = True,
         device: torch.device | str = "cpu",
+        matcher: Matcher | None = None,
     ) -> SLAM:
         """Go on in the worlds of a file that `save` wrote, with its camera: lost at first, in a session of its own.
 
@@ -100,7 +108,7 @@ class SLAM:
         Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
         """
         session = Session.load(path, mapping, device)
-        slam = cls(session.camera, config, extractor)
+        slam = cls(session.camera, config, extractor, matcher)
         slam.enter(session)
         return slam
 
@@ -209,7 +217,7 @@ class SLAM:
             if features is None:
                 assert self.extractor is not None  # as `_check` saw to
                 features = self.extractor(frame)
-            view = View.of(frame, features, self.camera.params)
+            view = as_wanted(View.of(frame, features, self.camera.params), frame, self.matcher)
             self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)
@@ -345,7 +353,7 @@ class SLAM:
         """Nothing is followed any more."""
         self.world = None
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
-        self.initializer = Initializer(self.camera, self.scaled)
+        self.initializer = Initializer(self.camera, self.scaled, self.matcher)
         self.probation = Probation(self.config)
         self.foreign.forget_last()
         self.lost_for = 0
@@ -409,7 +417,7 @@ class SLAM:
     def _replace(self, youth: Youth) -> bool:
         """Begin anew with the first and the last frame of a young world, if these contradict it."""
         with self.clock("initialization"):
-            start = youth.rival(self.camera, self.scaled)
+            start = youth.rival(self.camera, self.scaled, self.matcher)
             replaced = start is not None and not self._begin(start, youth.views)
         if replaced:
             self.foreign.forget_last()  # its pose was one of the map before

@@ -6,7 +6,7 @@ Letters in shapes: B batch, N keypoints, M matches, L points; H, W image height 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
 
@@ -117,6 +117,7 @@ class View:
     mask:        (N,) bool
     session:     which run over the same map saw it, from 0
     information: (N, I) as in `Noise`: what the front end says of the keypoints' errors; nothing if left out
+    image:       (1, 1, H, W) grey, where a matcher wants it
     """
 
     index: int
@@ -129,6 +130,7 @@ class View:
     T_cw_groundtruth: Tensor | None = None
     session: int = 0
     information: Tensor = field(default_factory=lambda: torch.zeros(0))
+    image: Tensor | None = None
 
     def __post_init__(self) -> None:
         _nothing_said(self)
@@ -155,6 +157,13 @@ class View:
     def noise(self) -> Noise:
         """Of the keypoints (N,)."""
         return Noise(self.scales, self.information)
+
+    def weighed(self, keypoints: Tensor, weights: Tensor | None) -> View:
+        """The same view, the information of keypoints (n,) multiplied with the weights (n,) of their matches."""
+        if weights is None:
+            return self
+        factors = torch.ones_like(self.scales).index_put((keypoints,), weights)
+        return replace(self, information=self.noise.stated().weighed(factors).information)
 
     @property
     def has_features(self) -> bool:
@@ -202,6 +211,7 @@ class Tracked:
     point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
     matches:     how many matches the inliers were chosen from
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
+    weights:     (m,) of the matches, where the matcher gave some
     depth:       median depth of the points it sees
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
     coverage:    share of the image in which the points that were expected are found
@@ -217,6 +227,7 @@ class Tracked:
     error: float = 0.0
     coverage: float = 1.0
     explained: float = 1.0
+    weights: Tensor | None = None
 
     @property
     def inliers(self) -> int:

@@ -18,9 +18,10 @@ from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
 from torchslam.mapping.mapper import Mapper, world_scale
-from torchslam.mapping.new_points import FreeKeypoints, has_consistent_scale, match_along_epipolar_lines
+from torchslam.mapping.new_points import has_consistent_scale
 from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
+from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Start, View
@@ -203,7 +204,7 @@ def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
         for view in (view_of(slam, i) for i in (4, 9))
     )
     T_21 = walk_from_start(slam, 9) @ se3_inverse(walk_from_start(slam, 4))
-    _, first, second = match_along_epipolar_lines(one, two, T_21[None], slam.camera, 1.0, CONFIG.matching)
+    _, first, second = match_along_epipolar_lines(one, two, T_21[None], slam.camera, 1.0, 64.0)
     assert len(first) > 50
     assert torch.equal(one.features.descriptors[0, first], two.features.descriptors[0, second])
 

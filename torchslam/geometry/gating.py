@@ -69,6 +69,16 @@ class Noise:
         """Of some keypoints, as one indexes a tensor."""
         return Noise(self.scales[rows], self.information[rows])
 
+    def stated(self) -> Noise:
+        """The same noise, stated where it was only known by scale: tests that know MARGIN stay as they are."""
+        if self.information.shape[-1]:
+            return self
+        return Noise(self.scales, MARGIN**2 * self.scales[..., None] ** -2)
+
+    def weighed(self, factors: Tensor) -> Noise:
+        """Stated information, multiplied with factors (...)."""
+        return Noise(self.scales, self.information * factors[..., None])
+
     def worse(self, other: Noise) -> Noise:
         """Of each pair of keypoints that of the one that is known less well."""
         first = self.sigmas >= other.sigmas

@@ -20,6 +20,7 @@ from torchslam.geometry import (
 )
 from torchslam.solvers import refine_pose
 from torchslam.tracking.correspondences import match_near, match_views, project_points
+from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.world.map import Map
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity
@@ -117,7 +118,8 @@ def find(
     view = other.view(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    return match_near(slam_map, near, view, _RADIUS_PX, config.matching, ratio=0.9)
+    pairs = match_near(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
+    return pairs.first, pairs.second
 
 
 def agreeing(

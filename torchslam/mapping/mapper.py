@@ -12,6 +12,7 @@ from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.matcher import Matcher
 from torchslam.values import Start, Tracked, View
 from torchslam.world.compaction import Renumbering, compact
 from torchslam.world.map import Map
@@ -23,10 +24,13 @@ YOUNG = 3  # keyframes after its own for which a point is on trial
 class Mapper:
     """Grows the map, keyframe by keyframe."""
 
-    def __init__(self, camera: Camera, config: Config, clock: Stopwatch) -> None:
+    def __init__(
+        self, camera: Camera, config: Config, clock: Stopwatch, matcher: Matcher | None = None
+    ) -> None:
         self.camera = camera
         self.config = config
         self.clock = clock
+        self.matcher = matcher
 
     def start(self, slam_map: Map, start: Start) -> tuple[int, int]:
         """Make the first map of two views, at the configured scale; returns the two keyframes."""
@@ -51,7 +55,7 @@ class Mapper:
         """Make a tracked frame a keyframe; returns its index."""
         settings = self.config.mapping
         with self.clock("mapping"):
-            keyframe = slam_map.add_keyframe(view, tracked.T_cw)
+            keyframe = slam_map.add_keyframe(view.weighed(tracked.keypoints, tracked.weights), tracked.T_cw)
             slam_map.observe(keyframe, tracked.keypoints, tracked.point_ids)
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
@@ -59,7 +63,7 @@ class Mapper:
             last = range(keyframe - 1, max(keyframe - 1 - settings.neighbours, -1), -1)
             partners = neighbours if settings.partners == "covisible" else slam_map.ids(*last)
             partners = partners[: settings.neighbours]
-            triangulate_against(slam_map, keyframe, partners, self.camera, self.config)
+            triangulate_against(slam_map, keyframe, partners, self.camera, self.config, self.matcher)
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)

@@ -15,7 +15,8 @@ from torch import Tensor
 from torchslam.config import IndependentMotionConfig, MatchingConfig
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
-from torchslam.tracking.correspondences import match_views, max_distance
+from torchslam.tracking.correspondences import match_views
+from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.spread import cells
 from torchslam.tracking.stillness import distances_to_segments
 from torchslam.values import Tracked, View

@@ -20,7 +20,7 @@ from torchslam.geometry import (
     triangulate,
 )
 from torchslam.solvers import BundleProblem, bundle_adjust
-from torchslam.tracking.correspondences import match_views
+from torchslam.tracking.matcher import Matcher, matched, matcher_of
 from torchslam.values import Start, View
 
 AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
@@ -32,8 +32,9 @@ EXPLAINED_SHARE = 0.5  # of them that the motion of the others must explain
 class Initializer:
     """Tries every frame against a reference frame until two of them make a map worth having."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
+        self.matcher = matcher_of(config.matching, matcher)
         self.config = config
         self.views: list[View] = []  # the reference and what came after it
         # pixels (n, 2) that the last view showed not to move with the scene
@@ -51,7 +52,9 @@ class Initializer:
             self.views = [view]
             return None, "took a reference frame"
         self.views.append(view)
-        first, second = match_views(self.reference, view, self.config.matching)
+        pairs = matched(self.matcher, self.reference, view)
+        first, second = pairs.first, pairs.second
+        view = view.weighed(second, pairs.weights)
         least = self.config.initialization.min_matches
         if len(first) < least:
             self.views = [view]
@@ -149,7 +152,9 @@ class Initializer:
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
-        noise = self.reference.noise[first].worse(view.noise[second])
+        noise = view.noise[second]
+        known = self.reference.noise[first]
+        noise = (known.stated() if noise.information.shape[-1] else known).worse(noise)
         seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)

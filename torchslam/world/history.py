@@ -49,7 +49,7 @@ class History:
 
     def add(self, view: View, tracked: Tracked, T_cr: Tensor, reference: int) -> None:
         """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
-        device = T_cr.device
+        device, view = T_cr.device, view.weighed(tracked.keypoints, tracked.weights)
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
             session=torch.tensor([view.session], device=device),

@@ -28,6 +28,7 @@ class Map:
     def __init__(self) -> None:
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
+        self.images: dict[int, Tensor] = {}  # of keyframes, by key, where a matcher wants them; saved nowhere
         self._index: Observers | None = None  # of what the tables hold; None: not made yet
 
     @property
@@ -112,6 +113,8 @@ class Map:
 
     def add_keyframe(self, view: View, T_cw: Tensor) -> int:
         """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
+        if view.image is not None:
+            self.images[(view.session << SESSION_BITS) + view.index] = view.image
         ids = self.keyframes.append(
             T_cw=T_cw[None],
             covariances=T_cw.new_zeros(1, 6, 6),
@@ -168,6 +171,10 @@ class Map:
         self._index_of_points.add(point_ids, keyframe * self._keypoints + keypoint_index)
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)
+
+    def weigh(self, keyframe: int | Tensor, keypoint_index: Tensor, weights: Tensor) -> None:
+        """Multiply the stated information of keypoints (n,) of a keyframe, or of one each (n,), with weights (n,)."""
+        self.keyframes["information"][keyframe, keypoint_index] *= weights[:, None]
 
     def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
         """Drop observations, given by keyframe (n,) and keypoint (n,)."""
@@ -232,6 +239,7 @@ class Map:
             index=int(row["frame_index"]),
             timestamp=float(row["timestamp"]),
             session=int(row["session"]),
+            image=self.images.get(self.key(keyframe)) if self.images else None,
             **{name: row[name] for name in names},
         )
 
@@ -261,6 +269,7 @@ class Map:
     def append(self, other: Map) -> tuple[int, int]:
         """Add all keyframes and points of another map, in the same world frame; returns how far their rows moved."""
         keyframes, points = len(self.keyframes), len(self.points)
+        self.images |= other.images
         rows = other.points.columns()
         rows["born"] = rows["born"] + keyframes
         rows["replaced_by"] = torch.where(rows["replaced_by"] >= 0, rows["replaced_by"] + points, NO_POINT)
