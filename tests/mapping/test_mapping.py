@@ -23,6 +23,7 @@ from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Start, View
 from torchslam.world.map import NO_POINT, Map
@@ -86,10 +87,12 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     near = project_points(
         slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
-    ids, keypoints = match_near(slam.map, near, view, 1.0, CONFIG.matching, ratio=0.9)
+    pairs = match_near(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
+    ids, keypoints = pairs.first, pairs.second
     assert len(ids) > 150
     assert len(torch.unique(keypoints)) == len(keypoints)
-    anywhere_ids, anywhere_keypoints = match_points(slam.map, near.ids, view, CONFIG.matching)
+    pairs = match_points(slam.map, near.ids, view, CONFIG.matching)
+    anywhere_ids, anywhere_keypoints = pairs.first, pairs.second
     both = dict(zip(anywhere_ids.tolist(), anywhere_keypoints.tolist(), strict=True))
     assert all(both.get(i, k) == k for i, k in zip(ids.tolist(), keypoints.tolist(), strict=True))
 
@@ -114,7 +117,7 @@ def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
 def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
     anywhere = match_points(slam.map, slam.map.living_points(), view, CONFIG.matching)
-    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere[0][:0])
+    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
     slam.tracker.start_at(slam.world, view, tracked)

@@ -44,7 +44,7 @@ class LightGlue(nn.Module):
         except (KeyError, ValueError):
             raise ConfigError(f"{weights}: not the weights of a LightGlue network") from None
         self.network = Network(
-            features=None,  # which would download
+            features=None,  # type: ignore[arg-type]  # a name would download
             input_dim=self.size_in,
             descriptor_dim=width,
             n_layers=layers,
