@@ -26,8 +26,8 @@ from torchslam.values import Features
 MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0
 XFEAT_NOISE, ALIKED_NOISE = 1.0, 0.7
-"""Pixels of the image that the network sees, by what whole runs on real sequences leave of its errors: XFeat has 1.03 to
-1.35, of which the least is taken (with 1.2 the start is refused on a short sequence), ALIKED 0.5 to 0.8."""
+"""Pixels of the image that the network sees, by what whole runs on real sequences leave of its errors: XFeat has 1.03
+to 1.35, of which the least is taken (with 1.2 the start is refused on a short sequence), ALIKED 0.5 to 0.8."""
 
 
 class XFeat(nn.Module):
