@@ -12,9 +12,8 @@ from torchslam.geometry import (
     fits,
     innovation_covariances,
     mahalanobis_squared,
-    unpacked_information,
 )
-from torchslam.geometry.gating import MARGIN
+from torchslam.geometry.gating import MARGIN, unpacked_information
 from torchslam.geometry.whitening import whitening
 
 

@@ -17,9 +17,7 @@ from torchslam.geometry.gating import (
     fits,
     innovation_covariances,
     mahalanobis_squared,
-    packed_information,
     squared_reprojection_errors,
-    unpacked_information,
 )
 from torchslam.geometry.homography import (
     decompose_homography,
@@ -88,7 +86,6 @@ __all__ = [
     "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
-    "packed_information",
     "quaternion_from_matrix",
     "rigid",
     "rotation_from_matches",
@@ -116,6 +113,5 @@ __all__ = [
     "triangulate_many",
     "triangulation_covariance",
     "umeyama",
-    "unpacked_information",
     "vee",
 ]
