@@ -187,6 +187,7 @@ def test_choices_have_one_source() -> None:
         "initialization.criterion": ("uncertainty", "parallax"),
         "measurement.gate": ("chi_square", "mahalanobis"),
         "mapping.partners": ("covisible", "last"),
+        "matching.matcher": ("descriptors", "lightglue"),
     }
 
 

@@ -16,7 +16,8 @@ from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, loa
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
-from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.front_end import source
+from torchslam.geometry import Noise, se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
 from torchslam.slam import FOUND_AGAIN, STARTED_ANEW
 from torchslam.tracking.tracker import Tracker
@@ -127,7 +128,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
     assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
     assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
-    whole = Gap(arc(60))
+    whole = source(Gap(arc(60)), slam.config, slam.camera)
     states = [slam.step(whole[index]).state for index in range(42, 46)]
     assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
     assert states[-1] is State.TRACKING
@@ -416,15 +417,15 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
     tracker = Tracker(run.camera, run.config)
     ids = run.map.points_seen_by(torch.tensor([1]))
-    T_cw, scales = run.map.T_cw[1], torch.ones(len(ids), dtype=torch.float64)
+    T_cw, noise = run.map.T_cw[1], Noise.of(torch.ones(len(ids), dtype=torch.float64), None)
     pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
-    assert tracker.agrees(run.map, T_cw, ids, pixels, scales).all()
+    assert tracker.agrees(run.map, T_cw, ids, pixels, noise).all()
     run.map.points["covariances_w"][ids] = 0
-    assert not tracker.agrees(run.map, T_cw, ids, pixels + 4.0, scales).any()
+    assert not tracker.agrees(run.map, T_cw, ids, pixels + 4.0, noise).any()
     depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
     spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
     run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
-    assert tracker.agrees(run.map, T_cw, ids, pixels + 4.0, scales).all()
+    assert tracker.agrees(run.map, T_cw, ids, pixels + 4.0, noise).all()
 
 
 # --- adjustments that wait -----------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
-from torchslam.front_end import Extractor
+from torchslam.front_end import FrontEnd
 from torchslam.loops.recognition import Recall
 from torchslam.run import Progressed
 from torchslam.session import Session
@@ -66,7 +66,7 @@ def read_checkpoint(
     sequence: Sequence,
     config: Config,
     device: torch.device | str = "cpu",
-    extractor: Extractor | None = None,
+    extractor: FrontEnd | None = None,
 ) -> tuple[SLAM, Progressed]:
     """The system and what it had done when the checkpoint was taken.
 

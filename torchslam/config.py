@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from torchslam.plugins import FRONT_ENDS, MATCHERS
 from torchslam.settings import Settings, choices, enlarged, merged, setting, to_toml
 
 __all__ = ["CHOICES", "Config", "load_config", "to_toml"]
@@ -32,6 +33,7 @@ class FeaturesConfig(Settings, section="features"):
         "orb",
         "front end: what finds and describes keypoints",
         choices=("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
+        group=FRONT_ENDS,
     )
     num_keypoints: int = setting(1000, "of an image, at most", low=1, high=100_000)
     image_pixels: int = setting(
@@ -76,6 +78,13 @@ class MatchingConfig(Settings, section="matching"):
     )
     max_cosine_distance: float = setting(0.25, "between descriptors of floats: 1 - cosine", above=0, high=2)
     ratio: float = setting(0.8, "of the best to the second best distance, at most", above=0, high=1)
+    matcher: str = setting(
+        "descriptors",
+        "who matches two views, also a map's points with a view; descriptors: nearest and mutual",
+        choices=("descriptors", "lightglue"),
+        group=MATCHERS,
+    )
+    weights: str = setting("", "file with the weights of a learned matcher")
 
 
 @dataclass(frozen=True)

@@ -83,4 +83,6 @@ def why_alone(sequence: Sequence, config: Config) -> str:
         return "simulated features need no images"
     if not len(sequence.timestamps):
         return "a live source is read as it comes"
+    if config.matching.matcher != "descriptors":
+        return "the matcher may want images"
     return ""

@@ -12,8 +12,8 @@ import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
-from torchslam.errors import ConfigError, FrameError, InitializationError, TorchslamError
-from torchslam.front_end import Extractor, simulated_extractor
+from torchslam.errors import FrameError, InitializationError, TorchslamError
+from torchslam.front_end import source
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.loops.memory import Memory
 from torchslam.loops.recognition import Recall
@@ -33,7 +33,6 @@ class System(Protocol):
 
     camera: Camera
     config: Config
-    extractor: Extractor | None
     session: Session
     memory: Memory
     last_frame: tuple[int, float] | None
@@ -178,8 +177,7 @@ def run_sequence(
             "or save() its worlds and SLAM.load() them to go on there"
         )
     so_far = Progressed() if so_far is None else so_far
-    if slam.extractor is None:
-        slam.extractor = simulated_extractor(slam.config, slam.camera, true_poses(sequence))
+    sequence = source(sequence, slam.config, slam.camera)
     frames = sequence if frames is None else frames
     interrupted = False
     try:
@@ -276,15 +274,3 @@ def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
     kind, _ = Counter(reason.split(":")[0] for reason in attempts).most_common(1)[0]
     last = next(reason for reason in reversed(attempts) if reason.split(":")[0] == kind)
     return f"no map was initialised in {len(results)} frames: {last}"
-
-
-def true_poses(sequence: Sequence) -> torch.Tensor:
-    """(F, 4, 4) the true poses, world to camera, of the frames that have one."""
-    frames = len(sequence) if sequence.groundtruth is not None else 0
-    known = (sequence.pose(index) for index in range(frames))
-    poses = [pose for pose in known if pose is not None]
-    if not poses:
-        raise ConfigError(
-            f"{sequence.name} has no ground truth: simulated features need it; use --features orb"
-        )
-    return torch.stack(poses).to(torch.float64)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from torchslam.errors import ConfigError
+from torchslam.plugins import is_known, registered
 from torchslam.regular_file import read_text
 
 Value = TypeVar("Value", bool, int, float, str)
@@ -37,6 +38,7 @@ class Allowed:
     above:     a lower end that is not in the range
     also:      a number outside of the range that means something else
     choices:   of a string; empty for any
+    group:     of entry points, whose names are choices as well, and so is PACKAGE:NAME
     """
 
     low: float = 0
@@ -44,6 +46,7 @@ class Allowed:
     above: float = -math.inf
     choices: tuple[str, ...] = ()
     also: float | None = None
+    group: str = ""
 
     def __contains__(self, value: object) -> bool:
         if isinstance(value, bool):
@@ -52,11 +55,14 @@ class Allowed:
             is_finite = isinstance(value, int) or math.isfinite(value)  # isfinite makes floats of integers
             is_inside = is_finite and self.low <= value <= self.high and value > self.above
             return is_inside or value == self.also
-        return not self.choices or value in self.choices
+        if not self.choices or value in self.choices:
+            return True
+        return bool(self.group) and isinstance(value, str) and is_known(self.group, value)
 
     def __str__(self) -> str:
         if self.choices:
-            return f"one of {', '.join(self.choices)}"
+            known = [*self.choices, *(sorted(registered(self.group)) if self.group else ())]
+            return f"one of {', '.join(known)}{', or PACKAGE:NAME' if self.group else ''}"
         start = f"at least {self.low}" if self.above < self.low else f"above {self.above}"
         also = "" if self.also is None else f"{self.also} or "
         return f"{also}{start} and {'finite' if self.high == math.inf else f'at most {self.high}'}"
@@ -72,13 +78,14 @@ def setting(
     choices: tuple[str, ...] = (),
     also: float | None = None,
     grows: bool = False,
+    group: str = "",
 ) -> Value:
     """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number.
 
     about: what it is, in words, for `explained`
     grows: whether it is a length in the image, for `enlarged`
     """
-    allowed = Allowed(low, high, above, choices, also)
+    allowed = Allowed(low, high, above, choices, also, group)
     return field(default=default, metadata={"allowed": allowed, "about": about, "grows": grows})
 
 

@@ -18,7 +18,7 @@ from torchslam.config import Config
 from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.front_end import Extractor, check_order, check_size, image_extractor
+from torchslam.front_end import FrontEnd, check_order, check_size, image_extractor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.loops.memory import Memory
 from torchslam.mapping.culling import drop_covered
@@ -34,6 +34,7 @@ from torchslam.tracking.foreign import Foreign
 from torchslam.tracking.independent_motion import NOTHING
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.matcher import Matcher, as_wanted, matcher_of
 from torchslam.tracking.probation import Probation
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.tracking.scout import Scout
@@ -59,30 +60,36 @@ class SLAM:
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
     `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
 
-    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones; set it
-    to 0 for an extractor of one's own that does not reduce them.
+    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones.
+
+    extractor: front end, from images to `Features`, such as ORB(); the configured one if None. Frames that bring
+               features of their own, as those of `front_end.Simulated`, are not shown to it.
+    matcher:   who matches two views, see `tracking.matcher.Matcher`; the configured one if None
     """
 
     def __init__(
-        self, camera: Camera, config: Config | None = None, extractor: Extractor | None = None
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        extractor: FrontEnd | None = None,
+        matcher: Matcher | None = None,
     ) -> None:
         self.config = config or Config()
         self.camera = camera.to(torch.float64)
-        if extractor is None and self.config.features.kind != "simulated":
-            extractor = image_extractor(self.config, self.camera.params.device)
-        self._image_extractor = extractor
+        self.extractor = None  # where frames bring their features
+        if extractor is not None or self.config.features.kind != "simulated":
+            self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
         self.clock = Stopwatch()
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
-        self.tracker = Tracker(self.camera, scaled)
+        self.matcher = matcher_of(scaled.matching, matcher)
+        self.tracker = Tracker(self.camera, scaled, self.matcher)
         self.relocalizer = Relocalizer(self.tracker, scaled)
-        self.mapper = Mapper(self.camera, scaled, self.clock)
+        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher)
         self.founder = Founder(self.tracker, self.mapper, self.config.initialization.min_explained)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything and wait for a new start."""
-        # None: `run` makes simulated features from the true poses of the sequence
-        self.extractor = self._image_extractor
         self.enter(Session(self.camera, Worlds(self.camera.params)))
 
     @classmethod
@@ -90,9 +97,10 @@ class SLAM:
         cls,
         path: str | Path,
         config: Config | None = None,
-        extractor: Extractor | None = None,
+        extractor: FrontEnd | None = None,
         mapping: bool = True,
         device: torch.device | str = "cpu",
+        matcher: Matcher | None = None,
     ) -> SLAM:
         """Go on in the worlds of a file that `save` wrote, with its camera: lost at first, in a session of its own.
 
@@ -101,7 +109,7 @@ class SLAM:
         Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
         """
         session = Session.load(path, mapping, device)
-        slam = cls(session.camera, config, extractor)
+        slam = cls(session.camera, config, extractor, matcher)
         slam.enter(session)
         return slam
 
@@ -149,7 +157,7 @@ class SLAM:
         """
         self._check(frame)
         followed, scouts = frame.followed, self.config.patches.enabled and frame.followed is None
-        scouts = scouts and frame.features is None and self._image_extractor is not None
+        scouts = scouts and frame.features is None and self.extractor is not None
         if scouts:
             with self.clock("patches"):
                 followed = self.scout.follow(frame)
@@ -196,19 +204,22 @@ class SLAM:
         return History() if world is None else world.history
 
     def _check(self, frame: Frame) -> None:
-        if self.extractor is None:
+        if self.extractor is None and frame.features is None:
             raise ConfigError(
-                "simulated features need true poses: use SLAM.run(sequence), or pass an extractor"
+                "simulated features need true poses: use SLAM.run(sequence), or frames that bring features"
             )
         check_order(frame, self.last_frame)
-        if self._image_extractor is not None and frame.features is None and frame.followed is None:
+        is_whole = frame.image.numel() > 0 or frame.features is None  # else only its features came
+        if is_whole and frame.followed is None:
             check_size(frame, self.camera)
 
     def _look(self, frame: Frame) -> View:
-        assert self.extractor is not None  # as `_check` saw to
         with self.clock("features"):
-            features = self.extractor(frame) if frame.features is None else frame.features
-            view = View.of(frame, features, self.camera.params)
+            features = frame.features
+            if features is None:
+                assert self.extractor is not None  # as `_check` saw to
+                features = self.extractor(frame)
+            view = as_wanted(View.of(frame, features, self.camera.params), frame, self.matcher)
             self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)
@@ -373,7 +384,7 @@ class SLAM:
         """Nothing is followed any more."""
         self.world = None
         self.youth: Youth | None = None  # of the world that is followed, if it began lately
-        self.initializer = Initializer(self.camera, self.scaled)
+        self.initializer = Initializer(self.camera, self.scaled, self.matcher)
         self.probation = Probation(self.config)
         self.foreign.forget_last()
         self.lost_for = 0
@@ -437,7 +448,7 @@ class SLAM:
     def _replace(self, youth: Youth) -> bool:
         """Begin anew with the first and the last frame of a young world, if these contradict it."""
         with self.clock("initialization"):
-            start = youth.rival(self.camera, self.scaled)
+            start = youth.rival(self.camera, self.scaled, self.matcher)
             replaced = start is not None and not self._begin(start, youth.views)
         if replaced:
             self.foreign.forget_last()  # its pose was one of the map before

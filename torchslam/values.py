@@ -5,11 +5,15 @@ Letters in shapes: B batch, N keypoints, M matches, L points; H, W image height 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchslam.geometry.gating import Noise, packed_information, unpacked_information
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class Features:
     angles:      (B, N) radians, clockwise in the image (from x towards y)
     descriptors: (B, N, 32) uint8, 256 bits packed least significant first; or (B, N, D) floats of unit length
     mask:        (B, N) bool, True where the row is a keypoint
+    information: (B, N) inverse variances of the keypoints in each direction, px^-2, or (B, N, 2, 2) inverse
+                 covariances, positive (definite) where `mask`; None: a keypoint is known to its scale
     """
 
     keypoints: Tensor
@@ -56,13 +62,30 @@ class Features:
     angles: Tensor
     descriptors: Tensor
     mask: Tensor
+    information: Tensor | None = None
 
     def __getitem__(self, rows: slice) -> Features:
         """A part of the batch, by slice."""
-        return Features(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+        return self._each(lambda column: column[rows])
 
     def to(self, device: torch.device | str) -> Features:
-        return Features(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return self._each(lambda column: column.to(device))
+
+    def rows(self, rows: Tensor | slice) -> Features:
+        """Some keypoints of each element, by slice or index (n,)."""
+        return self._each(lambda column: column[:, rows])
+
+    @classmethod
+    def cat(cls, parts: Sequence[Features]) -> Features:
+        """One batch of several, all with or all without information."""
+        columns: Any = ([getattr(part, each.name) for part in parts] for each in fields(cls))
+        joined: Any = (None if column[0] is None else torch.cat(column) for column in columns)
+        return cls(*joined)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Features:
+        columns: Any = (getattr(self, each.name) for each in fields(self))
+        changed: Any = (None if column is None else change(column) for column in columns)
+        return Features(*changed)
 
 
 @dataclass(frozen=True)
@@ -93,6 +116,8 @@ class View:
     descriptors: (N, D)
     mask:        (N,) bool
     session:     which run over the same map saw it, from 0
+    information: (N, I) as in `Noise`: what the front end says of the keypoints' errors; nothing if left out
+    image:       (1, 1, H, W) grey, where a matcher wants it
     """
 
     index: int
@@ -104,11 +129,18 @@ class View:
     mask: Tensor
     T_cw_groundtruth: Tensor | None = None
     session: int = 0
+    information: Tensor = field(default_factory=lambda: torch.zeros(0))
+    image: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _nothing_said(self)
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> View:
         """The first element of a batch of features, with the device and the floating-point dtype of `like`."""
         features, truth = features.to(like.device), frame.T_cw_groundtruth
+        scales, information = features.scales[:1], features.information
+        information = None if information is None else information[:1]
         return cls(
             frame.index,
             frame.timestamp,
@@ -118,7 +150,20 @@ class View:
             features.descriptors[0],
             features.mask[0],
             None if truth is None else truth.to(like),
+            information=packed_information(information, scales)[0].to(like.dtype),
         )
+
+    @property
+    def noise(self) -> Noise:
+        """Of the keypoints (N,)."""
+        return Noise(self.scales, self.information)
+
+    def weighed(self, keypoints: Tensor, weights: Tensor | None) -> View:
+        """The same view, the information of keypoints (n,) multiplied with the weights (n,) of their matches."""
+        if weights is None:
+            return self
+        factors = torch.ones_like(self.scales).index_put((keypoints,), weights)
+        return replace(self, information=self.noise.stated().weighed(factors).information)
 
     @property
     def has_features(self) -> bool:
@@ -136,7 +181,9 @@ class View:
         """The keypoints as a batch of one, for matching."""
         scores = torch.ones_like(self.scales)
         columns = (self.keypoints, scores, self.scales, self.angles, self.descriptors, self.mask)
-        return Features(*(column[None] for column in columns))
+        information = unpacked_information(self.information[None])
+        keypoints, scores, scales, angles, descriptors, mask = (column[None] for column in columns)
+        return Features(keypoints, scores, scales, angles, descriptors, mask, information)
 
 
 @dataclass(frozen=True)
@@ -164,6 +211,7 @@ class Tracked:
     point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
     matches:     how many matches the inliers were chosen from
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
+    weights:     (m,) of the matches, where the matcher gave some
     depth:       median depth of the points it sees
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
     coverage:    share of the image in which the points that were expected are found
@@ -179,6 +227,7 @@ class Tracked:
     error: float = 0.0
     coverage: float = 1.0
     explained: float = 1.0
+    weights: Tensor | None = None
 
     @property
     def inliers(self) -> int:
@@ -190,7 +239,7 @@ class Anchor:
     """A frame found by its features, from which the next ones can be followed without any: what its camera sees.
 
     index:     of the frame
-    points_a:  (n, 3) in its camera; pixels: (n, 2) its keypoints there; scales: (n,) of these
+    points_a:  (n, 3) in its camera; pixels: (n, 2) its keypoints there; scales: (n,) and information: (n, I) of these
     senior:    (n,) bool, which points many frames have found
     T_ka:      (k, 4, 4) to the keyframes around it
     velocity:  (4, 4) last motion of the camera, T_a_previous
@@ -205,6 +254,21 @@ class Anchor:
     T_ka: Tensor
     velocity: Tensor
     overlap: float
+    information: Tensor = field(default_factory=lambda: torch.zeros(0))
+
+    def __post_init__(self) -> None:
+        _nothing_said(self)
+
+    @property
+    def noise(self) -> Noise:
+        """Of its keypoints (n,)."""
+        return Noise(self.scales, self.information)
+
+
+def _nothing_said(seen: View | Anchor) -> None:
+    """Where no information was given there is none: (n, 0)."""
+    if seen.information.ndim == 1:
+        object.__setattr__(seen, "information", packed_information(None, seen.scales))
 
 
 @dataclass(frozen=True)
@@ -233,7 +297,7 @@ class Observations:
     """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
 
     keyframe_index, keypoint_index, point_index: (O,) int64
-    pixels: (O, 2); scales: (O,) pixels
+    pixels: (O, 2); scales: (O,) pixels; information: (O, I) as in `Noise`
     """
 
     keyframe_index: Tensor
@@ -241,6 +305,11 @@ class Observations:
     point_index: Tensor
     pixels: Tensor
     scales: Tensor
+    information: Tensor
+
+    @property
+    def noise(self) -> Noise:
+        return Noise(self.scales, self.information)
 
     def __len__(self) -> int:
         return len(self.point_index)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from experiments.common import table, write_between
 from torchslam.config import load_config
-from torchslam.front_end import simulated_extractor
+from torchslam.front_end import Simulated
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.slam import SLAM
 from torchslam.values import Frame
@@ -37,12 +38,13 @@ def main() -> None:
     poses = loop_poses(frames)
     camera = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
     config = load_config(None, ["features.kind=simulated", "simulated.noise_px=0.5"])
-    slam = SLAM(camera, config, simulated_extractor(config, camera, poses))
+    slam, eyes = SLAM(camera, config), Simulated(config, camera, poses)
     blank = torch.zeros(1, 1, 480, 640)
     ms, states = [], []
     for i, T_cw in enumerate(poses):
         before = time.process_time()
-        result = slam.step(Frame(i, i / 30, blank, f"frame {i}", T_cw))
+        frame = Frame(i, i / 30, blank, f"frame {i}", T_cw)
+        result = slam.step(replace(frame, features=eyes(frame)))
         ms.append(1e3 * (time.process_time() - before))
         states.append(result.state.value)
         if i % 300 == 299:

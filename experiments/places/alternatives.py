@@ -45,10 +45,10 @@ def hash_tables(features: Features, bits: int, tables: int) -> Tensor:
 
 def direct(features: Features, strongest: int, ratio: float | None, max_distance: float) -> Tensor:
     """No words: how many of the strongest keypoints match, mutually and by the ratio test."""
-    part = Features(*(column[:, :strongest] for column in vars(features).values()))
+    part = features.rows(slice(strongest))
     rows = []
     for row in range(len(part.mask)):
-        repeated = Features(*(column[row : row + 1].expand_as(column) for column in vars(part).values()))
+        repeated = Features.cat([part[row : row + 1]] * len(part.mask))
         rows.append(match(repeated, part, ratio, max_distance=max_distance).mask.sum(1))
     return torch.stack(rows).float()
 

@@ -53,8 +53,7 @@ def collect() -> Collection:
         found += [orb(frame.image) for frame in sequence]
         ranges[name] = range(start, len(found))
         T_cw[name] = torch.stack([frame_pose(sequence.pose(index)) for index in range(len(sequence))])
-    columns = zip(*(vars(features).values() for features in found), strict=True)
-    return Collection(Features(*(torch.cat(column) for column in columns)), ranges, T_cw)
+    return Collection(Features.cat(found), ranges, T_cw)
 
 
 def frame_pose(pose: Tensor | None) -> Tensor:

@@ -19,9 +19,9 @@ from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.front_end import Extractor, image_extractor, simulated_extractor
+from torchslam.front_end import Simulated, true_poses
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.run import Run, true_poses
+from torchslam.run import Run
 from torchslam.slam import SLAM
 from torchslam.values import Trajectory
 
@@ -102,28 +102,28 @@ def scaled(camera: Camera, factor: float) -> Camera:
     return camera.with_params(torch.cat([factor * camera.params[:2], camera.params[2:]]))
 
 
-def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config, Extractor]:
-    """The sequence as if nothing were known of its camera; with the given one, if there is; and its features."""
+def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config]:
+    """The sequence as if nothing were known of its camera; with the given one, if there is."""
     config = load_config(None, case.overrides)
     path = case.name if case.name.startswith("synthetic:") else DATA_DIR / case.name
     unknown = open_sequence(path, "auto", limit=case.frames)
     if case.simulated:
         known: Sequence | None = PosesOnly(open_sequence(path, limit=case.frames), wide_angle())
         assert known is not None
-        unknown = known.with_camera(unknown.camera)
-        return unknown, known, config, simulated_extractor(config, wide_angle(), true_poses(known))
+        known = Simulated(config, wide_angle(), true_poses(known)).of(known)
+        return known.with_camera(unknown.camera), known, config
     known = open_sequence(path, limit=case.frames) if Path(path).suffix != ".mp4" else None
-    return unknown, known, config, image_extractor(config)
+    return unknown, known, config
 
 
 def found(label: str, case: Case) -> list[str]:
     """Find the camera of a case, run with it and with the given one, and return the row of the table."""
-    unknown, known, config, extractor = open_case(case)
+    unknown, known, config = open_case(case)
     start = time.process_time()
-    result = calibrate(unknown, config, extractor=extractor, told=lambda done: tell(label, done))
+    result = calibrate(unknown, config, told=lambda done: tell(label, done))
     seconds = time.process_time() - start
-    run = SLAM(result.camera, config, extractor).run(unknown)
-    given = None if known is None else SLAM(known.camera, config, extractor).run(known)
+    run = SLAM(result.camera, config).run(unknown)
+    given = None if known is None else SLAM(known.camera, config).run(known)
     reference = case.peer or (math.nan if known is None else float(known.camera.focal))
     off = math.log(float(result.camera.focal) / reference)
     std = math.nan if result.refined is None else result.refined.std
@@ -173,12 +173,12 @@ def error_of(run: Run, sequence: Sequence) -> str:
 
 def warned(label: str, case: Case) -> None:
     """What runs with focal lengths that are off both ways say of them."""
-    _, known, config, extractor = open_case(case)
+    _, known, config = open_case(case)
     if known is None:
         return
     for factor in (1 / WRONG, 1.0, WRONG):
         camera = scaled(known.camera.to(torch.float64), factor)
-        run = SLAM(camera, config, extractor).run(known)
+        run = SLAM(camera, config).run(known)
         said = run.failure or contradiction(camera, refine(run.graph)) or "nothing"
         print(f"{label}, given {float(camera.focal):.1f} px: {said}", flush=True)
 

@@ -12,28 +12,26 @@ from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
 from torchslam.calibration.words import contradiction, in_words
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
-from torchslam.front_end import Extractor, simulated_extractor
+from torchslam.front_end import Simulated, true_poses
 from torchslam.geometry import Camera
-from torchslam.run import true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 
 
-def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config, Extractor]:
+def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
     """A walk with `CAMERA`, of which the sequence does not know."""
     settings = ["features.num_keypoints=200", "simulated.points_per_view=90", "simulated.noise_px=0.3"]
     config = load_config(None, ["features.kind=simulated", *settings])
     path = Walk(poses).with_camera(CAMERA)
-    extractor = simulated_extractor(config, CAMERA, true_poses(path))
     guess = CAMERA.with_params(CAMERA.params * torch.tensor([share * 1.6] * 2 + [1.0] * 2))
-    unknown = path.with_camera(guess, Calibrated.GUESSED)
-    return unknown, config, extractor
+    unknown = Simulated(config, CAMERA, true_poses(path)).of(path).with_camera(guess, Calibrated.GUESSED)
+    return unknown, config
 
 
 def test_the_focal_length_is_found_from_nothing() -> None:
-    unknown, config, extractor = walk(arc(22, 2.2))
+    unknown, config = walk(arc(22, 2.2))
     told: list[Round] = []
-    found = calibrate(unknown, config, extractor=extractor, told=told.append)
+    found = calibrate(unknown, config, told=told.append)
     assert found.is_determined
     assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
     assert found.rounds == told
@@ -46,16 +44,16 @@ def test_the_focal_length_is_found_from_nothing() -> None:
 
 
 def test_a_given_camera_is_refined_without_guessing() -> None:
-    unknown, config, extractor = walk(arc(22, 2.2), share=0.55)
+    unknown, config = walk(arc(22, 2.2), share=0.55)
     given = unknown.with_camera(unknown.camera)
-    found = calibrate(given, config, radial=0, guess=False, extractor=extractor)
+    found = calibrate(given, config, radial=0, guess=False)
     assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
     assert len(found.rounds) < 4
 
 
 def test_a_camera_that_only_turns_stays_unknown() -> None:
-    unknown, config, extractor = walk(turn(14))
-    found = calibrate(unknown, config, extractor=extractor)
+    unknown, config = walk(turn(14))
+    found = calibrate(unknown, config)
     assert not found.is_determined
     assert found.camera is unknown.camera or float(found.camera.focal) == float(unknown.camera.focal)
     assert "a guess, which may be wrong by a factor of two" in in_words(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from experiments.benchmarks.mapping import CAMERA, Walk
-from torchslam.geometry import fits, squared_reprojection_errors, transform
+from torchslam.geometry import fits, transform
 
 
 def test_the_next_keyframes_see_old_points_and_new_ones_where_they_are() -> None:
@@ -20,5 +20,5 @@ def test_the_next_keyframes_see_old_points_and_new_ones_where_they_are() -> None
         assert int((seen.point_index < before).sum()) > 200
         assert int((seen.point_index >= before).sum()) > 50
         points_c = transform(slam_map.T_cw[13], slam_map.positions_w[seen.point_index])
-        errors = squared_reprojection_errors(points_c, seen.pixels, CAMERA)
-        assert float(fits(errors, seen.scales).double().mean()) > 0.95
+        errors = seen.noise.squared_reprojection(points_c, seen.pixels, CAMERA)
+        assert float(fits(errors).double().mean()) > 0.95

@@ -40,7 +40,7 @@ def disturbed(first: Features, seed: int, flips: int = 30) -> Features:
     """The same features in another order, with some bits flipped (floats: some noise)."""
     g = torch.Generator().manual_seed(seed)
     order = torch.randperm(first.mask.shape[1], generator=g)
-    second = Features(*(getattr(first, name)[:, order] for name in first.__dataclass_fields__))
+    second = first.rows(order)
     d = second.descriptors
     if d.dtype == torch.uint8:
         noise = torch.rand(*d.shape, 8, generator=g) < flips / 256
@@ -155,7 +155,7 @@ def test_many_columns_need_wider_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = match(first, second, max_distance=None)
     # The last of 9000 keypoints has the index that would not fit.
     far = 9000
-    grown = Features(*(t.repeat(1, far // 50, *[1] * (t.dim() - 2)) for t in vars(second).values()))
+    grown = second.rows(torch.arange(far) % 50)
     mask = torch.zeros_like(grown.mask)
     mask[:, -50:] = second.mask
     matches = match(first, replace(grown, mask=mask), max_distance=None)

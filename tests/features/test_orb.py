@@ -43,7 +43,8 @@ def distances(first: Tensor, second: Tensor) -> Tensor:
 
 
 def same(first: Features, second: Features) -> bool:
-    return all(torch.equal(getattr(first, f.name), getattr(second, f.name)) for f in fields(Features))
+    columns = ((getattr(first, f.name), getattr(second, f.name)) for f in fields(Features))
+    return all(one is other if one is None else torch.equal(one, other) for one, other in columns)
 
 
 @EXTRACTORS

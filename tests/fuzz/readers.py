@@ -26,7 +26,7 @@ from torchslam.data.image_file import read_colour, read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
-from torchslam.front_end import simulated_extractor
+from torchslam.front_end import Simulated
 from torchslam.output.results import read_results
 from torchslam.output.view import page
 from torchslam.session import Session
@@ -177,11 +177,11 @@ def _map(root: Path) -> None:
 
 
 def _checkpoint(root: Path) -> None:
-    eyes = simulated_extractor(CONFIG, WALK.camera, T_cw(WALK))
-    slam, so_far = read_checkpoint(root / "checkpoint.safetensors", WALK, CONFIG, extractor=eyes)
+    seen = Simulated(CONFIG, WALK.camera, T_cw(WALK)).of(WALK)
+    slam, so_far = read_checkpoint(root / "checkpoint.safetensors", WALK, CONFIG)
     assert slam.last_frame is not None
     if so_far.next < len(WALK):
-        slam.step(WALK[so_far.next])
+        slam.step(seen[so_far.next])
 
 
 def _graph(root: Path) -> object:

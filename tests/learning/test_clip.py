@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,7 +37,7 @@ class BentEyes(nn.Module):
             noise_px=noise_px,
         )
         frames = [scene(pose, index) for index, pose in enumerate(poses)]
-        self.exact = Features(*(torch.cat([getattr(f, c.name) for f in frames]) for c in fields(Features)))
+        self.exact = Features.cat(frames)
 
     def forward(self, images: Tensor) -> Features:
         away = self.exact.keypoints - self.exact.keypoints.new_tensor([159.5, 119.5])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -83,7 +83,7 @@ def simulated(poses: Tensor, near: float = 50.0, far: float = 70.0) -> Features:
         poses, camera, num_keypoints=300, points_per_view=300, depth_near=near, depth_far=far, noise_px=0.0
     )
     frames = [scene(pose, index) for index, pose in enumerate(poses)]
-    return Features(*(torch.cat([getattr(f, c.name) for f in frames]) for c in fields(Features)))
+    return Features.cat(frames)
 
 
 @pytest.mark.parametrize("depths", [(50.0, 70.0), (30.0, 90.0)])

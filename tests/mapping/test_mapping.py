@@ -12,16 +12,18 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.front_end import simulated_extractor
-from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.front_end import Simulated
+from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
 from torchslam.mapping.mapper import Mapper, world_scale
-from torchslam.mapping.new_points import FreeKeypoints, has_consistent_scale, match_along_epipolar_lines
+from torchslam.mapping.new_points import has_consistent_scale
 from torchslam.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
+from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Start, View
 from torchslam.world.map import NO_POINT, Map
@@ -36,13 +38,15 @@ OVERRIDES = [
 ]
 CONFIG = load_config(None, OVERRIDES)
 WALK = Walk(arc(30))
+EYES = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
+SEEN = EYES.of(WALK)
 
 
 @pytest.fixture(scope="module")
 def slam_after_20() -> SLAM:
-    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    slam = SLAM(WALK.camera, CONFIG)
     for i in range(20):
-        slam.step(WALK[i])
+        slam.step(SEEN[i])
     return slam
 
 
@@ -53,8 +57,7 @@ def slam(slam_after_20: SLAM) -> SLAM:
 
 
 def view_of(slam: SLAM, index: int) -> View:
-    assert slam.extractor is not None
-    return View.of(WALK[index], slam.extractor(WALK[index]), WALK.camera.params.double())
+    return View.of(WALK[index], EYES(WALK[index]), WALK.camera.params.double())
 
 
 def walk_from_start(slam: SLAM, index: int) -> torch.Tensor:
@@ -84,10 +87,12 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     near = project_points(
         slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
-    ids, keypoints = match_near(slam.map, near, view, 1.0, CONFIG.matching, ratio=0.9)
+    pairs = match_near(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
+    ids, keypoints = pairs.first, pairs.second
     assert len(ids) > 150
     assert len(torch.unique(keypoints)) == len(keypoints)
-    anywhere_ids, anywhere_keypoints = match_points(slam.map, near.ids, view, CONFIG.matching)
+    pairs = match_points(slam.map, near.ids, view, CONFIG.matching)
+    anywhere_ids, anywhere_keypoints = pairs.first, pairs.second
     both = dict(zip(anywhere_ids.tolist(), anywhere_keypoints.tolist(), strict=True))
     assert all(both.get(i, k) == k for i, k in zip(ids.tolist(), keypoints.tolist(), strict=True))
 
@@ -112,7 +117,7 @@ def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
 def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
     anywhere = match_points(slam.map, slam.map.living_points(), view, CONFIG.matching)
-    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere[0][:0])
+    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
     slam.tracker.start_at(slam.world, view, tracked)
@@ -194,12 +199,15 @@ def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
 def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
     one, two = (
         FreeKeypoints(
-            view.features, torch.arange(len(view.mask))[None], slam.camera.normalize(view.keypoints)[None]
+            view.features,
+            torch.arange(len(view.mask))[None],
+            slam.camera.normalize(view.keypoints)[None],
+            Noise(view.scales[None], view.information[None]),
         )
         for view in (view_of(slam, i) for i in (4, 9))
     )
     T_21 = walk_from_start(slam, 9) @ se3_inverse(walk_from_start(slam, 4))
-    _, first, second = match_along_epipolar_lines(one, two, T_21[None], slam.camera, 1.0, CONFIG.matching)
+    _, first, second = match_along_epipolar_lines(one, two, T_21[None], slam.camera, 1.0, 64.0)
     assert len(first) > 50
     assert torch.equal(one.features.descriptors[0, first], two.features.descriptors[0, second])
 
@@ -217,7 +225,7 @@ def test_scale_consistency() -> None:
 
 
 def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[Start | None, str]:
-    extract = simulated_extractor(config, walk.camera, true_T_cw(walk))
+    extract = Simulated(config, walk.camera, true_T_cw(walk))
     initializer = Initializer(walk.camera, config)
     for i in indices:
         result = initializer.step(View.of(walk[i], extract(walk[i]), walk.camera.params.double()))
@@ -282,7 +290,7 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
 def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
     start, _ = start_of((0, 5), WALK, CONFIG)
     assert start is not None
-    slam = SLAM(WALK.camera, CONFIG, simulated_extractor(CONFIG, WALK.camera, true_T_cw(WALK)))
+    slam = SLAM(WALK.camera, CONFIG)
     slam_map = Map()
     first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
     seen = [slam_map.points_seen_by(torch.tensor([k])) for k in (first, second)]

@@ -11,16 +11,11 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
-from torchslam.geometry import se3_inverse, so3_exp, transform, triangulation_covariance
-from torchslam.mapping.new_points import (
-    FreeKeypoints,
-    around,
-    has_baseline,
-    has_consistent_scale,
-    match_along_epipolar_lines,
-    triangulate_against,
-)
-from torchslam.values import Features, View
+from torchslam.geometry import Noise, se3_inverse, so3_exp, transform, triangulation_covariance
+from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
+from torchslam.tracking.epipolar import FreeKeypoints, around, match_along_epipolar_lines
+from torchslam.tracking.matcher import max_distance
+from torchslam.values import View
 from torchslam.world.map import Map
 
 SCENE = Scene.of(300)
@@ -172,8 +167,9 @@ ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
 
 def free(view: View, rows: Tensor) -> FreeKeypoints:
     """Some keypoints (n,) of a view."""
-    features = Features(*(x[:, rows] for x in vars(view.features).values()))
-    return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints))
+    features = view.features.rows(rows)
+    noise = Noise(view.scales[rows][None], view.information[rows][None])
+    return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints), noise)
 
 
 def matched(
@@ -182,7 +178,7 @@ def matched(
     """(m,), (m,) keypoints among some rows of two views that match."""
     one, two = (free(view, some) for view, some in zip(views, rows, strict=True))
     which, at_1, at_2 = match_along_epipolar_lines(
-        one, two, T_21[None], CAMERA, epipolar_px, MatchingConfig()
+        one, two, T_21[None], CAMERA, epipolar_px, max_distance(one.features.descriptors, MatchingConfig())
     )
     assert not which.any()
     return one.rows[0, at_1], two.rows[0, at_2]

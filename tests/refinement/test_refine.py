@@ -17,7 +17,7 @@ from torchslam.data.given_poses import GivenPoses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
-from torchslam.front_end import Extractor, simulated_extractor
+from torchslam.front_end import Simulated
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.refinement import CameraChoice, Refined, refine
 from torchslam.values import State, Trajectory
@@ -40,8 +40,8 @@ def config(*overrides: str) -> Config:
     )
 
 
-def extractor(settings: Config) -> Extractor:
-    return simulated_extractor(settings, WALK.camera, TRUE)
+def seen(settings: Config, walk: Sequence | None = None) -> Sequence:
+    return Simulated(settings, WALK.camera, TRUE).of(walk or WALK)
 
 
 def disturbed(T_cw: Tensor, centimetres: float = 3.0, degrees: float = 2.0) -> Trajectory:
@@ -73,7 +73,7 @@ def errors(refined: Refined, truth: Trajectory) -> tuple[float, float]:
 def exact() -> Refined:
     """Exact features; poses 3 cm and 2 degrees off, the focal length 5 %."""
     settings = config()
-    return refine(with_focal(WALK, 1.05), disturbed(TRUE), settings, extractor=extractor(settings))
+    return refine(with_focal(seen(settings), 1.05), disturbed(TRUE), settings)
 
 
 def test_exact_features_give_the_true_poses(exact: Refined) -> None:
@@ -103,8 +103,7 @@ def test_noise_is_averaged_and_said() -> None:
     settings = config("simulated.noise_px=0.3", "simulated.outliers=0.1")
     given = disturbed(TRUE)
     found = [
-        refine(with_focal(WALK, 0.95), given, settings, CameraChoice.FREE, extractor=extractor(settings)).run
-        for _ in range(2)
+        refine(with_focal(seen(settings), 0.95), given, settings, CameraChoice.FREE).run for _ in range(2)
     ]
     assert torch.equal(found[0].trajectory.T_wc, found[1].trajectory.T_wc)
     before = evaluate(given, WALK.groundtruth).ate_m
@@ -119,7 +118,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
     T_wc = S @ WALK.groundtruth.T_wc if WALK.groundtruth is not None else S
     T_wc[:, :3, 3] *= 3.28
     given = Trajectory(WALK.timestamps, T_wc)
-    found = refine(WALK, given, settings, CameraChoice.FIXED, extractor=extractor(settings))
+    found = refine(seen(settings), given, settings, CameraChoice.FIXED)
     assert found.camera is None
     ate, angle = errors(found, given)
     assert ate < 2e-3
@@ -129,7 +128,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
 def test_a_right_camera_stays() -> None:
     """The images do not contradict it, so not a bit of it changes; freed, it comes out as good as the same."""
     settings = config("simulated.noise_px=0.3")
-    judged = refine(WALK, disturbed(TRUE), settings, extractor=extractor(settings))
+    judged = refine(seen(settings), disturbed(TRUE), settings)
     assert torch.equal(judged.run.camera.params, WALK.camera.params.double())
     assert judged.rounds == 1
     assert judged.camera is not None
@@ -142,14 +141,14 @@ def test_frames_and_poses_that_have_no_partner() -> None:
     T_wc = se3_inverse(TRUE)
     times = torch.cat([WALK.timestamps[:10], WALK.timestamps[-1:] + 5])
     given = Trajectory(times, torch.cat([T_wc[:10], T_wc[:1]]))
-    found = refine(WALK, given, settings, CameraChoice.FIXED, extractor=extractor(settings))
+    found = refine(seen(settings), given, settings, CameraChoice.FIXED)
     assert (found.without_pose, found.without_image) == (4, 1)
     assert len(found.run.trajectory) == 10
     torch.testing.assert_close(found.run.trajectory.timestamps, WALK.timestamps[:10])
     with pytest.raises(TrajectoryError, match="are not those of the images"):
-        refine(WALK, Trajectory(WALK.timestamps + 100, T_wc), settings, extractor=extractor(settings))
+        refine(seen(settings), Trajectory(WALK.timestamps + 100, T_wc), settings)
     with pytest.raises(TrajectoryError, match="without poses"):
-        refine(WALK, Trajectory.empty(), settings, extractor=extractor(settings))
+        refine(seen(settings), Trajectory.empty(), settings)
 
 
 def test_images_that_make_no_map() -> None:
@@ -160,17 +159,14 @@ def test_images_that_make_no_map() -> None:
     assert len(found.run.trajectory) == 0
     assert [result.state for result in found.run.results] == [State.LOST] * 4
     one = GivenPoses("tum", Path("one.txt"), TRUE[:1], WALK.timestamps[:1])
-    assert (
-        refine(WALK, one, settings, extractor=extractor(settings)).run.failure
-        == "no map: 1 images with a pose are too few"
-    )
+    assert refine(seen(settings), one, settings).run.failure == "no map: 1 images with a pose are too few"
 
 
 def test_devices(device: torch.device) -> None:
     """All of it works where it is asked to, and comes to the same."""
     settings = config()
     walk = WALK.part(0, 6)
-    found = refine(walk, _first(6), settings, device=device, extractor=extractor(settings))
+    found = refine(seen(settings, walk), _first(6), settings, device=device)
     assert found.run.map.T_cw.device.type == device.type
     assert len(found.run.trajectory) == 6
 

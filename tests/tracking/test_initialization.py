@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, pose
 from torchslam.config import InitializationConfig, load_config
-from torchslam.geometry import Triangulation, transform
+from torchslam.geometry import Noise, Triangulation, transform
 from torchslam.tracking.initialization import Initializer, is_good, refine_pair, why_not
 from torchslam.values import Start, View
 
@@ -226,26 +227,23 @@ def seen(angles: list[float], errors: float = 0.0, mask: bool = True) -> Triangu
     )
 
 
+def good(angles: list[float], sigma: float = 1.0, off: float = 0.0, **rest: Any) -> list[bool]:
+    """Which points are good that are seen under angles, off by a multiple of the noise."""
+    triangulated, settings = seen(angles, mask=rest.pop("mask", True)), InitializationConfig(**rest)
+    ones = torch.ones(len(angles), dtype=torch.float64)
+    return is_good(triangulated, off**2 * ones, sigma * ones, CAMERA, settings).tolist()
+
+
 def test_a_point_is_good_when_its_depth_is_known_to_a_tenth() -> None:
-    settings = InitializationConfig()
-    ones = torch.ones(2, dtype=torch.float64)
-    assert is_good(seen([0.0501, 0.0499]), ones, CAMERA, settings).tolist() == [
-        True,
-        False,
-    ]  # 1 / (200 * 0.05)
-    assert is_good(seen([0.1002, 0.0998]), 2 * ones, CAMERA, settings).tolist() == [True, False]
-    assert is_good(seen([0.0, 1.0], mask=False), ones, CAMERA, settings).tolist() == [False, False]
-    for errors, good in ((2.99, True), (3.01, False)):
-        assert is_good(seen([1.0, 1.0], errors), ones, CAMERA, settings).tolist() == [good, good]
-    other = replace(seen([1.0]), errors_1=torch.tensor([6.02]).double())
-    assert not is_good(other, 2 * ones[:1], CAMERA, settings)
-    assert is_good(seen([1.0], 5.98), 2 * ones[:1], CAMERA, settings)
+    assert good([0.0501, 0.0499]) == [True, False]  # 1 / (200 * 0.05)
+    assert good([0.1002, 0.0998], sigma=2.0) == [True, False]
+    assert good([0.0, 1.0], mask=False) == [False, False]
+    assert good([1.0, 1.0], off=2.99) == [True, True]
+    assert good([1.0, 1.0], off=3.01) == [False, False]
 
 
 def test_by_parallax_a_point_is_good_from_an_angle_on() -> None:
-    settings = replace(InitializationConfig(), criterion="parallax")
-    angles = [math.radians(3.01), math.radians(2.99)]
-    assert is_good(seen(angles), torch.ones(2).double(), CAMERA, settings).tolist() == [True, False]
+    assert good([math.radians(3.01), math.radians(2.99)], criterion="parallax") == [True, False]
 
 
 def reason_for(count: int, total: int, matches: int, share: float = 0.15, **changes: object) -> str:
@@ -280,7 +278,7 @@ def refined(scales: Tensor, off: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Refinement from the truth, in units of twice the baseline, with pixels of the second view off by (n, 2)."""
     points_w = SCENE.points_w[:200]
     pixels = [CAMERA.project(transform(T, points_w))[0] for T in (pose(), SIDE)]
-    return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, scales, CAMERA)
+    return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, Noise.of(scales, None), CAMERA)
 
 
 def test_a_pair_that_is_right_stays_as_it_is() -> None:

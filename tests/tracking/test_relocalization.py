@@ -92,7 +92,8 @@ def test_a_keyframe_matches_by_its_own_descriptors() -> None:
     right, _ = worlds()
     right.map.points["descriptors"][:] = 0  # of other observations
     view = SCENE.view(50, ANYWHERE)
-    points, keypoints = match_keyframe(right.map, 2, view, relocalizer().matching)
+    pairs = match_keyframe(right.map, 2, view, relocalizer().tracker.matcher)
+    points, keypoints = pairs.first, pairs.second
     assert len(points) > 150
     assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
     assert set(points.tolist()) <= set(right.map.points_seen_by(torch.tensor([2])).tolist())
@@ -102,10 +103,11 @@ def test_points_match_by_descriptor_wherever_they_are() -> None:
     right, _ = worlds()
     view = SCENE.view(50, ANYWHERE)
     ids = right.map.living_points().flip(0)
-    points, keypoints = match_points(right.map, ids, view, relocalizer().matching)
+    pairs = match_points(right.map, ids, view, relocalizer().tracker.matching)
+    points, keypoints = pairs.first, pairs.second
     assert len(points) > 150
     assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
-    assert len(match_points(right.map, ids[:0], view, relocalizer().matching)[0]) == 0
+    assert len(match_points(right.map, ids[:0], view, relocalizer().tracker.matching).first) == 0
 
 
 def test_thresholds_of_bits_and_of_floats() -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
-from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
 from torchslam.tracking.spread import (
     CELLS,
@@ -285,10 +285,10 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
     off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
     scales = torch.full((len(seen),), scale, dtype=torch.float64)
-    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, scales).all()) is agrees
-    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, scales).any()) is agrees
+    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None)).all()) is agrees
+    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None)).any()) is agrees
     wide = tracker("measurement.chi_square=24")
-    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, scales).all()
+    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, Noise.of(scales, None)).all()
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
@@ -308,7 +308,7 @@ def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: 
     for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
         off = torch.zeros(2, dtype=torch.float64)
         off[axis] = offset * sigma * math.sqrt(5.991)
-        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, scales)
+        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
         assert agreeing.all() if agrees else not agreeing.any()
 
 
@@ -320,7 +320,9 @@ def test_points_behind_the_camera_agree_with_nothing() -> None:
     here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
     for gate in ("chi_square", "mahalanobis"):
         by = tracker(f"measurement.gate={gate}")
-        assert not by.agrees(here.map, T_cw, seen, middle, torch.ones(len(seen), dtype=torch.float64)).any()
+        assert not by.agrees(
+            here.map, T_cw, seen, middle, Noise.of(torch.ones(len(seen), dtype=torch.float64), None)
+        ).any()
 
 
 def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
@@ -332,7 +334,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     coarse = torch.arange(len(seen)) % 2 == 1
     scales = torch.where(coarse, 4.0, 1.0).double()
     shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, scales)
+    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, Noise.of(scales, None))
     assert agrees.all()
     fitted = CAMERA.project(transform(refined.T_cw[0], here.map.positions_w[seen]))[0]
     assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
@@ -349,7 +351,7 @@ def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
     wrong = torch.arange(len(seen)) < len(seen) // 4
     for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
         shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, scales)
+        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, Noise.of(scales, None))
         assert torch.equal(agrees, ~wrong)
         torch.testing.assert_close(refined.T_cw[0], T_cw, atol=exact, rtol=0)
 

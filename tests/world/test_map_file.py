@@ -83,11 +83,27 @@ def test_a_file_from_before_there_were_colours_is_read(path: Path, worlds: list[
     with safe_open(path, framework="pt") as file:
         about = json.loads(file.metadata()["torchslam"])
     del tensors["worlds.0.points.colors"]
+    for name in [name for name in tensors if name.endswith(".information")]:
+        del tensors[name]
     save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 3})})
     loaded, _ = read_map(path)
     assert torch.equal(loaded.positions_w, worlds[0].map.positions_w)
     assert loaded.points["colors"].shape == (len(loaded.points), 3)
     assert not loaded.points["colors"].any()
+    assert loaded.keyframes["information"].shape == (*loaded.keyframes["scales"].shape, 0)
+
+
+def test_a_file_from_before_there_was_information_is_read(path: Path, worlds: list[World]) -> None:
+    """As it was, and written anew to the same bytes as one of today."""
+    whole, tensors = path.read_bytes(), load_file(path)
+    with safe_open(path, framework="pt") as file:
+        about = json.loads(file.metadata()["torchslam"])
+    for name in [name for name in tensors if name.endswith(".information")]:
+        del tensors[name]
+    save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 4})})
+    saved = read_worlds(path)
+    write_worlds(path, saved.worlds, saved.camera, sessions=2)
+    assert path.read_bytes() == whole
 
 
 def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[World], camera: Camera) -> None:
@@ -150,8 +166,8 @@ def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
         ({"torchslam": "format 4"}, "not a torchslam map"),
         ({"torchslam": "[3]"}, "not a torchslam map"),
         ({"torchslam": '{"size": 3}'}, "not a torchslam map"),
-        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 4"),
-        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 4"),
+        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 5"),
+        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 5"),
     ],
 )
 def test_other_programs_and_formats_are_refused(

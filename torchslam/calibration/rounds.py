@@ -15,7 +15,7 @@ import torch
 from torchslam.calibration.refinement import Refinement, refine
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.front_end import Extractor, image_extractor
+from torchslam.front_end import Extractor, FrontEnd, WithFeatures, image_extractor
 from torchslam.geometry import Camera
 from torchslam.run import Run
 from torchslam.slam import SLAM
@@ -79,7 +79,7 @@ class FoundCamera:
 
 
 class Remembered:
-    """An extractor that reads every image once: features do not depend on the camera."""
+    """An extractor that looks at every image once: features do not depend on the camera."""
 
     def __init__(self, extractor: Extractor) -> None:
         self.extractor = extractor
@@ -97,24 +97,28 @@ def calibrate(
     radial: int = 2,
     guess: bool = True,
     device: torch.device | str = "cpu",
-    extractor: Extractor | None = None,
+    extractor: FrontEnd | None = None,
     told: Callable[[Round], None] | None = None,
 ) -> FoundCamera:
     """Find the camera of a sequence, started at the one it has.
 
     radial: how many coefficients of the distortion may be fitted, where the residuals ask for them
     guess:  the sequence's camera is a guess: other focal lengths are tried, and its principal point may move
-    extractor: the configured one if None
+    extractor: front end, the configured one if None
     told:   of every round
 
     Raises KeyboardInterrupt where that ends a run.
     """
-    extractor = Remembered(extractor or image_extractor(config, device))
+    remembered = None
+    if not sequence.brings_features:
+        remembered = Remembered(image_extractor(config, device, extractor))
     rounds: list[Round] = []
     start = sequence.camera.to(torch.float64).to(device)
 
     def one(camera: Camera, frames: int) -> Round:
-        run = SLAM(camera, config, extractor).run(sequence.part(stop=frames))
+        part = sequence.part(stop=frames)
+        looked = part if remembered is None else WithFeatures(part, remembered)
+        run = SLAM(camera, config, extractor).run(looked)
         if run.interrupted:
             raise KeyboardInterrupt
         refined = None if run.failure else refine(run.graph, start, radial, guess)

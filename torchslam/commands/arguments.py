@@ -78,8 +78,17 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         metavar="SECTION.KEY=VALUE",
         help="change one setting, for example features.num_keypoints=2000; may be repeated",
     )
-    parser.add_argument("--features", choices=CHOICES["features.kind"], help="front end (features.kind)")
+    parser.add_argument(
+        "--features",
+        metavar="NAME",
+        help=f"front end (features.kind): {', '.join(CHOICES['features.kind'])}, a registered name, or PACKAGE:NAME",
+    )
     parser.add_argument("--weights", metavar="FILE", help="weights of a learned front end (features.weights)")
+    parser.add_argument(
+        "--matcher",
+        metavar="NAME",
+        help="matcher (matching.matcher): descriptors, a registered name, or PACKAGE:NAME",
+    )
     parser.add_argument("--scale", choices=CHOICES["scale"], help="length of a map unit (scale)")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of all random choices (seed)")
 
@@ -89,6 +98,7 @@ def config(options: argparse.Namespace) -> Config:
     named = {
         "features.kind": options.features,
         "features.weights": options.weights,
+        "matching.matcher": options.matcher,
         "scale": options.scale,
         "seed": options.seed,
     }

@@ -33,6 +33,7 @@ from torchslam.errors import ConfigError, ResultsError, TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate
 from torchslam.export.colours import paint
 from torchslam.export.recording import import_rerun
+from torchslam.front_end import source
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
 from torchslam.output.report import doubts, metrics, summary, table
@@ -167,6 +168,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     prepare(plan.output, plan.overwrite, plan.resume)
     sequence, found = _with_camera(sequence, config, plan)
     slam, so_far = _begin(sequence, config, plan)
+    sequence = source(sequence, config, slam.camera)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
     processes = 1 if plan.view or plan.video else plan.processes  # images are wanted here, not elsewhere
     with Stopping() as stopping, _watching(slam, sequence, plan) as watching:

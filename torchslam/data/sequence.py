@@ -15,7 +15,7 @@ from torchslam.data.association import interpolate_poses
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
-from torchslam.values import Frame, Trajectory
+from torchslam.values import Features, Frame, Trajectory
 
 GROUNDTRUTH_TOLERANCE = 0.02
 """Seconds between an image and the nearest ground-truth pose beyond which the image counts as without one."""
@@ -134,6 +134,15 @@ class Sequence(ABC):
         """(1, 1, H, W) bool, True where features may be found in frame `index`; None: everywhere."""
         return None
 
+    @property
+    def brings_features(self) -> bool:
+        """Whether its frames bring their features: then nobody looks at the images."""
+        return False
+
+    def features(self, index: int) -> Features | None:
+        """Those of frame `index`, a batch of one, where the sequence brings them."""
+        return None
+
     def timestamp(self, index: int) -> float:
         """Seconds of frame `index`; of a live source, of the frame that `image` gave."""
         return float(self.timestamps[index])
@@ -156,6 +165,7 @@ class Sequence(ABC):
             name=self.image_name(index),
             T_cw_groundtruth=self.pose(index),
             mask=self.mask(index),
+            features=self.features(index),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -252,6 +262,7 @@ class Transformed(Sequence):
         )
         self._whole = whole
         self._indices = indices
+        self._same_pixels = camera is None and size in (None, whole.size)
 
     def __len__(self) -> int:
         return len(self._whole) if self._indices is None else len(self._indices)
@@ -275,6 +286,13 @@ class Transformed(Sequence):
 
     def mask(self, index: int) -> Tensor | None:
         return self._whole.mask(self._at(index))
+
+    @property
+    def brings_features(self) -> bool:
+        return self._same_pixels and self._whole.brings_features
+
+    def features(self, index: int) -> Features | None:
+        return self._whole.features(self._at(index)) if self._same_pixels else None
 
     def timestamp(self, index: int) -> float:
         return self._whole.timestamp(self._at(index))

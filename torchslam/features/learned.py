@@ -1,14 +1,13 @@
 """Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
 
-The networks are kornia's. Descriptors are floats of unit length, angles are 0. The networks have a single scale; it is
-given as 2 pixels, because scales stand for the standard deviation of keypoints: XFeat's are better than that, but taken
-for 1 pixel, clips come out worse (`experiments/learn_features/clip_noise.md`).
+The networks are kornia's. Descriptors are floats of unit length, angles are 0. The networks have a single scale, 2
+pixels, which is what searches take for the size of a keypoint. What is known of its error is its information, with the
+noise as measured on real sequences (`experiments/front_ends/noise.py`).
 Keypoints, scores and descriptors carry gradients to the weights.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import torch
@@ -26,6 +25,9 @@ from torchslam.values import Features
 
 MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0
+XFEAT_NOISE, ALIKED_NOISE = 1.0, 0.7
+"""Pixels of the image that the network sees, by what whole runs on real sequences leave of its errors: XFeat has 1.03
+to 1.35, of which the least is taken (with 1.2 the start is refused on a short sequence), ALIKED 0.5 to 0.8."""
 
 
 class XFeat(nn.Module):
@@ -90,7 +92,8 @@ class XFeat(nn.Module):
         descriptors = F.normalize(sampled[:, :, 0].mT, dim=-1)
         ratio = positions.new_tensor([width / inner[1], height / inner[0]])
         keypoints = (positions + 0.5) * ratio - 0.5
-        return _features(keypoints, ranked.gather(1, best.indices), descriptors, mask, self.num_keypoints)
+        scores = ranked.gather(1, best.indices)
+        return _features(keypoints, scores, descriptors, mask, self.num_keypoints, XFEAT_NOISE)
 
 
 class ALIKED(nn.Module):
@@ -133,24 +136,26 @@ class ALIKED(nn.Module):
                 one.descriptors[None],
                 torch.ones_like(one.keypoint_scores[None], dtype=torch.bool),
                 self.num_keypoints,
+                ALIKED_NOISE,
             )
             for one in found
         ]
-        features = Features(*(torch.cat([getattr(row, f.name) for row in rows]) for f in fields(Features)))
+        features = Features.cat(rows)
         return features if wanted is None else only_where(features, wanted)
 
 
-def _features(keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int) -> Features:
-    """Features padded to `count` rows, zero where masked, with one scale and angle 0."""
+def _features(
+    keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int, noise_px: float
+) -> Features:
+    """Features padded to `count` rows, zero where masked, with one scale, angle 0 and one noise."""
     missing = count - mask.shape[1]
     mask = F.pad(mask, (0, missing))
     scores = F.pad(scores, (0, missing)) * mask
     keypoints, descriptors = (
         F.pad(t, (0, 0, 0, missing)) * mask[..., None] for t in (keypoints, descriptors)
     )
-    return Features(
-        keypoints, scores, torch.full_like(scores, _SCALE), torch.zeros_like(scores), descriptors, mask
-    )
+    scales, information = torch.full_like(scores, _SCALE), torch.full_like(scores, noise_px**-2)
+    return Features(keypoints, scores, scales, torch.zeros_like(scores), descriptors, mask, information)
 
 
 def _read(weights: str | Path) -> dict[str, Tensor]:

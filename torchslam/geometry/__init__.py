@@ -13,6 +13,7 @@ from torchslam.geometry.essential import (
 )
 from torchslam.geometry.gating import (
     CHI_SQUARE_95,
+    Noise,
     fits,
     innovation_covariances,
     mahalanobis_squared,
@@ -66,6 +67,7 @@ __all__ = [
     "AbsolutePose",
     "Camera",
     "MultiViewTriangulation",
+    "Noise",
     "RelativePose",
     "Similarity",
     "Triangulation",

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.whitening import inverse_2x2, whitening
 
 
 @dataclass(frozen=True)
@@ -112,14 +113,16 @@ def triangulation_covariance(
 ) -> Tensor:
     """How well two views, poses taken as exact, determine points: (sum of J^T J / sigma^2)^-1. (..., N, 3, 3).
 
-    points_w: (..., N, 3); sigmas_1, sigmas_2: (..., N) standard deviations of their pixels. Zero where the two views
-    do not determine a point: no parallax, or not in front of both.
+    points_w: (..., N, 3); sigmas_1, sigmas_2: (..., N) standard deviations of their pixels, or (..., N, 2, 2) their
+    covariances. Zero where the two views do not determine a point: no parallax, or not in front of both.
     """
     information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
     determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
     for T_cw, sigmas, camera in ((T_1w, sigmas_1, camera_1), (T_2w, sigmas_2, camera_2)):
         _, valid, J_c, _ = camera.project_with_jacobians(transform(T_cw, points_w))
-        J = J_c @ T_cw[..., None, :3, :3] / sigmas[..., None, None]
+        J = J_c @ T_cw[..., None, :3, :3]
+        is_matrix = sigmas.ndim > 1 and sigmas.shape[-2:] == (2, 2) and sigmas.ndim == points_w.ndim + 1
+        J = whitening(inverse_2x2(sigmas)) @ J if is_matrix else J / sigmas[..., None, None]
         information, determined = information + J.mT @ J, determined & valid
     eye = torch.eye(3, dtype=points_w.dtype, device=points_w.device)
     size = information.detach().diagonal(dim1=-2, dim2=-1).sum(-1)

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torchslam.config import Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, Noise
+from torchslam.geometry.whitening import times
 from torchslam.run import finish
 from torchslam.slam import SLAM
 from torchslam.solvers.graph import GraphSolution, solve
@@ -139,7 +140,8 @@ class ClipSLAM(nn.Module):
                ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; `train` would have their
                normalisation follow the clip.
     weigh:     module or function from Features to (B, N), what each keypoint counts (its score, for instance), not
-               negative: a factor of the inverse variance that its scale suggests. All count alike if None.
+               negative: a factor of its information, which is what the features say, or its scale. All count alike
+               if None.
     config:    of the system; its section on features is not read
     """
 
@@ -225,7 +227,8 @@ class ClipSLAM(nn.Module):
         features = features.to(camera.params.device)
         worth = torch.ones_like(features.scores) if self.weigh is None else self.weigh(features)
         # Zero times all that poses depend on: where there is no pose, there is a gradient all the same.
-        nothing = 0 * (features.keypoints.sum() + worth.sum() + camera.params.sum())
+        nothing = features.keypoints.sum() + worth.sum() + camera.params.sum()
+        nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
         frames = len(features.mask)
         T_cw = torch.eye(4, dtype=torch.float64, device=nothing.device) + nothing.expand(frames, 1, 1)
         posed = torch.zeros(frames, dtype=torch.bool, device=nothing.device)
@@ -233,7 +236,10 @@ class ClipSLAM(nn.Module):
             return ClipPoses(T_cw, posed, posed.any(), ("no map started",), (None,), (None,))
         seen = _still_seen(seen, features.mask)
         rows = (seen.frame_ids[seen.frame_index], seen.keypoint_index)
-        pixels, weights = features.keypoints[rows].double(), seen.weights * worth[rows]
+        pixels, weights = features.keypoints[rows].double(), seen.weights
+        if features.information is not None:
+            weights = Noise.of(features.scales[rows], features.information[rows]).weights.double()
+        weights = times(weights, worth[rows])
         graph = replace(seen, pixels=pixels, weights=weights, camera=camera)
         solution = solve(graph)
         T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
@@ -245,8 +251,11 @@ class ClipSLAM(nn.Module):
     def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
         """What the system makes of the features of one clip; None where no map starts."""
         features = features.to(camera.params.device)
-        slam = SLAM(camera, self.config, lambda frame: features[frame.index : frame.index + 1])
-        frames = [Frame(index, float(index), image[None]) for index, image in enumerate(images)]
+        slam = SLAM(camera, self.config, self.extractor)
+        frames = [
+            Frame(index, float(index), image[None], features=features[index : index + 1])
+            for index, image in enumerate(images)
+        ]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
         return None if run.main is None else run.main.history.graph(run.map, run.camera)
 

@@ -16,17 +16,18 @@ from torchslam.geometry import (
     se3_inverse,
     sim3_inverse,
     sim3_scale,
-    squared_reprojection_errors,
     transform,
 )
 from torchslam.solvers import refine_pose
 from torchslam.tracking.correspondences import match_near, match_views, project_points
+from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.world.map import Map
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity
 _AROUND = 10  # keyframes whose points are looked for in the other map
 _NEEDED = 12  # inliers of the first similarity that are worth a closer look
 _KERNEL_SCALE = 2.0
+WIDER = 2.0  # times the noise: a similarity has its own
 
 
 @dataclass(frozen=True)
@@ -117,18 +118,19 @@ def find(
     view = other.view(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    return match_near(slam_map, near, view, _RADIUS_PX, config.matching, ratio=0.9)
+    pairs = match_near(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
+    return pairs.first, pairs.second
 
 
 def agreeing(
     slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
-    """As `find`, those alone that are seen where they should be, twice the noise allowed for the similarity's."""
+    """As `find`, those alone that are seen where they should be, more noise allowed for that of the similarity."""
     ids, keypoints = find(slam_map, point_ids, T_cw, other, keyframe, camera, config)
     view = other.view(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
-    errors = squared_reprojection_errors(points_c, view.keypoints[keypoints], camera)
-    good = fits(errors, 2 * view.scales[keypoints], config.measurement.chi_square)
+    errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
+    good = fits(errors, WIDER**2 * config.measurement.chi_square)
     return ids[good], keypoints[good]
 
 
@@ -154,8 +156,8 @@ def _first_guess(
         view_2.keypoints[rows_2][None],
         camera,
         camera,
-        view_1.scales[rows_1][None],
-        view_2.scales[rows_2][None],
+        view_1.noise[rows_1].tolerance[None],
+        view_2.noise[rows_2].tolerance[None],
         seed=config.seed,
     )
     if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
@@ -168,16 +170,15 @@ def _refined(
 ) -> tuple[Tensor, Tensor]:
     """(4, 4), (n,): the pose of another map's keyframe by points (n,) it sees at keypoints (n,), and who agrees."""
     view, points_w = other.view(keyframe), slam_map.positions_w[ids]
-    pixels, scales = view.keypoints[keypoints], view.scales[keypoints]
+    pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
     refined = refine_pose(
         T_cw[None],
         points_w[None],
         pixels[None],
         camera,
-        weights=(scales**-2)[None],
+        weights=noise.weights[None],
         kernel="cauchy",
         scale=_KERNEL_SCALE,
         backward="detached",
     ).T_cw[0]
-    errors = squared_reprojection_errors(transform(refined, points_w), pixels, camera)
-    return refined, fits(errors, scales)
+    return refined, fits(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

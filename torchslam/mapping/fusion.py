@@ -8,7 +8,8 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, fits
-from torchslam.tracking.correspondences import look_at, max_distance
+from torchslam.tracking.correspondences import look_at
+from torchslam.tracking.matcher import max_distance
 from torchslam.world.map import Map
 
 RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
@@ -50,8 +51,10 @@ def find_in(
     )
     which, row = torch.nonzero(matches.mask, as_tuple=True)
     ids, keyframe, keypoint = point_ids[row], keyframes[which], matches.indices_2[which, row]
-    errors = (pixels[which, row] - table["keypoints"][keyframe, keypoint]).square().sum(-1)
-    agrees = fits(errors, table["scales"][keyframe, keypoint], config.measurement.chi_square)
+    errors = slam_map.noise(keyframe, keypoint).squared(
+        pixels[which, row] - table["keypoints"][keyframe, keypoint]
+    )
+    agrees = fits(errors, config.measurement.chi_square)
     ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
     taken = table["point_ids"][keyframe, keypoint]
     is_free = taken < 0

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import BundleConfig
-from torchslam.geometry import CHI_SQUARE_95, Camera, fits, squared_reprojection_errors, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.solvers.schur import Marginals
@@ -115,7 +115,7 @@ def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part 
         point_index,
         seen.pixels,
         camera,
-        weights=seen.scales**-2,
+        weights=seen.noise.weights,
         fixed_frames=torch.isin(keyframes, fixed),
     )
     return Part(keyframes, point_ids, seen, problem)
@@ -158,7 +158,7 @@ def take(slam_map: Map, part: Part, adjusted: Adjusted, camera: Camera) -> None:
 def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    wrong = ~fits(squared_reprojection_errors(points_c[:, 0], seen.pixels, camera), seen.scales)
+    wrong = ~fits(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
     slam_map.drop(seen, wrong)
 
 

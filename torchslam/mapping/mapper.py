@@ -12,6 +12,7 @@ from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
+from torchslam.tracking.matcher import Matcher
 from torchslam.values import Start, Tracked, View
 from torchslam.world.compaction import Renumbering, compact
 from torchslam.world.map import Map
@@ -23,11 +24,14 @@ YOUNG = 3  # keyframes after its own for which a point is on trial
 class Mapper:
     """Grows the map, keyframe by keyframe."""
 
-    def __init__(self, camera: Camera, config: Config, clock: Stopwatch) -> None:
+    def __init__(
+        self, camera: Camera, config: Config, clock: Stopwatch, matcher: Matcher | None = None
+    ) -> None:
         self.camera = camera
         self.config = config
         self.clock = clock
         self.adjusting = Adjusting(camera, config.bundle, config.measurement.gate == "mahalanobis")
+        self.matcher = matcher
 
     def start(self, slam_map: Map, start: Start) -> tuple[int, int]:
         """Make the first map of two views, at the configured scale; returns the two keyframes."""
@@ -36,8 +40,9 @@ class Mapper:
         T_cw[:3, 3] *= factor
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         points_w, camera = start.points_w * factor, self.camera
-        scales_1, scales_2 = start.reference.scales[start.keypoints_1], start.view.scales[start.keypoints_2]
-        covariances_w = triangulation_covariance(T_1w, T_cw, points_w, scales_1, scales_2, camera, camera)
+        spread_1 = start.reference.noise[start.keypoints_1].spread
+        spread_2 = start.view.noise[start.keypoints_2].spread
+        covariances_w = triangulation_covariance(T_1w, T_cw, points_w, spread_1, spread_2, camera, camera)
         first = slam_map.add_keyframe(start.reference, T_1w)
         second = slam_map.add_keyframe(start.view, T_cw)
         descriptors = start.view.descriptors[start.keypoints_2]
@@ -54,7 +59,7 @@ class Mapper:
         """
         settings = self.config.mapping
         with self.clock("mapping"):
-            keyframe = slam_map.add_keyframe(view, tracked.T_cw)
+            keyframe = slam_map.add_keyframe(view.weighed(tracked.keypoints, tracked.weights), tracked.T_cw)
             slam_map.observe(keyframe, tracked.keypoints, tracked.point_ids)
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
@@ -62,7 +67,7 @@ class Mapper:
             last = range(keyframe - 1, max(keyframe - 1 - settings.neighbours, -1), -1)
             partners = neighbours if settings.partners == "covisible" else slam_map.ids(*last)
             partners = partners[: settings.neighbours]
-            triangulate_against(slam_map, keyframe, partners, self.camera, self.config)
+            triangulate_against(slam_map, keyframe, partners, self.camera, self.config, self.matcher)
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchslam.config import Config, MatchingConfig
-from torchslam.features import expand_runs, match_pairs
+from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     fits,
@@ -19,41 +17,26 @@ from torchslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from torchslam.tracking.correspondences import max_distance
-from torchslam.values import Features
+from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, matched, max_distance
+from torchslam.values import View
 from torchslam.world.map import NO_POINT, Map
 from torchslam.world.observers import first_of_each
 
 
-@dataclass(frozen=True)
-class FreeKeypoints:
-    """The keypoints of k keyframes that see no point yet; where one has fewer than others, rows are masked out.
-
-    features: (k, n, ...); rows: (k, n) of the keyframes' keypoints; normalized: (k, n, 2) undistorted
-    """
-
-    features: Features
-    rows: Tensor
-    normalized: Tensor
-
-    @classmethod
-    def of(cls, slam_map: Map, keyframes: Tensor, camera: Camera) -> FreeKeypoints:
-        """Those of keyframes (k,)."""
-        table = slam_map.keyframes
-        free = table["mask"][keyframes] & (table["point_ids"][keyframes] == NO_POINT)
-        free, rows = torch.sort(free, dim=1, descending=True, stable=True)
-        free = free[:, : int(free.sum(1).max())]
-        rows = rows[:, : free.shape[1]]
-        features = replace(slam_map.features(keyframes, rows), mask=free)
-        return cls(features, rows, camera.normalize(features.keypoints))
-
-
 def triangulate_against(
-    slam_map: Map, keyframe: int, neighbours: Tensor, camera: Camera, config: Config
+    slam_map: Map,
+    keyframe: int,
+    neighbours: Tensor,
+    camera: Camera,
+    config: Config,
+    matcher: Matcher | None = None,
 ) -> None:
     """Add the points that a keyframe and neighbours (k,) see with enough parallax and that the map does not have yet.
 
     Of several neighbours with which a keypoint makes a point the first one counts.
+
+    matcher: one of one's own; along epipolar lines, by descriptors, if None
     """
     settings, limit = config.mapping, config.measurement.chi_square
     neighbours = neighbours[has_baseline(slam_map, keyframe, neighbours, settings.min_baseline)]
@@ -62,16 +45,27 @@ def triangulate_against(
     here = FreeKeypoints.of(slam_map, slam_map.ids(keyframe), camera)
     there = FreeKeypoints.of(slam_map, neighbours, camera)
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours]
-    which, at_1, at_2 = match_along_epipolar_lines(
-        here, there, T_2w @ se3_inverse(T_1w), camera, settings.epipolar_px, config.matching
-    )
+    T_21, weights = T_2w @ se3_inverse(T_1w), None
+    if matcher is None or isinstance(matcher, DescriptorMatcher):
+        limit_of = max_distance(here.features.descriptors, config.matching)
+        which, at_1, at_2 = match_along_epipolar_lines(
+            here, there, T_21, camera, settings.epipolar_px, limit_of
+        )
+    else:
+        views = [free_view(slam_map, row) for row in (keyframe, *neighbours.tolist())]
+        prior = Prior(T_21=T_21, camera=camera, epipolar_px=settings.epipolar_px)
+        which, at_1, at_2, weights = match_each(matcher, views, here, there, prior)
     # From here on every match (m,) is a pair of views of its own, with one point.
     T_2w, seen_1, seen_2 = T_2w[which], (0, at_1, None), (which, at_2, None)
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
     normalized = here.normalized[seen_1], there.normalized[seen_2]
     scale_1, scale_2 = here.features.scales[seen_1], there.features.scales[seen_2]
     seen = triangulate(T_1w, T_2w, *pixels, camera, camera, normalized=normalized)
-    good = seen.mask & fits(seen.errors_1**2, scale_1, limit) & fits(seen.errors_2**2, scale_2, limit)
+    noise_1, noise_2 = here.noise[seen_1], there.noise[seen_2]
+    good = seen.mask
+    for T_cw, noise, seen_at in ((T_1w, noise_1, pixels[0]), (T_2w, noise_2, pixels[1])):
+        points_c = transform(T_cw, seen.points_w)
+        good &= fits(noise.squared_reprojection(points_c, seen_at, camera), limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
     sizes = tuple(size[which] for size in slam_map.scale_ranges(neighbours))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
@@ -79,13 +73,47 @@ def triangulate_against(
     keep = keep[first_of_each(at_1[keep])]
     points_w = seen.points_w[keep]
     covariances_w = triangulation_covariance(
-        T_1w, T_2w[keep], points_w, scale_1[keep], scale_2[keep], camera, camera
+        T_1w, T_2w[keep], points_w, noise_1[keep].spread, noise_2[keep].spread, camera, camera
     )
     which, at_1, at_2 = which[keep], at_1[keep], at_2[keep]
     descriptors = here.features.descriptors[0, at_1]
     ids = slam_map.add_points(points_w[:, 0], descriptors, keyframe, covariances_w[:, 0])
     slam_map.observe(keyframe, here.rows[0, at_1], ids)
     slam_map.observe(neighbours[which], there.rows[which, at_2], ids)
+    if weights is not None:
+        slam_map.weigh(keyframe, here.rows[0, at_1], weights[keep])
+        slam_map.weigh(neighbours[which], there.rows[which, at_2], weights[keep])
+
+
+def free_view(slam_map: Map, keyframe: int) -> View:
+    """What a keyframe saw, of which keypoints that see no point yet may match."""
+    view = slam_map.view(keyframe)
+    return replace(view, mask=view.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))
+
+
+def match_each(
+    matcher: Matcher, views: list[View], here: FreeKeypoints, there: FreeKeypoints, prior: Prior
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """As `match_along_epipolar_lines` of the first view with each of the others, by a matcher; and the weights (m,).
+
+    prior: with T_21 (k, 4, 4) to all of the others
+    """
+    assert prior.T_21 is not None
+    parts, weights = [], []
+    for row, (view, T_21) in enumerate(zip(views[1:], prior.T_21, strict=True)):
+        pairs = matched(matcher, views[0], view, replace(prior, T_21=T_21))
+        at_1, at_2 = places(here.rows[0])[pairs.first], places(there.rows[row])[pairs.second]
+        order = torch.argsort(at_1 * len(view.mask) + at_2)
+        parts.append(torch.stack([torch.full_like(at_1, row), at_1, at_2])[:, order])
+        weights += [] if pairs.weights is None else [pairs.weights[order]]
+    which, at_1, at_2 = torch.cat(parts, dim=1)
+    return which, at_1, at_2, torch.cat(weights) if len(weights) == len(parts) else None
+
+
+def places(rows: Tensor) -> Tensor:
+    """(N,) where each of N keypoints stands among rows (n,), which may leave some out."""
+    found = torch.zeros(int(rows.max()) + 1 if len(rows) else 1, dtype=torch.int64, device=rows.device)
+    return found.index_put((rows.flip(0),), torch.arange(len(rows), device=rows.device).flip(0))
 
 
 def has_baseline(slam_map: Map, keyframe: int, neighbours: Tensor, least: float) -> Tensor:
@@ -96,54 +124,6 @@ def has_baseline(slam_map: Map, keyframe: int, neighbours: Tensor, least: float)
     depth = depths.masked_fill(seen == NO_POINT, torch.nan).nanmedian(-1).values
     apart = se3_inverse(T_1w)[:3, 3] - se3_inverse(T_2w)[:, :3, 3]
     return torch.linalg.vector_norm(apart, dim=-1) > least * depth
-
-
-def match_along_epipolar_lines(
-    here: FreeKeypoints,
-    there: FreeKeypoints,
-    T_21: Tensor,
-    camera: Camera,
-    epipolar_px: float,
-    settings: MatchingConfig,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Keypoints of one keyframe and of k others that are each other's best on the epipolar line.
-
-    T_21: (k, 4, 4) from the one camera to the others. Returns for every match (m,) which of the others it is with, and
-    the rows in `here` and `there`, ordered by these three.
-
-    The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
-    contain the baseline, so that a plane is an angle around it.
-    """
-    rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
-    (angles_1, _), (angles_2, sines) = (
-        around(T_21[:, :3, 3], rays) for rays in (rays_1, pad(there.normalized, (0, 1), value=1.0))
-    )
-    width = epipolar_px / camera.focal * there.features.scales / sines.clamp(min=1e-12)
-    width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
-    # A number per angle and neighbour, each a turn below and above as well: a window may reach over the end of a turn.
-    offset = 6 * math.pi * torch.arange(len(T_21), device=width.device)[:, None]
-    turns = 2 * math.pi * torch.arange(-1, 2, device=width.device)
-    keys, order = (angles_1[..., None] + offset[..., None] + turns).flatten().sort(stable=True)
-    left, right = (torch.searchsorted(keys, angles_2 + offset + sign * width) for sign in (-1, 1))
-    column, place = expand_runs(left.flatten(), torch.where(there.features.mask, right, left).flatten())
-    count, descriptors = angles_1.shape[1], here.features.descriptors
-    row, column = match_pairs(
-        descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
-        there.features.descriptors.flatten(0, 1),
-        order[place] // 3,
-        column,
-        0.8 * max_distance(descriptors, settings),
-    )
-    return row // count, row % count, column % width.shape[1]
-
-
-def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """(k, n), (k, n) angles of rays (k, n, 3) around axes (k, 3), radians, and the sines of their angles to these."""
-    least = torch.nn.functional.one_hot(axes.abs().argmin(-1), 3).to(axes.dtype)
-    across = torch.nn.functional.normalize(torch.linalg.cross(axes, least), dim=-1)
-    other = torch.linalg.cross(torch.nn.functional.normalize(axes, dim=-1), across)
-    x, y = (rays @ torch.stack((across, other), dim=-1)).unbind(-1)
-    return torch.atan2(y, x), torch.hypot(x, y) / torch.linalg.vector_norm(rays, dim=-1)
 
 
 def has_consistent_scale(

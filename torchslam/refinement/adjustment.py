@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchslam.calibration.keyframes import FOCAL, directions
 from torchslam.config import Config
-from torchslam.geometry import Camera, squared_reprojection_errors, transform
+from torchslam.geometry import Camera, Noise, fits, transform
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import triangulate_against
@@ -48,7 +48,11 @@ def settle(
     free_focal: the focal length is adjusted as well: matches that a wrong one would rule out still count here
     """
     pixels = torch.stack([view.keypoints for view in views])[tracks.keyframe, tracks.keypoint]
-    scales = torch.stack([view.scales for view in views])[tracks.keyframe, tracks.keypoint]
+    scales, information = (
+        torch.stack([getattr(view, name) for view in views])[tracks.keyframe, tracks.keypoint]
+        for name in ("scales", "information")
+    )
+    noise = Noise(scales, information)
     parallax = config.mapping.min_parallax_deg
     for width in WIDTHS:
         points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
@@ -60,14 +64,14 @@ def settle(
             tracks.track[rows],
             pixels[rows],
             camera,
-            weights=scales[rows] ** -2,
+            weights=noise[rows].weights,
         )
         free = directions(camera, [FOCAL]) if free_focal and width < WIDTHS[0] else False
         solution = bundle_adjust(problem, "cauchy", width, free, "detached", ITERATIONS, TOLERANCE)
         T_cw, camera = solution.T_cw, solution.camera
     points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
     points_c = transform(T_cw[tracks.keyframe], points_w[tracks.track][:, None])[:, 0]
-    near = squared_reprojection_errors(points_c, pixels, camera).sqrt() < GATE * WIDTHS[-1] * scales
+    near = fits(noise.squared_reprojection(points_c, pixels, camera), (GATE * WIDTHS[-1]) ** 2)
     kept = tracks.of(near & good[tracks.track])
     seen = torch.stack([view.keypoints for view in views])[kept.keyframe, kept.keypoint]
     return T_cw, camera, kept, triangulate_tracks(kept, seen, T_cw, camera, 0.0)[0]

@@ -12,6 +12,7 @@ from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.tracking.correspondences import match_keyframe
 from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.relocalization import alone
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import State, StepResult, Tracked, View
@@ -95,9 +96,9 @@ class Poser:
             self.tracker.start_at(world, view, tracked)
         return tracked
 
-    def _candidates(self, slam_map: Map, view: View, nearest: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    def _candidates(self, slam_map: Map, view: View, nearest: Tensor) -> Iterator[Pairs]:
         for keyframe in nearest.tolist():
-            yield match_keyframe(slam_map, keyframe, view, self.config.matching)
+            yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
 
 
 def as_tracked(slam_map: Map, keyframe: int) -> Tracked:

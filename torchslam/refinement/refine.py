@@ -24,14 +24,14 @@ from torchslam.config import Config
 from torchslam.data.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, TrajectoryError
-from torchslam.front_end import Extractor, check_size, image_extractor, simulated_extractor
+from torchslam.front_end import Extractor, FrontEnd, check_size, image_extractor, source
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.refinement.adjustment import map_of, turned
 from torchslam.refinement.between import Poser, graph_of
 from torchslam.refinement.frame import back_to_given
 from torchslam.refinement.pairs import Pair, choose_keyframes, find_pairs
 from torchslam.refinement.tracks import join_matches
-from torchslam.run import Run, true_poses
+from torchslam.run import Run
 from torchslam.solvers.graph import solve
 from torchslam.values import State, StepResult, Trajectory, View
 from torchslam.world.map import Map
@@ -89,14 +89,14 @@ def refine(
     choice: CameraChoice = CameraChoice.JUDGED,
     radial: int = 0,
     device: torch.device | str = "cpu",
-    extractor: Extractor | None = None,
+    extractor: FrontEnd | None = None,
     told: Callable[[str], None] | None = None,
 ) -> Refined:
     """Make somebody else's poses of the images of a sequence better.
 
     poses:     as read, or what `read_poses` reads; the camera is that of the sequence
     radial:    how many coefficients of the distortion may be fitted beside the focal length, where the images ask
-    extractor: the configured one if None
+    extractor: front end, the configured one if None
     told:      of every step, in words
 
     Frames without a pose are left out, so are poses without an image. A run without a map says why (`Run.failure`).
@@ -106,14 +106,9 @@ def refine(
     given = _as_given(poses)
     rows = given.rows(sequence)
     camera = sequence.camera.to(device).to(torch.float64)
-    if extractor is None:
-        simulated = config.features.kind == "simulated"
-        extractor = (
-            simulated_extractor(config, camera, true_poses(sequence))
-            if simulated
-            else image_extractor(config, device)
-        )
-    views, skipped = _look(sequence, rows, camera, extractor)
+    looked = source(sequence, config, camera)
+    extract = None if looked.brings_features else image_extractor(config, device, extractor)
+    views, skipped = _look(looked, rows, camera, extract)
     frames = torch.tensor([view.index for view in views], dtype=torch.int64)
     T_cw = given.T_cw[rows[frames]].to(camera.params)
     say(f"{len(views)} images with poses")
@@ -168,7 +163,7 @@ def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
 
 
 def _look(
-    sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor
+    sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor | None
 ) -> tuple[list[View], list[str]]:
     """The views of the frames that have a pose, and those that could not be read, in words."""
     views, skipped = [], []
@@ -181,7 +176,8 @@ def _look(
             skipped.append(str(error))
             continue
         with torch.inference_mode():
-            features = extractor(frame)
+            features = frame.features if extractor is None else extractor(frame)
+            assert features is not None
         views.append(View.of(frame, features, camera.params))
     return views, skipped
 

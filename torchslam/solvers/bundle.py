@@ -101,7 +101,7 @@ def bundle_adjust(
     check_backward(backward)
     given = sanitized(problem, scale)
     minimization = BundleMinimization(
-        problem.camera, kernel, free_camera, iterations, tolerance, progress, check
+        problem.camera, kernel, free_camera, iterations, tolerance, progress, check, given.weights.ndim > 2
     )
     if backward == "unroll":
         found = minimization.minimize(given)

@@ -19,7 +19,7 @@ from torchslam.solvers.folding import Tensors
 from torchslam.solvers.grid_layout import GridLayout, build_grid_layout, fits_grids, grid_data
 from torchslam.solvers.implicit import Ndims
 from torchslam.solvers.levenberg import LeastSquares, M, Progress, X, minimize
-from torchslam.solvers.residuals import Observations, linearize_each
+from torchslam.solvers.residuals import Observations, linearize_each, only
 from torchslam.solvers.schur import Marginals
 from torchslam.solvers.tangent import move, pull_back, push, retract
 
@@ -87,11 +87,6 @@ class BundleMinimization:
 
     num_unknowns = 3
     num_vectors = 3
-    ndims: tuple[Ndims, Ndims, Ndims] | None = (
-        (2, 2, 1),
-        (3, 2, 2, 0, 1, 1, 1, 0, 0, 0, 0),
-        (3, 2, 2, 1, 2, 0, 3, 3, 2, 3, 1, 0, 1, 1, 1, 1, 1),
-    )
 
     def __init__(
         self,
@@ -102,7 +97,14 @@ class BundleMinimization:
         tolerance: float,
         progress: Progress | None,
         check: bool = True,
+        matrices: bool = False,
     ) -> None:
+        """matrices: whether weights are inverse covariances"""
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+            (2, 2, 1),
+            (3, 2, 2, 0, 1, 1, 1, 0, 0, 0, 0),
+            (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 0, 1, 1, 1, 1, 1),
+        )
         self.camera, self.kernel = camera, kernel
         self.free_camera = free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
@@ -164,10 +166,10 @@ class BundleMinimization:
             in_cameras = flat_rows(given.camera_of, at.params.shape[1])
         observed = Observations(
             given.pixels.flatten(0, 1),
-            torch.where(found.used, given.weights, 0.0).flatten(),
+            only(found.used, given.weights).flatten(0, 1),
             cameras[0 if in_cameras is None else in_cameras],
             self.kernel,
-            given.scale[:, None].expand_as(given.weights).flatten(),
+            given.scale[:, None].expand_as(given.counted).flatten(),
         )
         is_free = self.free_camera is not False
         lin = linearize_each(observed, points_c, is_free)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import check_dtypes
 from torchslam.solvers.prior import CameraPrior, PosePrior
-from torchslam.solvers.residuals import usable
+from torchslam.solvers.residuals import only, usable
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class BundleProblem:
     frame_index:  (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
     pixels:       (O, 2)
     camera:       one for all frames, params (K,); with `camera_index` C of them, all of one model and size, (C, K)
-    weights:      (O,) inverse variances in px^-2, one if None
+    weights:      (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
+                  definite; one if None
     fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are. One frame fixes all but the scale, which
                   then is that of the start; with none the answer keeps the position and the orientation, too.
                   Whatever more is fixed, or held by priors, constrains the shape.
@@ -149,11 +150,12 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
         prior_params_information=priors[3],
     )
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
-    frame_index = _index("frame_index", problem.frame_index, weights.shape, num_frames)
-    point_index = _index("point_index", problem.point_index, weights.shape, num_points)
+    rows = asked.shape
+    frame_index = _index("frame_index", problem.frame_index, rows, num_frames)
+    point_index = _index("point_index", problem.point_index, rows, num_points)
 
     is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
-    seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, weights.shape)
+    seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, rows)
     counted = asked & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
     wanted = torch.zeros_like(frame_index[:, :1]).expand(batch, num_frames)
     wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
@@ -162,7 +164,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
         torch.where(is_finite[..., None, None], T_cw, eye),
         torch.where(torch.isfinite(points_w), points_w, 0.0),
         torch.where(counted[..., None], pixels, 0.0),
-        torch.where(counted, weights, 0.0),
+        only(counted, weights),
         params,
         torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
         *priors,
@@ -188,11 +190,12 @@ def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor,
     points_w = _over("points_w", "(P, 3)", points_w, (batch, points_w.shape[-2], 3))
     pixels = _over("pixels", "(O, 2)", pixels, (batch, count, 2))
     weights = torch.ones_like(pixels[..., 0]) if problem.weights is None else problem.weights
-    asked = torch.ones_like(weights, dtype=torch.bool) if problem.mask is None else problem.mask
+    asked = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
+    matrix = (2, 2) if weights.shape[-2:] == (2, 2) and weights.shape[-3:-2] == (count,) else ()
     return (
         points_w,
         pixels,
-        _over("weights", "(O,)", weights, (batch, count)),
+        _over("weights", "(O,) or (O, 2, 2)", weights, (batch, count, *matrix)),
         _over("mask", "(O,)", asked, (batch, count)),
     )
 

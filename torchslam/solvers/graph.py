@@ -43,7 +43,7 @@ class ObservationGraph:
     points_w:    (P, 3)
     frame_index: (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
     pixels:      (O, 2)
-    weights:     (O,) inverse variances in px^-2
+    weights:     (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances
     camera:      one for all frames
     is_keyframe: (F,) bool; keyframes and points are solved together, the other frames against the points
     world:       (F,) int64 in which world a frame is; worlds share nothing but the camera. All in world 0 if left out
@@ -129,6 +129,8 @@ class ObservationGraph:
         rows = {"F": len(self.T_cw), "P": len(self.points_w), "O": len(self.pixels)}
         for name, (owner, shape, kind) in self._SCHEMA.items():
             column = getattr(self, name)
+            if name == "weights" and column.ndim == 3:
+                shape = (2, 2)
             if tuple(column.shape) != (rows[owner], *shape):
                 raise ValueError(f"{name} is {tuple(column.shape)}, not {(rows[owner], *shape)}")
             is_float = kind is float and column.is_floating_point()
@@ -143,7 +145,8 @@ class ObservationGraph:
         params = self.camera.params
         if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
             raise ValueError("the camera's parameters are none")
-        if min(self.camera.size) < 1 or bool((self.weights < 0).any()):
+        weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
+        if min(self.camera.size) < 1 or bool((weights < 0).any()):
             raise ValueError("an image without pixels, or a negative weight")
 
     @classmethod

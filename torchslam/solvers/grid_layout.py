@@ -49,6 +49,8 @@ def fits_grids(given: Given, moving: Moving) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
+    if given.weights.ndim > 2:
+        return False  # whitening makes the grids' way of a pinhole camera a longer one
     if not 0 < cells <= _SPARSEST * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)

@@ -23,6 +23,7 @@ from torchslam.solvers.residuals import (
     Observations,
     exact_expansion,
     linearize,
+    only,
     usable,
     variance_factor,
 )
@@ -77,7 +78,8 @@ def refine_pose(
 
     T_cw:      (B, 4, 4) start
     points_w:  (B, N, 3), pixels: (B, N, 2); points or pixels of a batch of one broadcast
-    weights:   (B, N) inverse variances in px^-2, one if None
+    weights:   (B, N) inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
+               positive definite; one if None
     mask:      (B, N) bool, all if None; rows that are not finite are left out in any case
     scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
     prior:     a Gaussian on the poses, in the same units
@@ -141,10 +143,14 @@ class _Inputs:
             prior_information=information,
         )
         batch, count = T_cw.shape[0], points_w.shape[1]
-        if weights is not None and weights.shape not in ((batch, count), (1, count)):
-            raise ValueError(f"weights must be (B, N) = {(batch, count)}, not {tuple(weights.shape)}")
+        shapes = [(size, count, *matrix) for size in (batch, 1) for matrix in ((), (2, 2))]
+        if weights is not None and weights.shape not in shapes:
+            raise ValueError(
+                f"weights must be (B, N) = {(batch, count)} or (B, N, 2, 2), not {tuple(weights.shape)}"
+            )
         points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
-        weights = torch.ones_like(pixels[..., 0]) if weights is None else weights.expand(batch, count)
+        weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+        weights = weights.expand(batch, *weights.shape[1:])
         use = usable(pixels, points_w, weights)
         use = use if mask is None else use & mask
         rows = use[..., None]
@@ -152,7 +158,7 @@ class _Inputs:
         if prior is not None:
             prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
         observations = Observations(
-            torch.where(rows, pixels, 0.0), torch.where(use, weights, 0.0), camera, kernel, scale[..., None]
+            torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
         )
         return _Inputs(torch.where(rows, points_w, 0.0), observations, prior)
 
@@ -175,7 +181,7 @@ class _PoseProblem:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
         self.laid_out = PoseObservations(inputs.points_w, inputs.observations)
         self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
-        counted = (self.observations.weights > 0).sum(-1)
+        counted = (self.observations.factors > 0).sum(-1)
         self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
 
     def evaluate(self, T_cw: Tensor, near: Tensor) -> PoseModel:
@@ -244,7 +250,12 @@ class _Minimization:
     def __init__(self, inputs: _Inputs, iterations: int, tolerance: float) -> None:
         self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
         prior = () if inputs.prior is None else (2, 2)
-        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (1,), (2, 0, 0, 0, 0, 0), (2, 2, 2, 1, 1, 1, *prior)
+        weights = inputs.observations.weights.ndim - 1
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+            (1,),
+            (2, 0, 0, 0, 0, 0),
+            (2, 2, 2, weights, 1, 1, *prior),
+        )
 
     def minimize(self, inputs: Tensors) -> Tensors:
         T_cw, problem = inputs[0], _PoseProblem(self.inputs.replaced(inputs[1:]))

@@ -37,7 +37,7 @@ class PoseObservations:
         self.observations = observations
         camera = observations.camera
         self.points_w = points_w.mT.contiguous()
-        self.pinhole = camera.model == "pinhole"
+        self.pinhole = camera.model == "pinhole" and not observations.has_matrices
         self.metric = camera.params.new_ones(1, 1)  # what turns products of rows into those of pixels
         if self.pinhole:
             focal, centre = camera.params[..., :2, None], camera.params[..., 2:4, None]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.robust import Kernel, robustify
+from torchslam.geometry.whitening import is_definite, whitening
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Observations:
     """Pixels that points were seen at, and how errors are weighed.
 
     pixels:  (..., N, 2)
-    weights: (..., N) inverse variance, px^-2; zero where the observation does not count
+    weights: (..., N) inverse variances, px^-2, or (..., N, 2, 2) inverse covariances; zero where the observation does
+             not count
     camera:  parameters (P,) or (..., P)
     scale:   scalar, or with the batch dimensions and a last one of size 1 or N
     """
@@ -36,6 +38,16 @@ class Observations:
     camera: Camera
     kernel: Kernel
     scale: Tensor
+
+    @property
+    def has_matrices(self) -> bool:
+        """Whether weights are inverse covariances: residuals and Jacobians then are whitened by them."""
+        return self.weights.ndim == self.pixels.ndim + 1
+
+    @property
+    def factors(self) -> Tensor:
+        """(..., N) what squares of residuals are multiplied with: weights, or one where residuals are whitened."""
+        return has_weight(self.weights).to(self.weights.dtype) if self.has_matrices else self.weights
 
     def tensors(self) -> list[Tensor]:
         """All that gradients may flow to: pixels, weights, camera parameters, scale."""
@@ -50,7 +62,7 @@ class Observations:
 class Linearization(NamedTuple):
     """Reprojection errors and their first derivatives.
 
-    residual:     (..., N, 2) projected minus observed, px
+    residual:     (..., N, 2) projected minus observed, px; whitened where weights are matrices
     J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
     cost:         (..., N) the share in the objective, half of rho
     weight:       (..., N) weights * rho', zero where the point cannot be projected
@@ -70,15 +82,30 @@ class Linearization(NamedTuple):
 
 
 def usable(pixels: Tensor, points_w: Tensor, weights: Tensor) -> Tensor:
-    """Whether all inputs of an observation are finite and its weight is not negative. -> (..., N)."""
+    """Whether all inputs of an observation are finite and its weight is not negative, or definite. -> (..., N)."""
     finite = torch.isfinite(pixels).all(-1) & torch.isfinite(points_w).all(-1)
+    if weights.ndim == pixels.ndim + 1:
+        return finite & torch.isfinite(weights).flatten(-2).all(-1) & is_definite(weights)
     return finite & torch.isfinite(weights) & (weights >= 0)
+
+
+def only(use: Tensor, weights: Tensor) -> Tensor:
+    """Weights (..., N) or (..., N, 2, 2), zero outside of `use` (..., N)."""
+    return torch.where(use if weights.ndim == use.ndim else use[..., None, None], weights, 0.0)
+
+
+def has_weight(weights: Tensor) -> Tensor:
+    """(..., N) bool, which of the matrices (..., N, 2, 2) are not zero."""
+    return weights.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
 
 
 def linearize(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
     """Errors and Jacobians of finite points_c (..., N, 3)."""
     pixels, valid, J = _project(observations.camera, points_c, free_camera)
     residual = pixels - observations.pixels
+    if observations.has_matrices:
+        W = whitening(observations.weights)
+        residual, J = (W @ residual[..., None]).squeeze(-1), W @ J
     return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
 
 
@@ -110,9 +137,11 @@ class Weighed(NamedTuple):
 
 
 def weigh(observations: Observations, squared_px: Tensor, valid: Tensor) -> Weighed:
-    """What squared errors (..., N) in pixels cost and how they pull; those that are not valid pull nowhere."""
-    camera, weights = observations.camera, observations.weights
-    diagonal = float(camera.width**2 + camera.height**2)
+    """What squared errors (..., N), px or whitened, cost and how they pull; those that are not valid pull nowhere."""
+    camera, weights = observations.camera, observations.factors
+    diagonal: Tensor | float = float(camera.width**2 + camera.height**2)
+    if observations.has_matrices:
+        diagonal = 0.5 * diagonal * observations.weights.diagonal(dim1=-2, dim2=-1).sum(-1)
     squared = weights * torch.where(valid, squared_px, diagonal)
     rho, slope, curvature = robustify(squared, observations.kernel, observations.scale)
     counted = torch.where(valid, weights, 0.0)
@@ -190,7 +219,8 @@ def exact_expansion(observations: Observations, points_c: Tensor, free_camera: b
     force = lin.force[..., None]
     along = (lin.residual[..., None, :] @ lin.J) * (lin.bend[..., None] * lin.residual)[..., None]
     hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
-    hessian = hessian + _bend_of_projection(observations.camera, points_c, force.detach(), free_camera)
+    pull = whitening(observations.weights).mT @ force if observations.has_matrices else force
+    hessian = hessian + _bend_of_projection(observations.camera, points_c, pull.detach(), free_camera)
     return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
 
 
@@ -232,7 +262,7 @@ def variance_factor(
     with Huber's correction for small samples; for least squares this is the variance of unit weight. One where there is
     no redundancy. Source: Huber, "Robust statistics", 1981, section 7.6.
     """
-    weights = observations.weights
+    weights = observations.factors
     counted = (linearization.weight > 0) & (weights > 0)
     variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
     squared = linearization.residual.square().sum(-1)

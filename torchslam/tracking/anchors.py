@@ -20,12 +20,13 @@ LEAST = 20  # points: with fewer there is nothing to follow
 class Anchored:
     """An anchor in its world.
 
-    point_ids: (n,) rows of its points in the map; scales: (n,) of their keypoints
+    point_ids: (n,) rows of its points in the map; scales: (n,) and information: (n, I) of their keypoints
     T_ar:      (4, 4) from keyframe `reference`
     """
 
     point_ids: Tensor
     scales: Tensor
+    information: Tensor
     T_ar: Tensor
     reference: int
 
@@ -59,8 +60,8 @@ class Anchors:
         ids, keypoints = ids[chosen], keypoints[chosen]
         T_aw, newest = world.T_cw, track.local_keyframes.new_tensor([slam_map.num_keyframes - 1])
         around = torch.cat([track.local_keyframes, newest])
-        scales = view.scales[keypoints]
-        self._known[view.index] = Anchored(ids, scales, track.T_cr, track.reference)
+        scales, information = view.scales[keypoints], view.information[keypoints]
+        self._known[view.index] = Anchored(ids, scales, information, track.T_cr, track.reference)
         self._known = dict(list(self._known.items())[-self.keep :])
         return Anchor(
             index=view.index,
@@ -71,6 +72,7 @@ class Anchors:
             T_ka=slam_map.T_cw[around] @ se3_inverse(T_aw),
             velocity=track.velocity,
             overlap=min(1.0, tracked.inliers / max(track.reference_size, 1)),
+            information=information,
         )
 
     def renumber(self, renumbering: Renumbering) -> None:
@@ -98,13 +100,20 @@ class Anchors:
         ids = anchored.point_ids[followed.rows]
         ids = torch.where(ids >= 0, slam_map.resolve(ids.clamp(min=0)), -1)
         used = torch.nonzero((ids >= 0) & slam_map.points["alive"][ids])[:, 0]
-        ids, pixels, scales = ids[used], followed.pixels[used], anchored.scales[followed.rows][used]
+        ids, pixels, rows = ids[used], followed.pixels[used], followed.rows[used]
+        scales, information = anchored.scales[rows], anchored.information[rows]
         track.T_cr, track.reference = followed.T_ca @ anchored.T_ar, anchored.reference
         track.velocity, track.seen_last = world.T_cw @ se3_inverse(before), ids
         nothing = torch.zeros(len(ids), 0, dtype=slam_map.points["descriptors"].dtype, device=ids.device)
         mask = torch.ones(len(ids), dtype=torch.bool, device=ids.device)
         angles = torch.zeros_like(scales)
-        view = View(frame.index, frame.timestamp, pixels, scales, angles, nothing, mask, session=session)
+        view = View(
+            frame.index,
+            frame.timestamp,
+            *(pixels, scales, angles, nothing, mask),
+            session=session,
+            information=information,
+        )
         rows = torch.arange(len(ids), device=ids.device)
         depth = float(transform(world.T_cw, slam_map.positions_w[ids])[:, 2].median()) if len(ids) else 0.0
         return view, Tracked(world.T_cw, ids, rows, followed.expected, followed.covariance, depth)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
-from torchslam.features import match, match_projected
+from torchslam.features import match
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, Prior, matched, max_distance
 from torchslam.values import View
 from torchslam.world.map import Map
 
@@ -25,22 +26,10 @@ class Projected:
     angles: Tensor
 
 
-def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
-    """The threshold for this kind of descriptor: bits, or 1 - cosine."""
-    return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
-
-
 def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) keypoints of two views that match: mutual, by ratio, one to one."""
-    matches = match(
-        view_1.features,
-        view_2.features,
-        ratio=settings.ratio,
-        mutual=True,
-        max_distance=max_distance(view_1.descriptors, settings),
-    )
-    found = matches.mask[0]
-    return matches.indices_1[0][found], matches.indices_2[0][found]
+    """(m,), (m,) keypoints of two views that match by their descriptors: mutual, by ratio, one to one."""
+    pairs = matched(DescriptorMatcher(settings), view_1, view_2)
+    return pairs.first, pairs.second
 
 
 def project_points(
@@ -90,33 +79,38 @@ def match_near(
     projected: Projected,
     view: View,
     radius_px: float,
-    settings: MatchingConfig,
+    matcher: Matcher,
     ratio: float | None,
-) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) point ids and keypoints that match within a radius around the projection, one to one.
+) -> Pairs:
+    """Point ids and keypoints that match within a radius around the projection, one to one.
 
     The radius is in pixels of the pyramid level at which the point is expected.
     """
-    descriptors = slam_map.points["descriptors"][projected.ids]
     if len(projected.ids) == 0:
-        return projected.ids, projected.ids
-    matches = match_projected(
-        descriptors[None],
-        projected.pixels[None],
-        (radius_px * projected.scales)[None],
-        view.features,
-        scales=projected.scales[None],
-        max_distance=max_distance(descriptors, settings),
-        ratio=ratio,
+        return Pairs(projected.ids, projected.ids)
+    expected = expected_view(slam_map, projected, view)
+    pairs = matched(matcher, expected, view, Prior(radius_px * projected.scales, ratio))
+    return replace(pairs, first=projected.ids[pairs.first])
+
+
+def expected_view(slam_map: Map, projected: Projected, view: View) -> View:
+    """What the map expects a camera to see, as a view: points where they should appear, as they looked last."""
+    return View(
+        view.index,
+        view.timestamp,
+        keypoints=projected.pixels,
+        scales=projected.scales,
+        angles=projected.angles,
+        descriptors=slam_map.points["descriptors"][projected.ids],
+        mask=torch.ones_like(projected.ids, dtype=torch.bool),
+        session=view.session,
     )
-    found = matches.mask[0]
-    return projected.ids[matches.indices_1[0][found]], matches.indices_2[0][found]
 
 
-def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) point ids and keypoints that match by descriptor alone, wherever they are in the image."""
+def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfig) -> Pairs:
+    """Point ids and keypoints that match by descriptor alone, wherever they are in the image."""
     if len(ids) == 0:
-        return ids, ids
+        return Pairs(ids, ids)
     matches = match(
         slam_map.point_features(ids),
         view.features,
@@ -125,14 +119,12 @@ def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfi
         max_distance=max_distance(view.descriptors, settings),
     )
     found = matches.mask[0]
-    return ids[matches.indices_1[0][found]], matches.indices_2[0][found]
+    return Pairs(ids[matches.indices_1[0][found]], matches.indices_2[0][found])
 
 
-def match_keyframe(
-    slam_map: Map, keyframe: int, view: View, settings: MatchingConfig
-) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) points that a keyframe sees and keypoints of a view, matched by the keyframe's own descriptors."""
+def match_keyframe(slam_map: Map, keyframe: int, view: View, matcher: Matcher) -> Pairs:
+    """Points that a keyframe sees and keypoints of a view, matched by the keyframe's own descriptors."""
     seen = slam_map.view(keyframe)
     point_ids = slam_map.keyframes["point_ids"][keyframe]
-    rows, keypoints = match_views(replace(seen, mask=seen.mask & (point_ids >= 0)), view, settings)
-    return point_ids[rows], keypoints
+    pairs = matched(matcher, replace(seen, mask=seen.mask & (point_ids >= 0)), view)
+    return replace(pairs, first=point_ids[pairs.first])

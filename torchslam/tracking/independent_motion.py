@@ -15,7 +15,8 @@ from torch import Tensor
 from torchslam.config import IndependentMotionConfig, MatchingConfig
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
-from torchslam.tracking.correspondences import match_views, max_distance
+from torchslam.tracking.correspondences import match_views
+from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.spread import cells
 from torchslam.tracking.stillness import distances_to_segments
 from torchslam.values import Tracked, View
@@ -183,7 +184,7 @@ class IndependentMotion:
         return len(torch.unique(cells(pixels, self.camera.size)))
 
     def _errors(self, last: _Look, look: _Look, first: Tensor, second: Tensor) -> Tensor:
-        """(n,) pixels, in units of the keypoints' scales, by which matches miss where a point of the scene can be;
+        """(n,) pixels, in units of the keypoints' noise, by which matches miss where a point of the scene can be;
         zero where the poses are unknown."""
         seen, view = last.view, look.view
         if last.T_cw is None or look.T_cw is None:
@@ -194,7 +195,7 @@ class IndependentMotion:
         pixels, valid = self.camera.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
         distances = distances_to_segments(view.keypoints[second], pixels[:-1], pixels[1:])
         errors = distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
-        return errors / torch.maximum(seen.scales[first], view.scales[second])
+        return errors / torch.maximum(seen.noise.tolerance[first], view.noise.tolerance[second])
 
     def _together(self, earlier: View, view: View, first: Tensor, second: Tensor, among: Tensor) -> Tensor:
         """(m,) rows of the matches (n,), (n,) that one rigid motion explains, if it explains enough of those among

@@ -10,17 +10,17 @@ from torch import Tensor
 from torchslam.config import Config, InitializationConfig
 from torchslam.geometry import (
     Camera,
+    Noise,
     RelativePose,
     Triangulation,
     epipolar_offsets,
     estimate_relative_pose,
     fits,
-    squared_reprojection_errors,
     transform,
     triangulate,
 )
 from torchslam.solvers import BundleProblem, bundle_adjust
-from torchslam.tracking.correspondences import match_views
+from torchslam.tracking.matcher import Matcher, matched, matcher_of
 from torchslam.values import Start, View
 
 AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
@@ -32,8 +32,9 @@ EXPLAINED_SHARE = 0.5  # of them that the motion of the others must explain
 class Initializer:
     """Tries every frame against a reference frame until two of them make a map worth having."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
+        self.matcher = matcher_of(config.matching, matcher)
         self.config = config
         self.views: list[View] = []  # the reference and what came after it
         # pixels (n, 2) that the last view showed not to move with the scene
@@ -51,7 +52,9 @@ class Initializer:
             self.views = [view]
             return None, "took a reference frame"
         self.views.append(view)
-        first, second = match_views(self.reference, view, self.config.matching)
+        pairs = matched(self.matcher, self.reference, view)
+        first, second = pairs.first, pairs.second
+        view = view.weighed(second, pairs.weights)
         least = self.config.initialization.min_matches
         if len(first) < least:
             self.views = [view]
@@ -149,15 +152,19 @@ class Initializer:
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
-        scales = torch.maximum(self.reference.scales[first], view.scales[second])
+        noise = view.noise[second]
+        known = self.reference.noise[first]
+        noise = (known.stated() if noise.information.shape[-1] else known).worse(noise)
         seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
-        good = is_good(seen, scales, self.camera, settings)
+        points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
+        errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)
+        good = is_good(seen, errors.amax(0), noise.tolerance, self.camera, settings)
         reason = why_not(good, seen, len(first), settings, least_share)
         if reason:
             return None, reason
         keep = torch.nonzero(good)[:, 0]
         poses, points_w, accurate = refine_pair(
-            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], scales[keep], self.camera
+            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera
         )
         if int(accurate.sum()) < settings.min_points:
             return (
@@ -168,17 +175,21 @@ class Initializer:
         return Start(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
 
 
-def is_good(seen: Triangulation, scales: Tensor, camera: Camera, settings: InitializationConfig) -> Tensor:
+def is_good(
+    seen: Triangulation, errors: Tensor, sigmas: Tensor, camera: Camera, settings: InitializationConfig
+) -> Tensor:
     """(n,) which triangulated points count for a start.
+
+    errors: (n,) the larger of the two squared errors, in units of the noise; sigmas: (n,) px
 
     With the criterion "uncertainty": the standard deviation of a depth z seen under the parallax a is about
     z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
     With "parallax": when the angle is large enough.
     """
-    is_close = torch.maximum(seen.errors_1, seen.errors_2) < AWAY * scales
+    is_close = fits(errors, AWAY**2)
     if settings.criterion == "parallax":
         return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
-    relative_std = scales / (camera.focal * seen.angles.clamp(min=1e-9))
+    relative_std = sigmas / (camera.focal * seen.angles.clamp(min=1e-9))
     return seen.mask & is_close & (relative_std < settings.max_depth_std)
 
 
@@ -203,7 +214,7 @@ def why_not(
 
 
 def refine_pair(
-    T_cw: Tensor, points_w: Tensor, pixels_1: Tensor, pixels_2: Tensor, scales: Tensor, camera: Camera
+    T_cw: Tensor, points_w: Tensor, pixels_1: Tensor, pixels_2: Tensor, noise: Noise, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Bundle adjustment of two views with the first one fixed.
 
@@ -216,7 +227,7 @@ def refine_pair(
     frame_index = torch.arange(2, device=device).repeat_interleave(n)
     point_index = torch.arange(n, device=device).repeat(2)
     pixels = torch.cat([pixels_1, pixels_2])
-    weights = scales.repeat(2) ** -2
+    weights = torch.cat([noise.weights] * 2)
     fixed = torch.tensor([True, False], device=device)
     problem = BundleProblem(
         T, points_w, frame_index, point_index, pixels, camera, weights=weights, fixed_frames=fixed
@@ -227,5 +238,5 @@ def refine_pair(
     refined[:3, 3] *= factor
     points_w = solution.points_w * factor
     points_c = transform(torch.stack([T[0], refined]), points_w)
-    errors = squared_reprojection_errors(points_c, torch.stack([pixels_1, pixels_2]), camera)
-    return refined, points_w, fits(errors, scales).all(0)
+    errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), camera)
+    return refined, points_w, fits(errors).all(0)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.tracking.correspondences import match_keyframe
 from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Tracked, View
 from torchslam.world.map import Map
@@ -26,7 +27,6 @@ class Relocalizer:
 
     def __init__(self, tracker: Tracker, config: Config) -> None:
         self.tracker = tracker
-        self.matching = config.matching
         self.judge = config.judge
         self.tries = config.relocalization.tries
 
@@ -55,8 +55,8 @@ class Relocalizer:
         near = slam_map.covisible(keyframe, self.tracker.settings.local_keyframes)
         return torch.cat([near.new_tensor([keyframe]), near])
 
-    def _matches(self, slam_map: Map, keyframe: int, view: View) -> Iterator[tuple[Tensor, Tensor]]:
-        yield match_keyframe(slam_map, keyframe, view, self.matching)
+    def _matches(self, slam_map: Map, keyframe: int, view: View) -> Iterator[Pairs]:
+        yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
 
 
 def alone(track: Track, tracked: Tracked) -> Track:

@@ -15,9 +15,10 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.features.patches import RADIUS, Aligned, Patches, Pyramid, align, cut, pyramid
 from torchslam.front_end import reduced
-from torchslam.geometry import Camera, fits, se3_inverse, squared_reprojection_errors, transform
+from torchslam.geometry import Camera, fits, se3_inverse, transform
 from torchslam.geometry.motion import apart
 from torchslam.geometry.robust import Kernel
+from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose
 from torchslam.tracking.spread import voices
 from torchslam.tracking.tracker import refine_one
@@ -107,7 +108,7 @@ class Scout:
         inverse, failed = torch.linalg.inv_ex(J[..., :2])
         unwarp = torch.where((failed == 0)[:, None, None], inverse, 0.0)
         patches = cut(self._pyramids[anchor.index], self._reduced(anchor.pixels))
-        errors = squared_reprojection_errors(anchor.points_a, anchor.pixels, self.camera) / anchor.scales**2
+        errors = anchor.noise.squared_reprojection(anchor.points_a, anchor.pixels, self.camera)
         self._held = Held(anchor, patches, unwarp, float(errors.median()))
         T_ab = self._poses.get(anchor.index)
         eye = torch.eye(4, dtype=anchor.points_a.dtype, device=anchor.points_a.device)
@@ -175,7 +176,7 @@ class Scout:
 
         By points of age alone if there are enough of them, then by all that agrees with that.
         """
-        weights = anchor.scales**-2 * voices(anchor.pixels, self.camera.size)
+        weights = times(anchor.noise.weights, voices(anchor.pixels, self.camera.size))
         kernels: tuple[Kernel, ...] = ("cauchy", "huber")
         mask = good & anchor.senior
         if int(mask.sum()) < LEAST:
@@ -183,8 +184,8 @@ class Scout:
         for kernel in kernels:
             refined = refine_one(T_ca, anchor.points_a, pixels, self.camera, weights, mask, kernel)
             T_ca = refined.T_cw[0]
-            errors = squared_reprojection_errors(transform(T_ca, anchor.points_a), pixels, self.camera)
-            mask = good & fits(errors, anchor.scales, self.chi_square) & refined.success
+            errors = anchor.noise.squared_reprojection(transform(T_ca, anchor.points_a), pixels, self.camera)
+            mask = good & fits(errors, self.chi_square) & refined.success
             if int(mask.sum()) < LEAST:
                 break
         return refined, mask
@@ -193,7 +194,7 @@ class Scout:
         """Why a frame with a pose should be found by its features all the same: it may be wrong, or worth keeping."""
         anchor = held.anchor
         points_c = transform(T_ca, anchor.points_a[rows])
-        errors = squared_reprojection_errors(points_c, pixels[rows], self.camera) / anchor.scales[rows] ** 2
+        errors = anchor.noise[rows].squared_reprojection(points_c, pixels[rows], self.camera)
         if len(rows) < self.settings.min_agreeing:
             return f"only {len(rows)} patches agree with the pose"
         worse = float(errors.median()) / max(held.error, LEAST_ERROR)

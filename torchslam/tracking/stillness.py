@@ -14,7 +14,7 @@ from torch import Tensor
 from torchslam.config import MatchingConfig, StillnessConfig
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.tracking.correspondences import max_distance
+from torchslam.tracking.matcher import max_distance
 from torchslam.values import View
 
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie

@@ -11,17 +11,19 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
+    Noise,
     estimate_absolute_pose,
     fits,
     innovation_covariances,
     mahalanobis_squared,
     se3_inverse,
-    squared_reprojection_errors,
     transform,
 )
 from torchslam.geometry.robust import Kernel
+from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, matcher_of
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
 from torchslam.values import Tracked, View
 from torchslam.world.map import Map
@@ -43,8 +45,10 @@ class Tracker:
 
     counts = True
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
+        self.matcher = matcher_of(config.matching, matcher)
+        self.own = DescriptorMatcher(config.matching)  # for what is guided to a few pixels
         self.settings = config.tracking
         self.matching = config.matching
         self.measurement = config.measurement
@@ -103,37 +107,35 @@ class Tracker:
         self.accept(world, view, tracked)
         return tracked
 
-    def _candidates(self, world: World, view: View) -> Iterator[tuple[Tensor, Tensor]]:
+    def _candidates(self, world: World, view: View) -> Iterator[Pairs]:
         """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
         slam_map, track, settings = world.map, world.track, self.settings
         T_cw = self.predict(world)
         if settings.guided:
             alive = track.seen_last[slam_map.points["alive"][track.seen_last]]
             near = self._project(slam_map, alive, T_cw, view)
-            yield match_near(slam_map, near, view, settings.radius_px, self.matching, ratio=0.9)
+            yield match_near(slam_map, near, view, settings.radius_px, self.matcher, ratio=0.9)
             local = self._project(slam_map, track.local_points, T_cw, view)
             wide = settings.radius_px * settings.wide_radius_factor
-            yield match_near(slam_map, local, view, wide, self.matching, ratio=0.9)
+            yield match_near(slam_map, local, view, wide, self.matcher, ratio=0.9)
         else:
             local = self._project(slam_map, track.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
         yield match_points(slam_map, track.local_points, view, self.matching)
 
     def locate(
-        self, slam_map: Map, view: View, candidates: Iterator[tuple[Tensor, Tensor]], local_points: Tensor
+        self, slam_map: Map, view: View, candidates: Iterator[Pairs], local_points: Tensor
     ) -> Tracked | None:
         """The pose by the first of several sets of matches that gives one, refined against the local points (n,)."""
-        for point_ids, keypoints in candidates:
-            tracked = self._locate(slam_map, view, point_ids, keypoints, local_points)
+        for pairs in candidates:
+            tracked = self._locate(slam_map, view, pairs, local_points)
             if tracked is not None:
                 return tracked
         return None
 
-    def _locate(
-        self, slam_map: Map, view: View, point_ids: Tensor, keypoints: Tensor, local_points: Tensor
-    ) -> Tracked | None:
+    def _locate(self, slam_map: Map, view: View, pairs: Pairs, local_points: Tensor) -> Tracked | None:
         """PnP RANSAC over matches, then all local points near their projection, then robust refinement."""
-        settings = self.settings
+        settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
         if len(point_ids) < settings.min_matches:
             return None
         chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
@@ -150,10 +152,13 @@ class Tracker:
         T_cw = pose.T_cw[0]
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self._project(slam_map, candidates, T_cw, view)
-        ids, at = match_near(slam_map, near, view, settings.refine_radius_px, self.matching, ratio=0.9)
+        guided = match_near(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
+        ids, at, noise = guided.first, guided.second, view.noise[guided.second]
         if len(ids) < settings.min_inliers:
             return None
-        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], view.scales[at])
+        weights = weights_of(pairs, guided, len(view.mask))
+        noise = noise if weights is None else noise.stated().weighed(weights)
+        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], noise)
         if int(inliers.sum()) < settings.min_inliers:
             return None
         T_cw, seen = refined.T_cw[0], ids[inliers]
@@ -167,6 +172,7 @@ class Tracker:
             error=float(errors.median()),
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
+            weights=None if weights is None else weights[inliers],
         )
         if self.counts:
             slam_map.points["times_visible"][near.ids] += 1
@@ -189,7 +195,7 @@ class Tracker:
         return torch.cat([near.new_tensor([keyframe]), near])
 
     def _refine(
-        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor
+        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise
     ) -> tuple[RefinedPose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
@@ -197,23 +203,23 @@ class Tracker:
         on all that agrees with that.
         """
         points_w = slam_map.positions_w[ids]
-        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
-        mask = fits(errors, scales, FAR * self.measurement.chi_square)
+        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
+        mask = fits(errors, FAR * self.measurement.chi_square)
         old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = scales**-2 * voices(pixels, self.camera.size)
+        weights = times(noise.weights, voices(pixels, self.camera.size))
         kernels: tuple[Kernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
             refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
             T_cw = refined.T_cw[0]
-            mask = self.agrees(slam_map, T_cw, ids, pixels, scales)
+            mask = self.agrees(slam_map, T_cw, ids, pixels, noise)
             if int(mask.sum()) < 6:
                 break
-        errors = squared_reprojection_errors(transform(T_cw, points_w), pixels, self.camera)
-        return refined, errors / scales**2, mask
+        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
+        return refined, errors, mask
 
-    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, scales: Tensor) -> Tensor:
+    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
 
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
@@ -221,9 +227,9 @@ class Tracker:
         chi_square, points = self.measurement.chi_square, slam_map.points
         points_c = transform(T_cw, points["positions_w"][ids])
         if self.measurement.gate == "chi_square":
-            return fits(squared_reprojection_errors(points_c, pixels, self.camera), scales, chi_square)
+            return fits(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
-        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], scales)
+        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.spread)
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
     def accept(self, world: World, view: View, tracked: Tracked) -> None:
@@ -295,6 +301,19 @@ def refine_one(
         iterations=10,
         tolerance=NEGLIGIBLE,
     )
+
+
+def weights_of(pairs: Pairs, guided: Pairs, keypoints: int) -> Tensor | None:
+    """(n,) what a matcher gave to those of its pairs that a guided search found as well; None where it gave nothing.
+
+    Pairs that the guided search alone found count as the median of the matcher's.
+    """
+    if pairs.weights is None:
+        return None
+    points = torch.full((keypoints,), -1, device=pairs.first.device).index_put((pairs.second,), pairs.first)
+    weights = pairs.weights.new_zeros(keypoints).index_put((pairs.second,), pairs.weights)
+    is_same = points[guided.second] == guided.first
+    return torch.where(is_same, weights[guided.second], pairs.weights.median())
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:

@@ -7,6 +7,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, epipolar_offsets, se3_inverse
 from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.matcher import Matcher
 from torchslam.values import Start, View
 from torchslam.world.world import World
 
@@ -29,7 +30,7 @@ class Youth:
         self.views.append(view)
         self.age += 1
 
-    def rival(self, camera: Camera, config: Config) -> Start | None:
+    def rival(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> Start | None:
         """A start by the first and the last frame alone, if it contradicts the map.
 
         The map keeps what agrees with it, so its own observations never contradict it: these two frames are matched
@@ -37,7 +38,7 @@ class Youth:
         """
         if self.age % INTERVAL != 0:
             return None
-        initializer = Initializer(camera, config)
+        initializer = Initializer(camera, config, matcher)
         initializer.step(self.views[0])
         start, _ = initializer.step(self.views[-1])
         if start is None:

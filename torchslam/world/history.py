@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import Camera, Noise, se3_inverse
 from torchslam.solvers.graph import GraphSolution, ObservationGraph, Schema
 from torchslam.values import Tracked, Trajectory, View
 from torchslam.world.map import NO_KEYPOINT, Map, key_of
@@ -49,7 +49,7 @@ class History:
 
     def add(self, view: View, tracked: Tracked, T_cr: Tensor, reference: int) -> None:
         """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
-        device = T_cr.device
+        device, view = T_cr.device, view.weighed(tracked.keypoints, tracked.weights)
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
             session=torch.tensor([view.session], device=device),
@@ -65,6 +65,7 @@ class History:
             else torch.full_like(tracked.keypoints, NO_KEYPOINT),
             pixels=view.keypoints[tracked.keypoints],
             scales=view.scales[tracked.keypoints],
+            information=view.information[tracked.keypoints],
         )
 
     def __len__(self) -> int:
@@ -141,6 +142,7 @@ class History:
             keypoints=seen.keypoint_index,
             pixels=seen.pixels,
             scales=seen.scales,
+            information=seen.information,
         )
 
     def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
@@ -202,7 +204,7 @@ class History:
             frame_index=torch.cat([seen.keyframe_index, slot[self.observations["row"][rows]]]),
             point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
             pixels=with_own(seen.pixels, "pixels"),
-            weights=with_own(seen.scales, "scales") ** -2,
+            weights=Noise(with_own(seen.scales, "scales"), with_own(seen.information, "information")).weights,
             camera=camera,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,

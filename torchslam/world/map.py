@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry import se3_inverse
+from torchslam.geometry import Noise, se3_inverse
 from torchslam.solvers import Marginals
 from torchslam.values import Features, Observations, View
 from torchslam.world.observers import Observers, first_of_each, most
@@ -28,6 +28,7 @@ class Map:
     def __init__(self) -> None:
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
+        self.images: dict[int, Tensor] = {}  # of keyframes, by key, where a matcher wants them; saved nowhere
         self._index: Observers | None = None  # of what the tables hold; None: not made yet
 
     @property
@@ -94,6 +95,11 @@ class Map:
         keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
 
+    def noise(self, keyframes: Tensor, keypoints: Tensor) -> Noise:
+        """Of keypoints (n,) of a keyframe each, (n,)."""
+        table = self.keyframes
+        return Noise(table["scales"][keyframes, keypoints], table["information"][keyframes, keypoints])
+
     def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """(k, 1), (k, 1) the finest and the coarsest scale among the keypoints of keyframes (k,)."""
         scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
@@ -107,6 +113,8 @@ class Map:
 
     def add_keyframe(self, view: View, T_cw: Tensor) -> int:
         """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
+        if view.image is not None:
+            self.images[(view.session << SESSION_BITS) + view.index] = view.image
         ids = self.keyframes.append(
             T_cw=T_cw[None],
             covariances=T_cw.new_zeros(1, 6, 6),
@@ -118,6 +126,7 @@ class Map:
             angles=view.angles[None],
             descriptors=view.descriptors[None],
             mask=view.mask[None],
+            information=view.information[None],
             point_ids=torch.full((1, len(view.mask)), NO_POINT, device=T_cw.device),
         )
         return int(ids[0])
@@ -163,6 +172,10 @@ class Map:
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)
 
+    def weigh(self, keyframe: int | Tensor, keypoint_index: Tensor, weights: Tensor) -> None:
+        """Multiply the stated information of keypoints (n,) of a keyframe, or of one each (n,), with weights (n,)."""
+        self.keyframes["information"][keyframe, keypoint_index] *= weights[:, None]
+
     def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
         """Drop observations, given by keyframe (n,) and keypoint (n,)."""
         table = self.keyframes["point_ids"]
@@ -203,6 +216,7 @@ class Map:
             table[row, keypoint],
             self.keyframes["keypoints"][keyframe, keypoint],
             self.keyframes["scales"][keyframe, keypoint],
+            self.keyframes["information"][keyframe, keypoint],
         )
 
     def observers(self, point_ids: Tensor, keyframes: Tensor | None = None) -> Tensor:
@@ -220,11 +234,12 @@ class Map:
     def view(self, keyframe: int) -> View:
         """What a keyframe saw."""
         row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
-        names = ("keypoints", "scales", "angles", "descriptors", "mask")
+        names = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
         return View(
             index=int(row["frame_index"]),
             timestamp=float(row["timestamp"]),
             session=int(row["session"]),
+            image=self.images.get(self.key(keyframe)) if self.images else None,
             **{name: row[name] for name in names},
         )
 
@@ -254,6 +269,7 @@ class Map:
     def append(self, other: Map) -> tuple[int, int]:
         """Add all keyframes and points of another map, in the same world frame; returns how far their rows moved."""
         keyframes, points = len(self.keyframes), len(self.points)
+        self.images |= other.images
         rows = other.points.columns()
         rows["born"] = rows["born"] + keyframes
         rows["replaced_by"] = torch.where(rows["replaced_by"] >= 0, rows["replaced_by"] + points, NO_POINT)

@@ -16,7 +16,7 @@ Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; no columns at all where a table is empty."""
 
 # What everything else is computed from.
-FINITE = ("T_cw", "T_cr", "positions_w", "timestamp", "keypoints", "scales", "pixels", "reach")
+FINITE = ("T_cw", "T_cr", "positions_w", "timestamp", "keypoints", "scales", "pixels", "reach", "information")
 
 
 def check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
@@ -65,6 +65,10 @@ def why_not_alike(slam_map: Map, view: View, to_map: bool) -> str:
     held, seen = slam_map.keyframes["descriptors"], view.descriptors
     if held.shape[-1] != seen.shape[-1] or held.dtype != seen.dtype:
         return f"its descriptors are {held.shape[-1]} x {held.dtype}, the frame's {seen.shape[-1]} x {seen.dtype}"
+    known, said = slam_map.keyframes["information"].shape[-1], view.information.shape[-1]
+    if to_map and known != said:
+        kinds = {0: "none", 1: "a number", 3: "a matrix"}
+        return f"its keypoints have {kinds[known]} as information, the frame's {kinds[said]}"
     if to_map and held.shape[1] != len(seen):
         return f"its keyframes have {held.shape[1]} keypoints, the frame {len(seen)}"
     return ""

@@ -27,8 +27,9 @@ from torchslam.world.table import Table
 from torchslam.world.world import World
 from torchslam.world.worlds import Worlds
 
-FORMAT = 4  # 1 had no covariances, 2 a single map without the frames between keyframes
-WITHOUT_COLORS = 3  # is read as well: its points have the colours of a map that has seen no image
+FORMAT = 5  # 1 had no covariances, 2 a single map without the frames between keyframes
+# Are read as well: points have the colours of a map that has seen no image, keypoints are known to their scales.
+WITHOUT_COLORS, WITHOUT_INFORMATION = 3, 4
 TABLES: dict[str, Schema] = {
     "points": POINTS,
     "keyframes": KEYFRAMES,
@@ -161,8 +162,9 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         found = about["format"]
     except (ValueError, KeyError, TypeError):
         raise ResultsError(f"{path}: a safetensors file, but not a torchslam map") from None
-    if found == WITHOUT_COLORS:
-        tensors |= _without_colors(tensors)
+    if found in (WITHOUT_COLORS, WITHOUT_INFORMATION):
+        tensors |= _without_information(tensors)
+        tensors |= _without_colors(tensors) if found == WITHOUT_COLORS else {}
     elif found != FORMAT:
         raise ResultsError(f"{path}: map format {found}, this version reads format {FORMAT}: run again")
     return tensors, about
@@ -175,6 +177,16 @@ def _without_colors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         name.removesuffix(positions) + ".points.colors": torch.zeros((*rows.shape[:1], 3), dtype=torch.uint8)
         for name, rows in tensors.items()
         if name.endswith(positions)
+    }
+
+
+def _without_information(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The columns of information that a file of before lacks: none."""
+    scales = ".scales"
+    return {
+        name.removesuffix(scales) + ".information": rows.new_zeros(*rows.shape, 0)
+        for name, rows in tensors.items()
+        if name.endswith(scales)
     }
 
 

@@ -1,6 +1,7 @@
 """The columns of a world's tables: what they hold, in which shape and which unit.
 
-A letter in a shape is a size that the first row of a table decides: N keypoints a frame, D numbers a descriptor. Kinds:
+A letter in a shape is a size that the first row of a table decides: N keypoints a frame, D numbers a descriptor, I
+numbers that a front end says of a keypoint's error. Kinds:
 "float" is the floating-point type of the geometry, "int" int64, "bool" bool, "byte" uint8, "descriptor" bytes or
 floats.
 """
@@ -75,6 +76,9 @@ KEYFRAMES: Schema = {
     "angles": Column(("N",), "float", "radians"),
     "descriptors": Column(("N", "D"), "descriptor", "of the keypoints"),
     "mask": Column(("N",), "bool", "which rows are keypoints"),
+    "information": Column(
+        ("N", "I"), "float", "px^-2, of their errors: I = 0: by scale, 1, or 3: xx, xy, yy"
+    ),
     "point_ids": Column(("N",), "int", "rows of the points that the keypoints observe, or -1"),
 }
 
@@ -92,4 +96,5 @@ OBSERVATIONS: Schema = {
     "keypoints": Column((), "int", "row of the frame's features"),
     "pixels": Column((2,), "float", "pixels"),
     "scales": Column((), "float", "pixels"),
+    "information": Column(("I",), "float", "px^-2, as of the keypoints"),
 }

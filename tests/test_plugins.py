@@ -1,0 +1,204 @@
+"""Parts of others by name: on the command line, by entry point, and what is said where something is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam import ORB, SLAM, ClipSLAM, Config, Features, load_config, open_sequence, plugins
+from torchslam.cli import main
+from torchslam.errors import ConfigError
+from torchslam.front_end import image_extractor
+from torchslam.tracking.lightglue import LightGlue
+from torchslam.tracking.matcher import matcher_of
+from torchslam.values import Frame, View
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "own_front_end.py"
+ROOM = "synthetic:room?frames=14"
+HERE = "tests.test_plugins"
+
+
+def answer(images: Tensor) -> Features:
+    rows = images.new_ones(len(images), 20)
+    keypoints = torch.rand(len(images), 20, 2) * 100
+    described = torch.zeros(len(images), 20, 32, dtype=torch.uint8)
+    return Features(keypoints, rows, rows, rows, described, rows > 0)
+
+
+class Broken:
+    """A front end that gives what it was told to."""
+
+    changes: dict[str, Any] = {}  # noqa: RUF012 - set by a test
+
+    def __call__(self, images: Tensor) -> object:
+        return (
+            SimpleNamespace()
+            if self.changes == {"": 0}
+            else Features(**{**vars(answer(images)), **self.changes})
+        )
+
+
+class Failing:
+    def __init__(self) -> None:
+        raise RuntimeError("no licence")
+
+
+number = 7
+
+
+def test_the_example_is_a_screen_long_and_runs(tmp_path: Path) -> None:
+    """From the command line, both parts its own."""
+    body = EXAMPLE.read_text().split('"""', 2)[2].splitlines()
+    assert len([line for line in body if line.strip()]) <= 30
+    names = ["--features", "examples.own_front_end:Patches", "--matcher", "examples.own_front_end:nearest"]
+    status = main(["run", ROOM, "-o", str(tmp_path), *names, "--set", "features.num_keypoints=500"])
+    assert status == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["posed"] >= 12
+    assert metrics["ate"]["rmse_m"] if "ate" in metrics else metrics["ate_m"] < 0.05
+    assert "own_front_end:Patches" in (tmp_path / "config.toml").read_text()
+
+
+def test_the_same_object_serves_slam_and_clips() -> None:
+    room = open_sequence(ROOM)
+    front_end = ORB(500)
+    run = SLAM(room.camera, extractor=front_end).run(room)
+    own = SLAM(room.camera, load_config(None, ["features.num_keypoints=500"])).run(room)
+    assert torch.equal(run.trajectory.T_wc, own.trajectory.T_wc)
+    images = torch.cat([room.image(index) for index in range(0, 14, 2)])
+    assert int(ClipSLAM(front_end)(images, room.camera).posed.sum()) == 7
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("orbb", "must be one of .*, or PACKAGE:NAME, not 'orbb'"),
+        (":x", "must be one of"),
+        ("nowhere_at_all:x", "no package 'nowhere_at_all' can be imported"),
+        ("torchslam.nowhere:x", "no package 'torchslam.nowhere' can be imported"),
+        (f"{HERE}:nothing", f"'{HERE}' has no 'nothing'"),
+        (f"{HERE}:number", "int is nothing that can be called"),
+        (f"{HERE}:Failing", "cannot be made: RuntimeError: no licence"),
+    ],
+)
+def test_a_wrong_name_is_one_line_and_status_2(
+    name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for option in ("--features", "--matcher"):
+        assert main(["run", ROOM, "-o", str(tmp_path / option), option, name]) == 2
+        (line,) = (
+            line for line in capsys.readouterr().err.splitlines() if line.startswith("torchslam: error")
+        )
+        assert re.search(words, line), line
+
+
+rows = torch.ones(1, 20)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"": 0}, "must return torchslam.Features, not SimpleNamespace"),
+        ({"keypoints": rows}, r"keypoints must be \(1, N, 2\), not \(1, 20\)"),
+        ({"scales": torch.ones(1, 19)}, r"scales must be \(1, 20\), not \(1, 19\)"),
+        ({"mask": rows}, "mask must be bool, not torch.float32"),
+        ({"angles": rows.long()}, "angles must be floats, not torch.int64"),
+        ({"descriptors": torch.zeros(1, 20)}, "descriptors must be"),
+        (
+            {"descriptors": torch.zeros(1, 20, 32).int()},
+            "descriptors must be uint8, bits, or floats, not torch.int32",
+        ),
+        ({"scales": 0 * rows}, "scales must be positive"),
+        ({"scales": torch.nan * rows}, "scales must be finite"),
+        (
+            {"information": torch.ones(1, 20, 3)},
+            r"information must be \(1, 20\) or \(1, 20, 2, 2\), not \(1, 20, 3\)",
+        ),
+        ({"information": rows.long()}, "information must be floats"),
+        ({"information": -rows}, "information must be positive"),
+        (
+            {"information": torch.ones(1, 20, 2, 2)},
+            "information must be positive, a matrix positive definite",
+        ),
+        ({"information": torch.nan * rows}, "information must be positive"),
+    ],
+)
+def test_a_wrong_answer_of_a_front_end_is_named(changes: dict[str, Any], words: str) -> None:
+    Broken.changes = changes
+    extract = image_extractor(load_config(None, [f"features.kind={HERE}:Broken"]))
+    with pytest.raises(ConfigError, match=f"front end {HERE}:Broken: {words}"):
+        extract(Frame(0, 0.0, torch.zeros(1, 1, 100, 100)))
+
+
+def test_what_a_package_registers_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = EntryPoint("mine", f"{HERE}:answer", plugins.FRONT_ENDS)
+    monkeypatch.setattr(
+        plugins, "registered", lambda group: {"mine": mine} if group == plugins.FRONT_ENDS else {}
+    )
+    config = load_config(None, ["features.kind=mine"])
+    assert image_extractor(config)(Frame(0, 0.0, torch.zeros(1, 1, 100, 100))).mask.sum() == 20
+    with pytest.raises(
+        ConfigError, match=r"matching.matcher must be one of descriptors, lightglue, or PACKAGE:NAME"
+    ):
+        load_config(None, ["matching.matcher=mine"])
+
+
+def test_information_follows_images_that_were_reduced() -> None:
+    """Stated for the reduced image, where a pixel is two of the large one."""
+
+    def says(images: Tensor) -> Features:
+        return Features(**{**vars(answer(images)), "information": torch.full((1, 20), 4.0)})
+
+    found = image_extractor(Config(), front_end=says)(Frame(0, 0.0, torch.zeros(1, 1, 960, 1280)))
+    assert found.information is not None
+    torch.testing.assert_close(found.information, torch.full((1, 20), 1.0))
+
+
+def lightglue_file(path: Path) -> Path:
+    from kornia.feature import LightGlue as Network
+    from safetensors.torch import save_file
+
+    torch.manual_seed(0)
+    network = Network(features=None, input_dim=64, descriptor_dim=96, n_layers=2, num_heads=1)
+    save_file({f"matcher.{name}": tensor for name, tensor in network.state_dict().items()}, path)
+    return path
+
+
+def view(dim: int, seed: int) -> View:
+    generator = torch.Generator().manual_seed(seed)
+    described = torch.nn.functional.normalize(torch.randn(30, dim, generator=generator), dim=-1)
+    keypoints = 100 * torch.rand(30, 2, generator=generator, dtype=torch.float64)
+    ones = torch.ones(30, dtype=torch.float64)
+    return View(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
+
+
+def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
+    """With weights of chance: what it says is nothing, how it says it is what is tested."""
+    from torchslam.tracking.matcher import matched
+
+    file = lightglue_file(tmp_path / "lightglue.safetensors")
+    matcher = matcher_of(
+        load_config(None, ["matching.matcher=lightglue", f'matching.weights="{file}"']).matching
+    )
+    assert isinstance(matcher, LightGlue)
+    matcher.network.conf.filter_threshold = 0.0
+    one = view(64, 1)
+    pairs = matched(matcher, one, one)
+    assert len(pairs.first) > 0
+    assert pairs.weights is not None
+    assert bool((pairs.weights > 0).all())
+    with pytest.raises(ConfigError, match="its weights are for descriptors of 64 floats, these are 32"):
+        matcher(view(32, 1), view(32, 2), None)
+    with pytest.raises(ConfigError, match="needs a file of weights"):
+        matcher_of(load_config(None, ["matching.matcher=lightglue"]).matching)
+    (tmp_path / "other.pt").write_bytes(b"nothing")
+    with pytest.raises(ConfigError, match="cannot read the weights"):
+        LightGlue(tmp_path / "other.pt")

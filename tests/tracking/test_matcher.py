@@ -1,0 +1,131 @@
+"""Matchers of one's own: the same bytes for torchslam's own one, images, weights, and errors that say what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.walks import Walk, arc
+from torchslam import SLAM, Matches, Run, load_config
+from torchslam.errors import ConfigError
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, nearest_keypoints
+from torchslam.values import View
+
+CONFIG = load_config(
+    None,
+    [
+        "features.kind=simulated",
+        "features.num_keypoints=250",
+        "simulated.points_per_view=150",
+        "simulated.noise_px=0.4",
+        "simulated.outliers=0.05",
+    ],
+)
+WALK = Walk(arc(36)[:22])
+
+
+def run_with(matcher: Matcher | None) -> tuple[SLAM, Run]:
+    slam = SLAM(WALK.camera, CONFIG, matcher=matcher)
+    return slam, slam.run(WALK)
+
+
+class Wrapped:
+    """torchslam's own matcher as somebody else's, which remembers what it was asked."""
+
+    def __init__(self, wants_images: bool = False) -> None:
+        self.own, self.wants_images = DescriptorMatcher(CONFIG.matching), wants_images
+        self.asked: set[str] = set()
+
+    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+        kind = "anywhere" if prior is None else "lines" if prior.radius_px is None else "near"
+        self.asked.add(kind)
+        assert (view_2.image is not None) == self.wants_images
+        if kind != "near":
+            assert (view_1.image is not None) == self.wants_images
+        return self.own(view_1, view_2, prior)
+
+
+def test_its_own_matcher_in_the_hook_gives_the_same_bytes() -> None:
+    matcher = Wrapped()
+    one, other = run_with(None)[1], run_with(matcher)[1]
+    assert matcher.asked == {"anywhere", "lines", "near"}
+    assert len(one.trajectory) == len(WALK)
+    assert torch.equal(one.trajectory.T_wc, other.trajectory.T_wc)
+    for table in ("points", "keyframes"):
+        columns = getattr(one.map, table).columns()
+        assert all(torch.equal(rows, getattr(other.map, table)[name]) for name, rows in columns.items())
+
+
+def test_a_matcher_that_wants_images_gets_those_of_keyframes_too() -> None:
+    slam, run = run_with(Wrapped(wants_images=True))
+    assert len(run.trajectory) == len(WALK)
+    image = slam.map.view(0).image
+    assert image is not None
+    assert image.shape == (1, 1, 240, 320)
+
+
+class Doubting(Wrapped):
+    """Believes in a match by half where it is in the left half of the image."""
+
+    weighs = True
+
+    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+        found = super().__call__(view_1, view_2, prior)
+        left = view_2.keypoints[found.indices_2[0], 0] < 160
+        return replace(found, weights=torch.where(left, 0.5, 1.0)[None].double())
+
+
+def test_weights_multiply_the_information_of_what_is_seen() -> None:
+    _, run = run_with(Doubting())
+    assert len(run.trajectory) == len(WALK)
+    weights, pixels = run.graph.weights, run.graph.pixels
+    right, left = weights[pixels[:, 0] >= 160], weights[pixels[:, 0] < 160]
+    assert float((right == 4.0).double().mean()) > 0.8  # half a scale, which is 1, and all of the weight
+    assert float((left == 2.0).double().mean()) > 0.8
+
+
+def rows_of(count: int) -> Tensor:
+    return torch.arange(count)[None]
+
+
+def matches(**changes: object) -> Matches:
+    count = 250
+    some = rows_of(count) < 5
+    found = Matches(rows_of(count) * some, rows_of(count) * some, torch.zeros(1, count), some)
+    return replace(found, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (None, "must return torchslam.Matches, not NoneType"),
+        (matches(mask=torch.ones(1, 250)), r"mask must be bool \(1, M\), not torch.float32 \(1, 250\)"),
+        (matches(indices_1=rows_of(250).int()), "indices_1 must be int64"),
+        (matches(indices_2=rows_of(249)), "indices_2 must be int64"),
+        (matches(indices_2=rows_of(250) + 1000), r"indices_2 must lie in 0 ... 249"),
+        (matches(indices_2=0 * rows_of(250)), "matched twice"),
+        (matches(indices_1=249 - rows_of(250)), "indices_1 names rows that are no keypoints"),
+        (matches(weights=torch.zeros(1, 250)), "weights must be positive floats"),
+        (matches(weights=torch.ones(1, 2)), "weights must be positive floats"),
+    ],
+)
+def test_a_wrong_answer_is_named(answer: Matches | None, words: str) -> None:
+    def odd(view_1: View, view_2: View, prior: Prior | None) -> Matches:
+        return answer  # type: ignore[return-value]
+
+    with pytest.raises(ConfigError, match=f"matcher odd: .*{words}"):
+        run_with(odd)
+
+
+def test_pixels_belong_to_the_nearest_keypoint_and_each_keypoint_to_one() -> None:
+    keypoints = torch.tensor([[10.0, 10.0], [20.0, 10.0], [30.0, 10.0], [40.0, 10.0]]).double()
+    mask = torch.tensor([True, True, True, False])
+    view = View(0, 0.0, keypoints, torch.ones(4).double(), torch.zeros(4), torch.zeros(4, 0), mask)
+    pixels = torch.tensor([[11.0, 10.0], [10.0, 10.2], [30.0, 12.0], [40.0, 10.0], [21.0, 10.0]])
+    found = nearest_keypoints(pixels, torch.tensor([4, 5, 6, 7, 8]), view)
+    assert found.mask.tolist() == [[False, True, False, False, True]]
+    assert found.indices_1[found.mask].tolist() == [5, 8]
+    assert found.indices_2[found.mask].tolist() == [0, 1]

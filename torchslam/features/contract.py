@@ -1,0 +1,68 @@
+"""What a front end must return, and an error that says what is wrong where it does not."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchslam.errors import ConfigError
+from torchslam.geometry.whitening import is_definite
+from torchslam.values import Features
+
+COLUMNS: dict[str, tuple[int, ...]] = {
+    "keypoints": (2,),
+    "scores": (),
+    "scales": (),
+    "angles": (),
+    "mask": (),
+}
+"""The shape of one keypoint's row."""
+
+
+def check_features(found: object, images: Tensor, name: str) -> None:
+    """Raises ConfigError where a front end's answer to images (B, 1, H, W) is not `Features` of B images."""
+
+    def refuse(what: str) -> None:
+        raise ConfigError(f"front end {name}: {what}")
+
+    if not isinstance(found, Features):
+        refuse(f"must return torchslam.Features, not {type(found).__name__}")
+        return
+    if not isinstance(found.keypoints, Tensor) or found.keypoints.ndim != 3:
+        refuse(f"keypoints must be ({len(images)}, N, 2), not {_described(found.keypoints)}")
+    rows = (len(images), found.keypoints.shape[1])
+    for column, shape in COLUMNS.items():
+        values = getattr(found, column)
+        if not isinstance(values, Tensor) or tuple(values.shape) != (*rows, *shape):
+            refuse(f"{column} must be {(*rows, *shape)}, not {_described(values)}")
+        if not (values.dtype == torch.bool if column == "mask" else values.is_floating_point()):
+            refuse(f"{column} must be {'bool' if column == 'mask' else 'floats'}, not {values.dtype}")
+    described = found.descriptors
+    if not isinstance(described, Tensor) or described.ndim != 3 or tuple(described.shape[:2]) != rows:
+        refuse(f"descriptors must be {rows} + (D,), not {_described(described)}")
+    if described.dtype != torch.uint8 and not described.is_floating_point():
+        refuse(f"descriptors must be uint8, bits, or floats, not {described.dtype}")
+    for column in ("keypoints", "scales"):
+        if not bool(getattr(found, column).isfinite().all()):
+            refuse(f"{column} must be finite, also where mask is False")
+    if bool(((found.scales <= 0) & found.mask).any()):
+        refuse("scales must be positive")
+    if found.information is not None:
+        _check_information(found.information, found.mask, rows, refuse)
+
+
+def _check_information(information: object, mask: Tensor, rows: tuple[int, int], refuse: object) -> None:
+    assert callable(refuse)
+    shapes = (rows, (*rows, 2, 2))
+    if not isinstance(information, Tensor) or tuple(information.shape) not in shapes:
+        refuse(f"information must be {shapes[0]} or {shapes[1]}, not {_described(information)}")
+    assert isinstance(information, Tensor)
+    if not information.is_floating_point():
+        refuse(f"information must be floats, not {information.dtype}")
+    good = information > 0 if information.ndim == 2 else is_definite(information)
+    if not bool((good & information.isfinite().reshape(*rows, -1).all(-1))[mask].all()):
+        refuse("information must be positive, a matrix positive definite, where mask is True")
+
+
+def _described(values: object) -> str:
+    return f"{tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__

@@ -1,0 +1,92 @@
+"""Parts of others, by name: PACKAGE:NAME, or what an installed package registered under an entry point.
+
+    [project.entry-points."torchslam.front_ends"]
+    mine = "my_package.features:MyFeatures"
+
+then `--features mine`, or `--features my_package.features:MyFeatures` without registering anything. A class is made
+with those of the configured arguments that it takes (num_keypoints, weights); anything else that can be called is the
+part itself. Importing it runs its code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from inspect import Parameter, signature
+from typing import Any
+
+from torchslam.errors import ConfigError
+
+FRONT_ENDS = "torchslam.front_ends"
+MATCHERS = "torchslam.matchers"
+
+
+@cache
+def registered(group: str) -> dict[str, EntryPoint]:
+    """What installed packages registered, by name."""
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def is_known(group: str, name: str) -> bool:
+    """Whether a name could be that of a part: registered, or of the form PACKAGE:NAME."""
+    package, colon, attribute = name.partition(":")
+    return bool(colon and package and attribute) or name in registered(group)
+
+
+def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
+    """The part of a name; of a class, one made with those of the arguments that it takes and that are not None.
+
+    Raises ConfigError for a package or an attribute that there is not, one that fails, and what cannot be called.
+    """
+    what = f"{group.rpartition('.')[2].rstrip('s').replace('_', ' ')} {name}"
+    point = registered(group).get(name)
+    package, _, attribute = (point.value if point else name).partition(":")
+    try:
+        part: Any = import_module(package)
+    except ModuleNotFoundError as error:
+        missing = "it" if error.name == package.partition(".")[0] or error.name == package else error.name
+        raise ConfigError(
+            f"{what}: no package {package!r} can be imported ({missing} is not there)"
+        ) from None
+    except Exception as error:
+        raise ConfigError(f"{what}: importing {package!r} failed: {_words(error)}") from error
+    for each in attribute.split("."):
+        if not hasattr(part, each):
+            raise ConfigError(f"{what}: {package!r} has no {attribute!r}")
+        part = getattr(part, each)
+    if isinstance(part, type):
+        try:
+            part = part(**_taken(part, arguments))
+        except ConfigError:
+            raise
+        except Exception as error:
+            raise ConfigError(f"{what}: cannot be made: {_words(error)}") from error
+    if not callable(part):
+        raise ConfigError(f"{what}: {type(part).__name__} is nothing that can be called")
+    called: Callable[..., Any] = part
+    return called
+
+
+def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
+    """The front end of a name: one of torchslam's own, or as `load` finds it."""
+    from torchslam.features import EXTRACTORS, extractor
+
+    if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
+        return extractor(name, num_keypoints, weights)
+    return load(FRONT_ENDS, name, num_keypoints=num_keypoints, weights=weights)
+
+
+def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:
+    """The arguments that a class can be made with."""
+    given = {name: value for name, value in arguments.items() if value is not None}
+    parameters = signature(kind).parameters.values()
+    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters):
+        return given
+    names = {parameter.name for parameter in parameters}
+    return {name: value for name, value in given.items() if name in names}
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

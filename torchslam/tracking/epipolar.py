@@ -1,0 +1,104 @@
+"""Matches along epipolar lines: keypoints of two views whose poses are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchslam.features import expand_runs, match_pairs
+from torchslam.geometry import Camera, Noise
+from torchslam.values import Features, View
+from torchslam.world.map import NO_POINT, Map
+
+
+@dataclass(frozen=True)
+class FreeKeypoints:
+    """The keypoints of k keyframes that see no point yet; where one has fewer than others, rows are masked out.
+
+    features: (k, n, ...); rows: (k, n) of the keyframes' keypoints; normalized: (k, n, 2) undistorted;
+    noise: (k, n)
+    """
+
+    features: Features
+    rows: Tensor
+    normalized: Tensor
+    noise: Noise
+
+    @classmethod
+    def of(cls, slam_map: Map, keyframes: Tensor, camera: Camera) -> FreeKeypoints:
+        """Those of keyframes (k,)."""
+        table = slam_map.keyframes
+        free = table["mask"][keyframes] & (table["point_ids"][keyframes] == NO_POINT)
+        free, rows = torch.sort(free, dim=1, descending=True, stable=True)
+        free = free[:, : int(free.sum(1).max())]
+        rows = rows[:, : free.shape[1]]
+        features = replace(slam_map.features(keyframes, rows), mask=free)
+        noise = slam_map.noise(keyframes[:, None], rows)
+        return cls(features, rows, camera.normalize(features.keypoints), noise)
+
+
+def match_along_epipolar_lines(
+    here: FreeKeypoints,
+    there: FreeKeypoints,
+    T_21: Tensor,
+    camera: Camera,
+    epipolar_px: float,
+    max_distance: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Keypoints of one keyframe and of k others that are each other's best on the epipolar line.
+
+    T_21: (k, 4, 4) from the one camera to the others. Returns for every match (m,) which of the others it is with, and
+    the rows in `here` and `there`, ordered by these three.
+
+    The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
+    contain the baseline, so that a plane is an angle around it.
+    """
+    rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
+    (angles_1, _), (angles_2, sines) = (
+        around(T_21[:, :3, 3], rays) for rays in (rays_1, pad(there.normalized, (0, 1), value=1.0))
+    )
+    width = epipolar_px / camera.focal * there.features.scales / sines.clamp(min=1e-12)
+    width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
+    # A number per angle and neighbour, each a turn below and above as well: a window may reach over the end of a turn.
+    offset = 6 * math.pi * torch.arange(len(T_21), device=width.device)[:, None]
+    turns = 2 * math.pi * torch.arange(-1, 2, device=width.device)
+    keys, order = (angles_1[..., None] + offset[..., None] + turns).flatten().sort(stable=True)
+    left, right = (torch.searchsorted(keys, angles_2 + offset + sign * width) for sign in (-1, 1))
+    column, place = expand_runs(left.flatten(), torch.where(there.features.mask, right, left).flatten())
+    count, descriptors = angles_1.shape[1], here.features.descriptors
+    row, column = match_pairs(
+        descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
+        there.features.descriptors.flatten(0, 1),
+        order[place] // 3,
+        column,
+        0.8 * max_distance,
+    )
+    return row // count, row % count, column % width.shape[1]
+
+
+def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """(k, n), (k, n) angles of rays (k, n, 3) around axes (k, 3), radians, and the sines of their angles to these."""
+    least = torch.nn.functional.one_hot(axes.abs().argmin(-1), 3).to(axes.dtype)
+    across = torch.nn.functional.normalize(torch.linalg.cross(axes, least), dim=-1)
+    other = torch.linalg.cross(torch.nn.functional.normalize(axes, dim=-1), across)
+    x, y = (rays @ torch.stack((across, other), dim=-1)).unbind(-1)
+    return torch.atan2(y, x), torch.hypot(x, y) / torch.linalg.vector_norm(rays, dim=-1)
+
+
+def match_free(
+    view_1: View, view_2: View, T_21: Tensor, camera: Camera, epipolar_px: float, max_distance: float
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) keypoints of two views, of those of their masks, that `match_along_epipolar_lines` finds."""
+    one, two = (_of_view(view, camera) for view in (view_1, view_2))
+    _, at_1, at_2 = match_along_epipolar_lines(one, two, T_21[None], camera, epipolar_px, max_distance)
+    return one.rows[0, at_1], two.rows[0, at_2]
+
+
+def _of_view(view: View, camera: Camera) -> FreeKeypoints:
+    rows = torch.nonzero(view.mask)[:, 0]
+    features = view.features.rows(rows)
+    return FreeKeypoints(features, rows[None], camera.normalize(features.keypoints), view.noise[rows[None]])

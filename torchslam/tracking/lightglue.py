@@ -1,0 +1,126 @@
+"""LightGlue as a matcher, with weights from a local file; nothing is ever downloaded. The network is kornia's.
+
+Source: Lindenberger, Sarlin and Pollefeys, "LightGlue: local feature matching at light speed", ICCV 2023.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from torchslam.errors import ConfigError
+from torchslam.regular_file import check_regular
+from torchslam.tracking.matcher import Prior
+from torchslam.values import Matches, View
+
+MAX_BYTES = 1 << 30  # of a file of weights
+
+
+class LightGlue(nn.Module):
+    """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
+
+    weights: safetensors or .pt/.pth file; which variant it is, its shapes tell
+    Raises ConfigError if the file cannot be read or holds another network.
+    """
+
+    weighs = True
+
+    def __init__(self, weights: str | Path | None = None) -> None:
+        from kornia.feature import LightGlue as Network
+
+        super().__init__()
+        if weights is None:
+            raise ConfigError("matcher lightglue needs a file of weights: matching.weights")
+        state = renamed(_read(weights))
+        try:
+            width, self.size_in = state["input_proj.weight"].shape
+            layers = len({name.split(".")[1] for name in state if name.startswith("transformers.")})
+            self.with_angles = state["posenc.Wr.weight"].shape[1] == 4
+        except (KeyError, ValueError):
+            raise ConfigError(f"{weights}: not the weights of a LightGlue network") from None
+        self.network = Network(
+            features=None,  # type: ignore[arg-type]  # a name would download
+            input_dim=self.size_in,
+            descriptor_dim=width,
+            n_layers=layers,
+            num_heads=max(1, width // 64 if width % 64 == 0 else 1),
+            add_scale_ori=self.with_angles,
+        )
+        parameters = {name for name, _ in self.network.named_parameters()}
+        try:
+            missing = parameters & set(self.network.load_state_dict(state, strict=False).missing_keys)
+        except RuntimeError as error:  # shapes differ
+            raise ConfigError(f"{weights}: the weights of another network") from error
+        if missing:
+            raise ConfigError(
+                f"{weights}: the weights of another network ({len(missing)} tensors are missing)"
+            )
+        self.network.eval()
+
+    @torch.no_grad()
+    def forward(self, view_1: View, view_2: View, prior: Prior | None = None) -> Matches:
+        """By descriptors and places alone: the prior is left alone. Raises ConfigError for other descriptors."""
+        rows = [torch.nonzero(view.mask)[:, 0] for view in (view_1, view_2)]
+        if min(map(len, rows)) == 0:
+            none = rows[0][:0][None]
+            return Matches(none, none, none.float(), none.bool())
+        size = torch.cat([view_1.keypoints[rows[0]], view_2.keypoints[rows[1]]]).amax(0) + 1
+        data = {
+            f"image{i}": self._data(view, at, size)
+            for i, (view, at) in enumerate(zip((view_1, view_2), rows, strict=True))
+        }
+        found = self.network(data)
+        first, second = found["matches"][0].unbind(-1)
+        scores = found["scores"][0].double()
+        good = scores > 0
+        one, two = rows[0][first][None], rows[1][second][None]
+        return Matches(one, two, (1 - scores).float()[None], good[None], weights=scores[None])
+
+    def _data(self, view: View, rows: Tensor, size: Tensor) -> dict[str, Tensor]:
+        described = view.descriptors[rows]
+        if not described.is_floating_point() or described.shape[-1] != self.size_in:
+            raise ConfigError(
+                f"matcher lightglue: its weights are for descriptors of {self.size_in} floats, "
+                f"these are {described.shape[-1]} x {described.dtype}"
+            )
+        data = {
+            "keypoints": view.keypoints[rows].float()[None],
+            "descriptors": described.float()[None],
+            "image_size": size.float()[None],
+        }
+        if self.with_angles:
+            data |= {"scales": view.scales[rows].float()[None], "oris": view.angles[rows].float()[None]}
+        return data
+
+
+def renamed(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors under the names of today: published files have older ones."""
+    names = {}
+    for name in state:
+        new = name.removeprefix("matcher.")
+        for part in ("self_attn", "cross_attn"):
+            head, dot, rest = new.partition(f"{part}.")
+            if not head and dot:
+                layer, _, rest = rest.partition(".")
+                new = f"transformers.{layer}.{part}.{rest}"
+        names[name] = new
+    return {new: state[name] for name, new in names.items()}
+
+
+def _read(weights: str | Path) -> dict[str, Tensor]:
+    """The tensors of a file."""
+    try:
+        check_regular(weights, MAX_BYTES, "a file of weights")
+        if Path(weights).suffix == ".safetensors":
+            return load_file(str(weights))
+        loaded: Any = torch.load(str(weights), map_location="cpu", weights_only=True)
+        return {name: tensor for name, tensor in loaded.items() if isinstance(tensor, Tensor)}
+    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RuntimeError, EOFError) as error:
+        raise ConfigError(f"{weights}: cannot read the weights ({error})") from error
+    except Exception as error:  # of unpickling
+        raise ConfigError(f"{weights}: cannot read the weights ({type(error).__name__})") from error

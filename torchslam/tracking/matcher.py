@@ -1,0 +1,177 @@
+"""Who matches whom between two views: the hook for matchers, and torchslam's own by descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchslam.config import MatchingConfig
+from torchslam.errors import ConfigError
+from torchslam.features import match, match_projected
+from torchslam.geometry import Camera
+from torchslam.plugins import MATCHERS, load
+from torchslam.tracking.epipolar import match_free
+from torchslam.values import Frame, Matches, View
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of two views before they are matched. A matcher may leave it alone: what it finds is tested.
+
+    radius_px:   (N,) of the first view's keypoints, which then are predictions: where points of the map should appear
+                 in the second view, with the scale and the descriptor they had; their partners lie so near
+    ratio:       of the best to the second best distance, where there is a radius; None: no such test
+    T_21:        (4, 4) from the first camera to the second, of length as in the map, and `camera` of both: partners lie
+                 within `epipolar_px` of their epipolar lines
+    """
+
+    radius_px: Tensor | None = None
+    ratio: float | None = None
+    T_21: Tensor | None = None
+    camera: Camera | None = None
+    epipolar_px: float = 0.0
+
+
+Matcher = Callable[[View, View, Prior | None], Matches]
+"""Two views, and what is known before, to a batch of one of `Matches`. Only keypoints of `mask` may match, each of the
+second view once.
+
+A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints; one whose
+attribute `wants_images` is true finds (1, 1, H, W) grey in `View.image`, of frames of this run, not of what the map
+expects to be seen."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Rows (m,), (m,) that match, and what each match counts, (m,); None: all alike."""
+
+    first: Tensor
+    second: Tensor
+    weights: Tensor | None = None
+
+
+class DescriptorMatcher:
+    """torchslam's own: mutual nearest descriptors with the ratio test; near a prediction, or along an epipolar line,
+    where there is a prior."""
+
+    def __init__(self, settings: MatchingConfig) -> None:
+        self.settings = settings
+
+    def __call__(self, view_1: View, view_2: View, prior: Prior | None = None) -> Matches:
+        limit = max_distance(view_2.descriptors, self.settings)
+        if prior is None:
+            return match(
+                view_1.features,
+                view_2.features,
+                ratio=self.settings.ratio,
+                mutual=True,
+                max_distance=limit,
+            )
+        if prior.radius_px is not None:
+            return match_projected(
+                view_1.descriptors[None],
+                view_1.keypoints[None],
+                prior.radius_px[None],
+                view_2.features,
+                mask=view_1.mask[None],
+                scales=view_1.scales[None],
+                max_distance=limit,
+                ratio=prior.ratio,
+            )
+        if prior.T_21 is None or prior.camera is None:
+            raise ValueError("a prior needs radius_px, or T_21 and camera")
+        rows, columns = match_free(view_1, view_2, prior.T_21, prior.camera, prior.epipolar_px, limit)
+        return Matches(rows[None], columns[None], torch.zeros_like(rows)[None].float(), rows[None] >= 0)
+
+
+def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
+    """The threshold for this kind of descriptor: bits, or 1 - cosine."""
+    return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
+
+
+def matcher_of(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
+    """A matcher of one's own, or the configured one. Raises ConfigError where there is none of its name."""
+    if matcher is None and settings.matcher == "lightglue":
+        from torchslam.tracking.lightglue import LightGlue
+
+        return LightGlue(settings.weights or None)
+    if matcher is None and settings.matcher != "descriptors":
+        return load(MATCHERS, settings.matcher, weights=settings.weights or None)
+    return DescriptorMatcher(settings) if matcher is None else matcher
+
+
+def as_wanted(view: View, frame: Frame, matcher: Matcher) -> View:
+    """A view as a matcher wants it: with the image, with stated noise that weights can multiply."""
+    if getattr(matcher, "weighs", False):
+        view = replace(view, information=view.noise.stated().information)
+    if getattr(matcher, "wants_images", False) and frame.image.numel():
+        view = replace(view, image=frame.image)
+    return view
+
+
+def matched(matcher: Matcher, view_1: View, view_2: View, prior: Prior | None = None) -> Pairs:
+    """Who matches whom. Raises ConfigError where a matcher's answer is not that of one."""
+    found = matcher(view_1, view_2, prior)
+    if not isinstance(matcher, DescriptorMatcher):
+        check_matches(found, view_1, view_2, matcher)
+    mask = found.mask[0]
+    weights = None
+    if found.weights is not None and getattr(matcher, "weighs", False):
+        weights = found.weights[0][mask].to(view_2.keypoints)
+    return Pairs(found.indices_1[0][mask], found.indices_2[0][mask], weights)
+
+
+def check_matches(found: Any, view_1: View, view_2: View, matcher: object) -> None:
+    """Raises ConfigError where `found` is not `Matches` between two views, each keypoint of the second used once."""
+    name = getattr(matcher, "__name__", type(matcher).__name__)
+
+    def refuse(what: str) -> None:
+        raise ConfigError(f"matcher {name}: {what}")
+
+    if not isinstance(found, Matches):
+        refuse(f"must return torchslam.Matches, not {type(found).__name__}")
+    shape = tuple(found.mask.shape)
+    if len(shape) != 2 or shape[0] != 1 or found.mask.dtype != torch.bool:
+        refuse(f"mask must be bool (1, M), not {found.mask.dtype} {shape}")
+    for column, view in (("indices_1", view_1), ("indices_2", view_2)):
+        rows = getattr(found, column)
+        if tuple(rows.shape) != shape or rows.dtype != torch.int64:
+            refuse(f"{column} must be int64 {shape}, not {rows.dtype} {tuple(rows.shape)}")
+        rows = rows[found.mask]
+        if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(view.mask):
+            refuse(f"{column} must lie in 0 ... {len(view.mask) - 1}")
+        if not bool(view.mask[rows].all()):
+            refuse(f"{column} names rows that are no keypoints: only those of mask may match")
+    second = found.indices_2[found.mask]
+    if len(torch.unique(second)) != len(second):
+        refuse("a keypoint of the second view is matched twice")
+    if found.weights is not None:
+        wrong = tuple(found.weights.shape) != shape or not found.weights.is_floating_point()
+        if wrong or not bool((found.weights[found.mask] > 0).all()):
+            refuse(f"weights must be positive floats {shape}")
+
+
+def nearest_keypoints(pixels: Tensor, rows: Tensor, view: View, radius_px: float = 1.5) -> Matches:
+    """What a dense matcher or optical flow says, as matches of keypoints: pixels (n, 2) in a view of keypoints `rows`
+    (n,) of another one belong to the view's nearest keypoint.
+
+    Where there is none within the radius there is no match: a point of the map is always a keypoint of both views. Of
+    several that come to one keypoint the nearest counts.
+    """
+    distances = torch.cdist(pixels.to(view.keypoints), view.keypoints).masked_fill(~view.mask, torch.inf)
+    nearest, column = distances.min(1)
+    order = torch.argsort(nearest, stable=True)
+    first = torch.full((len(view.mask),), len(rows), dtype=torch.int64, device=rows.device)
+    rank = torch.argsort(order)
+    first = first.scatter_reduce(0, column, rank, "amin")
+    mask = (nearest <= radius_px) & (first[column] == rank)
+    return Matches(
+        torch.where(mask, rows, 0)[None],
+        torch.where(mask, column, 0)[None],
+        torch.where(mask, nearest, 0.0)[None].float(),
+        mask[None],
+    )
