@@ -99,7 +99,11 @@ def batch_of(problems: list[BundleProblem]) -> BundleProblem:
 
 
 def loss_of(solution: BundleSolution) -> Tensor:
-    points = solution.points_w.flatten()
+    return points_loss(solution.points_w)
+
+
+def points_loss(points_w: Tensor) -> Tensor:
+    points = points_w.flatten()
     return points @ torch.linspace(-1, 1, len(points), dtype=points.dtype)
 
 
