@@ -23,7 +23,9 @@ _STATICS = "str model, int[] size, str kernel, int iterations, float tolerance"
 def pose_minimum(minimization: PoseMinimization, tensors: Tensors, backward: Backward) -> Tensors:
     """What `minimum` finds, in a graph. Raises ValueError where the gradient is to pass the iterations."""
     if backward not in ("implicit", "detached"):
-        raise ValueError(f"backward={backward!r} can not be compiled; torch.compile takes implicit and detached")
+        raise ValueError(
+            f"backward={backward!r} can not be compiled; torch.compile takes implicit and detached"
+        )
     if backward == "detached":
         tensors = tuple(tensor.detach() for tensor in tensors)
     observations = minimization.inputs.observations
