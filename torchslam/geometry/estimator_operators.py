@@ -47,6 +47,7 @@ def _relative_pose_like(inputs: Sequence[Tensor], mask: Tensor, *_: Any) -> tupl
         empty((B, N), mask),
         empty((B, N), mask),
         empty((3, B), x),
+        empty((B, 4, 4), x),
     )
 
 
@@ -70,7 +71,7 @@ operator(
 operator(
     "relative_pose",
     f"(Tensor[] inputs, Tensor mask, {_CAMERAS}, str wanted, int seed, float confidence, int min_samples, "
-    f"int max_samples) -> ({', '.join(9 * ['Tensor'])})",
+    f"int max_samples) -> ({', '.join(10 * ['Tensor'])})",
     _relative_pose,
     _relative_pose_like,
 )

@@ -63,6 +63,8 @@ class RelativePose:
     ambiguous: (B,) the matches lie on a plane and two motions explain them; T_21 is the likelier
     score_essential, score_homography, score_rotation: (B,) sum over the matches of 1 - min((error / threshold)^2, 1);
                zero for models that were not asked for
+    T_21_essential: (B, 4, 4) the pose of the essential matrix, whatever was chosen, without gradient; for those who
+               want a pose also where there is no `success`: of real pairs that were refused it is right now and then
     """
 
     T_21: Tensor
@@ -73,6 +75,7 @@ class RelativePose:
     score_essential: Tensor
     score_homography: Tensor
     score_rotation: Tensor
+    T_21_essential: Tensor
 
     @property
     def model(self) -> tuple[str, ...]:
@@ -148,6 +151,7 @@ def estimate_relative_pose(
         found.model,
         found.ambiguous & found.significant,
         *found.scores.unbind(0),
+        found.T_essential,
     )
 
 
@@ -175,7 +179,7 @@ class FoundPose(NamedTuple):
     """T_21 (B, 4, 4) of the chosen model (B,), `normal` (B, 3) of its plane, and what it rests on.
 
     noise: (B,) thresholds, the unit of the fits; significant: (B,) no accident; used: (B, N) matches that the final
-    fit saw; scores: (3, B)
+    fit saw; scores: (3, B); T_essential: (B, 4, 4)
     """
 
     T_21: Tensor
@@ -187,6 +191,7 @@ class FoundPose(NamedTuple):
     inliers: Tensor
     used: Tensor
     scores: Tensor
+    T_essential: Tensor
 
 
 def _views(
@@ -236,15 +241,16 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     if wanted == "essential":
         squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
         model, ambiguous = torch.zeros_like(mask[:, 0], dtype=torch.int64), torch.zeros_like(mask[:, 0])
-        R, t = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
+        R, t = R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         normal = torch.zeros_like(t)
     else:
         fits = fit_models(views, R, t, generator)
         model = choose(fits, mask, chance * noise)
         if bool((model != ESSENTIAL).any()):
             fits = fits.finished(views, width)
-        R, t, normal, ambiguous = pose_of(views, fits, model)
         squared = fits.squared
+        R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
+        R, t, normal, ambiguous = pose_of(views, fits, model)
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
@@ -252,9 +258,9 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     significant = significant & is_spread(views.in_units(1 / noise[:, None]), inliers)
     used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
-    found = mask.sum(-1) > 5
+    found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
     return FoundPose(
-        torch.where(found[:, None, None], rigid(R, t), torch.eye(4, dtype=R.dtype, device=R.device)),
+        torch.where(found, rigid(R, t), eye),
         normal,
         model,
         noise,
@@ -263,6 +269,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         inliers & significant[:, None],
         used & significant[:, None],
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
+        torch.where(found, rigid(R_E, t_E), eye),
     )
 
 
@@ -307,7 +314,7 @@ def _nothing(pixels: Tensor) -> RelativePose:
     score = torch.zeros(B, dtype=pixels.dtype, device=pixels.device)
     model = torch.full((B,), ROTATION, device=pixels.device)
     no = torch.zeros(B, N + 1, dtype=torch.bool, device=pixels.device)
-    return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score)
+    return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21)
 
 
 def attach_relative_pose(
