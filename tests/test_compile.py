@@ -34,8 +34,8 @@ def refinement(camera_model: str = "pinhole", **options: Any) -> Case:
     mask = torch.arange(40)[None] % 7 != 0
 
     def refine(points: Tensor, pixels: Tensor, params: Tensor, weights: Tensor, information: Tensor) -> Any:
-        prior = PosePrior(start, information @ information.mT)
-        given = start, points, pixels, camera.with_params(params), weights, mask
+        prior = PosePrior(start.to(points), (information[:, :, None] * information[:, None]).sum(-1))
+        given = start.to(points), points, pixels, camera.with_params(params), weights, mask
         refined = refine_pose(*given, scale=2.0, prior=prior, **options)
         return refined.T_cw, refined.success, refined.cost, *vars(refined.convergence).values()
 
@@ -103,6 +103,15 @@ def test_another_count_of_points_is_right_too() -> None:
     for count in (60, 50, 40):
         fewer = [x[:, :count] for x in inputs[:2]]
         for x, y in zip(function(*fewer, inputs[2]), graph(*fewer, inputs[2]), strict=True):
+            assert torch.equal(x, y)
+
+
+def test_autocast_changes_no_bit_of_a_graph() -> None:
+    function, inputs = refinement()
+    inputs = [x.float() for x in inputs]
+    expected = function(*inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        for x, y in zip(expected, compiled(function)(*inputs), strict=True):
             assert torch.equal(x, y)
 
 
