@@ -150,7 +150,9 @@ def estimate_relative_pose(
         found.significant & (found.model != ROTATION) & ~found.ambiguous,
         found.model,
         found.ambiguous & found.significant,
-        *found.scores.unbind(0),
+        found.scores[0],
+        found.scores[1],
+        found.scores[2],
         found.T_essential,
     )
 
