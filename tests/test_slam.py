@@ -16,7 +16,7 @@ from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, loa
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
-from torchslam.front_end import source
+from torchslam.front_end import Simulated
 from torchslam.geometry import Noise, se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
 from torchslam.slam import FOUND_AGAIN, STARTED_ANEW
@@ -128,7 +128,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
     assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
     assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
-    whole = source(Gap(arc(60)), slam.config, slam.camera)
+    whole = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(Gap(arc(60)))
     states = [slam.step(whole[index]).state for index in range(42, 46)]
     assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
     assert states[-1] is State.TRACKING

@@ -99,7 +99,11 @@ def batch_of(problems: list[BundleProblem]) -> BundleProblem:
 
 
 def loss_of(solution: BundleSolution) -> Tensor:
-    points = solution.points_w.flatten()
+    return points_loss(solution.points_w)
+
+
+def points_loss(points_w: Tensor) -> Tensor:
+    points = points_w.flatten()
     return points @ torch.linspace(-1, 1, len(points), dtype=points.dtype)
 
 
@@ -206,9 +210,7 @@ def main() -> None:
         "## As large as theseus's issue 565",
         "",
         *large(),
-        "The issue tells of 30 s an iteration. Others do not solve it here: theseus 0.2.3 installs, but its sparse "
-        "solvers want SuiteSparse or CUDA; its dense one, as that of pypose 0.9.5, wants a Jacobian of 86,000 x 11,000 "
-        "(7 GB) and 10^13 operations for its square; jaxls is not on PyPI.",
+        "The issue tells of 30 s an iteration. The others on the same problem: [bundle_peers.md](bundle_peers.md).",
         "",
         "## Many small ones at once",
         "",

@@ -35,10 +35,13 @@ class Row(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """How long pycolmap took, and the RMSE it reached, px."""
+    """How long pycolmap took, in how many iterations, what it found, and the RMSE it reached, px."""
 
     solve_ms: float
+    iterations: int
     rmse: float
+    T_cw: Tensor
+    points_w: Tensor
 
 
 def camera() -> Camera:
@@ -230,8 +233,9 @@ def colmap_solve(problem: BundleProblem) -> Peer:
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
     begin = time.process_time()
-    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    solved: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction).solve()
     elapsed = 1e3 * (time.process_time() - begin)
+    iterations = solved.ceres_summary.num_successful_steps + solved.ceres_summary.num_unsuccessful_steps
 
     T_cw = torch.eye(4, dtype=torch.float64).repeat(len(problem.T_cw), 1, 1)
     for frame in range(len(T_cw)):
@@ -240,7 +244,8 @@ def colmap_solve(problem: BundleProblem) -> Peer:
         [reconstruction.points3D[point + 1].xyz.tolist() for point in range(len(problem.points_w))],
         dtype=torch.float64,
     )
-    return Peer(elapsed, rmse(replace(problem, T_cw=T_cw, points_w=points_w)))
+    reached = rmse(replace(problem, T_cw=T_cw, points_w=points_w))
+    return Peer(elapsed, iterations, reached, T_cw, points_w)
 
 
 def rmse(problem: BundleProblem) -> float:

@@ -227,3 +227,16 @@ def test_wrong_options_are_named() -> None:
         estimate(scene, kernel="tukey")
     with pytest.raises(ValueError, match=r"weights must be \(1, 200\), not \(200,\)"):
         estimate(scene, weights=torch.ones(200))
+
+
+def test_what_the_choice_of_model_refuses_keeps_its_essential_matrix() -> None:
+    """On a plane, too, whose two motions are the reason to refuse it: one of them."""
+    for seed in range(4):
+        scene = two_views(seed, plane=True)
+        result, asked = estimate(scene), estimate(scene, model="essential")
+        assert result.model == ("homography",)
+        torch.testing.assert_close(result.T_21_essential, asked.T_21, rtol=0.0, atol=1e-6)
+        assert torch.equal(asked.T_21_essential, asked.T_21)
+    turned = estimate(two_views(0, baseline=0.0))
+    assert not turned.T_21[0, :3, 3].any()
+    assert turned.T_21_essential[0, :3, 3].norm().item() == pytest.approx(1)

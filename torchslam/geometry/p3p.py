@@ -16,7 +16,7 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     rays: (..., 3, 3), the rows of unit length; points: (..., 3, 3), one per row. Returns R (..., 4, 3, 3),
     t (..., 4, 3) and valid (..., 4); invalid entries and degenerate samples (collinear points) may hold anything.
-    Not differentiable by design: it makes hypotheses.
+    Not differentiable by design: it makes hypotheses. `torch.compile(fullgraph=True)` takes it.
 
     The three distance equations in the depths form a pencil of conics; a degenerate one of them is a pair of lines,
     which a real root of a cubic finds, and lines meet a conic in closed form.
@@ -56,6 +56,19 @@ _CONICS = (
     ((0, 2, 0, 1), (2, 2, 3, -1), (3, 3, 0, -1), (5, 3, 2, 1), (4, 2, 0, 1), (4, 3, 0, -1)),
 )
 
+_ADJUGATE_PAIRS = [
+    entry for table in (_ADJUGATE_PLUS, _ADJUGATE_MINUS) for row in zip(*table, strict=True) for entry in row
+]
+_CONIC_TABLE = [
+    [
+        sum(float(factor) for *place, factor in terms if place == [entry, distance, cosine])
+        for distance in (1, 2, 3)
+        for cosine in range(4)
+    ]
+    for terms in _CONICS
+    for entry in range(6)
+]
+
 
 @lru_cache(maxsize=4)
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
@@ -64,13 +77,9 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
     Indices of the factors of the adjugate (24,); how often each entry is in the full matrix (6, 1); the conics as a
     linear function of distances times one and the cosines (12, 12).
     """
-    pairs = (*zip(*_ADJUGATE_PLUS, strict=True), *zip(*_ADJUGATE_MINUS, strict=True))
-    conics = torch.zeros(2, 6, 3, 4, dtype=dtype, device=device)
-    for conic, terms in zip(conics, _CONICS, strict=True):
-        for entry, distance, cosine, factor in terms:
-            conic[entry, distance - 1, cosine] = factor
+    conics = torch.tensor(_CONIC_TABLE, dtype=dtype, device=device)
     times = torch.tensor((1, 2, 2, 1, 1, 2), dtype=dtype, device=device)
-    return torch.tensor(pairs, device=device).flatten(), times[:, None], conics.view(12, 12)
+    return torch.tensor(_ADJUGATE_PAIRS, device=device), times[:, None], conics
 
 
 def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

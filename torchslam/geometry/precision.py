@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -28,11 +27,11 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
         if not _is_any_autocast_enabled():
             return function(*args, **kwargs)
-        with ExitStack() as stack:
-            for device_type in _DEVICE_TYPES:
-                if torch.is_autocast_enabled(device_type):
-                    stack.enter_context(torch.autocast(device_type, enabled=False))
-            return function(*args, **kwargs)
+        for device_type in _DEVICE_TYPES:
+            if torch.is_autocast_enabled(device_type):
+                with torch.autocast(device_type, enabled=False):  # and so on with the other kinds of device
+                    return precise(*args, **kwargs)
+        return function(*args, **kwargs)
 
     return precise
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -57,20 +58,28 @@ class RelativePose:
                also where there is no `success`; the identity for fewer than six matches
     inliers:   (B, N) matches within the threshold of the chosen model
     success:   (B,) rotation and direction are determined: no accident, no pure rotation, no ambiguous plane
-    model:     per pair "essential", "homography" (the scene is a plane, as far as one can tell) or "rotation"
+    model:     per pair "essential", "homography" (the scene is a plane, as far as one can tell) or "rotation": as
+               strings, and as indices (B,) int64 of these, in `model_index`
     ambiguous: (B,) the matches lie on a plane and two motions explain them; T_21 is the likelier
     score_essential, score_homography, score_rotation: (B,) sum over the matches of 1 - min((error / threshold)^2, 1);
                zero for models that were not asked for
+    T_21_essential: (B, 4, 4) the pose of the essential matrix, whatever was chosen, without gradient; for those who
+               want a pose also where there is no `success`: of real pairs that were refused it is right now and then
     """
 
     T_21: Tensor
     inliers: Tensor
     success: Tensor
-    model: tuple[str, ...]
+    model_index: Tensor
     ambiguous: Tensor
     score_essential: Tensor
     score_homography: Tensor
     score_rotation: Tensor
+    T_21_essential: Tensor
+
+    @property
+    def model(self) -> tuple[str, ...]:
+        return tuple(MODELS[index] for index in self.model_index.tolist())
 
 
 @full_precision
@@ -108,6 +117,9 @@ def estimate_relative_pose(
     The same arguments and seed give the same result. Too few matches and pure noise give `success` False for that
     pair. Raises ValueError for wrong shapes, and for an unknown model or kernel.
 
+    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits: how many samples it draws depends on
+    the data, which no graph may ask. There, ask for `model_index` in place of `model`.
+
     Where an input requires a gradient, T_21 carries that of the final least squares of the chosen model with
     respect to pixels, weights and camera parameters, with the set of matches it uses and the level of the noise fixed
     (implicit function theorem, exact Hessian).
@@ -121,25 +133,27 @@ def estimate_relative_pose(
     finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
     mask = finite if mask is None else mask & finite
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
-    # The probability that a wrong match is within the threshold of an epipolar line.
-    chance = 2 * threshold * math.hypot(*camera_2.size) / (camera_2.width * camera_2.height)
-    given = (pixels_1, pixels_2, camera_1, camera_2, threshold, mask, weights)
-    with torch.no_grad():
-        views = TwoViews.of(*given)
-        effort = _Effort(seed, confidence, min_samples, max_samples)
-        found = _search(views, chance * _mean_width(mask, weights, views.x_1.dtype), model, kernel, effort)
-    T_21 = found.T_21
-    inputs = (pixels_1, pixels_2, camera_1.params, camera_2.params)
-    if needs_gradient(*inputs if weights is None else (*inputs, weights)):
-        graph_views = TwoViews.of(*given).in_units(found.noise[:, None])
-        T_21 = _with_gradient(found, graph_views, kernel)
+    cameras = camera_1.model, list(camera_1.size), camera_2.model, list(camera_2.size)
+    inputs = [pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])]
+    effort = seed, confidence, min_samples, max_samples
+    compiling = torch.compiler.is_compiling()
+    find = torch.ops.torchslam.relative_pose if compiling else find_relative_pose
+    found = FoundPose(*find([x.detach() for x in inputs], mask, *cameras, threshold, kernel, model, *effort))
+    T_21, others = found.T_21, [mask, found.normal, found.model, found.noise, found.used]
+    if compiling:
+        T_21 = torch.ops.torchslam.attached_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
+    elif needs_gradient(*inputs):
+        T_21 = attach_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
     return RelativePose(
         T_21,
         found.inliers,
         found.significant & (found.model != ROTATION) & ~found.ambiguous,
-        tuple(MODELS[index] for index in found.model.tolist()),
+        found.model,
         found.ambiguous & found.significant,
-        *found.scores.unbind(0),
+        found.scores[0],
+        found.scores[1],
+        found.scores[2],
+        found.T_essential,
     )
 
 
@@ -163,12 +177,11 @@ class _Effort(NamedTuple):
     max_samples: int
 
 
-@dataclass(frozen=True)
-class _Found:
+class FoundPose(NamedTuple):
     """T_21 (B, 4, 4) of the chosen model (B,), `normal` (B, 3) of its plane, and what it rests on.
 
     noise: (B,) thresholds, the unit of the fits; significant: (B,) no accident; used: (B, N) matches that the final
-    fit saw; scores: (3, B)
+    fit saw; scores: (3, B); T_essential: (B, 4, 4)
     """
 
     T_21: Tensor
@@ -180,9 +193,47 @@ class _Found:
     inliers: Tensor
     used: Tensor
     scores: Tensor
+    T_essential: Tensor
 
 
-def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effort: _Effort) -> _Found:
+def _views(
+    inputs: Sequence[Tensor],
+    mask: Tensor,
+    cameras: tuple[str, Sequence[int], str, Sequence[int]],
+    threshold: float,
+) -> TwoViews:
+    """What `estimate_relative_pose` is given: pixels, parameters of both cameras, and weights if there are any."""
+    pixels_1, pixels_2, params_1, params_2, *weights = inputs
+    model_1, (width_1, height_1), model_2, (width_2, height_2) = cameras
+    camera_1 = Camera(model_1, params_1, (width_1, height_1))
+    camera_2 = Camera(model_2, params_2, (width_2, height_2))
+    weight = weights[0] if weights else None
+    return TwoViews.of(pixels_1, pixels_2, camera_1, camera_2, threshold, mask, weight)
+
+
+def find_relative_pose(
+    inputs: Sequence[Tensor],
+    mask: Tensor,
+    model_1: str,
+    size_1: Sequence[int],
+    model_2: str,
+    size_2: Sequence[int],
+    threshold: float,
+    kernel: Kernel,
+    wanted: Model,
+    *effort: Any,
+) -> FoundPose:
+    """What `estimate_relative_pose` finds, without gradient; inputs as of `_views`, the rest as its arguments."""
+    with torch.no_grad():
+        views = _views(inputs, mask, (model_1, size_1, model_2, size_2), threshold)
+        # The probability that a wrong match is within the threshold of an epipolar line.
+        chance = 2 * threshold * math.hypot(*size_2) / (size_2[0] * size_2[1])
+        weights = inputs[4] if len(inputs) > 4 else None
+        chances = chance * _mean_width(mask, weights, views.x_1.dtype)
+        return _search(views, chances, wanted, kernel, _Effort(*effort))
+
+
+def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effort: _Effort) -> FoundPose:
     """Fit all models, choose one per pair, and take the pose from it."""
     mask, B = views.mask, len(views.mask)
     generator = torch.Generator().manual_seed(effort.seed)
@@ -192,15 +243,16 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     if wanted == "essential":
         squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
         model, ambiguous = torch.zeros_like(mask[:, 0], dtype=torch.int64), torch.zeros_like(mask[:, 0])
-        R, t = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
+        R, t = R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         normal = torch.zeros_like(t)
     else:
         fits = fit_models(views, R, t, generator)
         model = choose(fits, mask, chance * noise)
         if bool((model != ESSENTIAL).any()):
             fits = fits.finished(views, width)
-        R, t, normal, ambiguous = pose_of(views, fits, model)
         squared = fits.squared
+        R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
+        R, t, normal, ambiguous = pose_of(views, fits, model)
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
@@ -208,9 +260,9 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     significant = significant & is_spread(views.in_units(1 / noise[:, None]), inliers)
     used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
-    found = mask.sum(-1) > 5
-    return _Found(
-        torch.where(found[:, None, None], rigid(R, t), torch.eye(4, dtype=R.dtype, device=R.device)),
+    found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
+    return FoundPose(
+        torch.where(found, rigid(R, t), eye),
         normal,
         model,
         noise,
@@ -219,6 +271,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         inliers & significant[:, None],
         used & significant[:, None],
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
+        torch.where(found, rigid(R_E, t_E), eye),
     )
 
 
@@ -261,13 +314,28 @@ def _nothing(pixels: Tensor) -> RelativePose:
     B, N = pixels.shape[:2]
     T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).expand(B, 4, 4)
     score = torch.zeros(B, dtype=pixels.dtype, device=pixels.device)
+    model = torch.full((B,), ROTATION, device=pixels.device)
     no = torch.zeros(B, N + 1, dtype=torch.bool, device=pixels.device)
-    return RelativePose(T_21, no[:, :N], no[:, N], B * (MODELS[ROTATION],), no[:, N], score, score, score)
+    return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21)
 
 
-def _with_gradient(found: _Found, views: TwoViews, kernel: Kernel) -> Tensor:
-    """The same poses, with the gradient of the minimiser of the chosen model's errors over the rows in use."""
-    T_21, normal, used, model = found.T_21, found.normal, found.used, found.model
+def attach_relative_pose(
+    T_21: Tensor,
+    inputs: Sequence[Tensor],
+    others: Sequence[Tensor],
+    model_1: str,
+    size_1: Sequence[int],
+    model_2: str,
+    size_2: Sequence[int],
+    threshold: float,
+    kernel: Kernel,
+) -> Tensor:
+    """The same poses, with the gradient of the minimiser of the chosen model's errors over the rows in use.
+
+    inputs: as of `_views`; others: its mask, and normal, model, noise and used of what was found
+    """
+    mask, normal, model, noise, used = others
+    views = _views(inputs, mask, (model_1, size_1, model_2, size_2), threshold).in_units(noise[:, None])
     R, t = T_21[:, :3, :3], T_21[:, :3, 3]
     # Parameters that the chosen model does not have must not bring NaN.
     forward = t.new_tensor((0.0, 0.0, 1.0))

@@ -92,6 +92,20 @@ def minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
     return _Minimum.apply(problem, *inputs)
 
 
+def attached_gradient(
+    problem: Minimization,
+    found: Tensors,
+    inputs: Tensors,
+    gradient: Sequence[Tensor],
+    needed: Sequence[bool],
+) -> list[Tensor | None]:
+    """The gradient to the inputs that need it of a loss with this gradient in what was found, itself without graph."""
+    direction = problem.factorized(found, inputs)(
+        problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
+    )
+    return _last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
+
+
 class _Minimum(torch.autograd.Function):
     """inputs -> found."""
 
@@ -113,10 +127,9 @@ class _Minimum(torch.autograd.Function):
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, needed = ctx.problem, ctx.needs_input_grad[1:]
         inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
-        right = problem.pull_back(found, gradient[: problem.num_unknowns])
         if not torch.is_grad_enabled() and not _are_functorch_transforms_active():
-            direction = problem.factorized(found, inputs)(right)
-            return None, *_last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
+            return None, *attached_gradient(problem, found, inputs, gradient, needed)
+        right = problem.pull_back(found, gradient[: problem.num_unknowns])
         direction = _solve(problem, right, found, inputs)
         return None, *_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
 
