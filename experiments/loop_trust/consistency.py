@@ -28,12 +28,14 @@ class Consistency:
               rotation and log scale alone, at the later node
     pairwise: (G, N, N) of two loops from each other
     surprise: (G, N, N) half the log determinant by which knowing one loop narrows the other: what agreement is worth
+    way:      (G, N, N) half the log determinant that odometry adds to the noise of the two: what agreement rests on
     """
 
     own: Tensor
     in_parts: Tensor
     pairwise: Tensor
     surprise: Tensor
+    way: Tensor
 
 
 def consistency(
@@ -48,7 +50,8 @@ def consistency(
     steps = to_world[:, 1:] * odometry_sigmas[..., None, :]
     until = torch.nn.functional.pad((steps @ steps.mT).cumsum(1), (0, 0, 0, 0, 1, 0))
     own_noise = to_world[rows, j] * loop_sigmas[..., None, :]
-    covariance = until[rows, j] - until[rows, i] + own_noise @ own_noise.mT
+    alone = own_noise @ own_noise.mT
+    covariance = until[rows, j] - until[rows, i] + alone
 
     E = sim3_inverse(S_cw[rows, j]) @ loops @ S_cw[rows, i]
     at_j = sim3_adjoint(S_cw[rows, j])
@@ -61,9 +64,13 @@ def consistency(
     together = covariance[:, :, None] + covariance[:, None]
     apart = sim3_log(E[:, :, None] @ sim3_inverse(E)[:, None])
     difference = together - 2 * common
-    narrowed = 0.5 * (_log_determinant(together) - _log_determinant(difference))
+    spread = _log_determinant(difference)
     return Consistency(
-        _mahalanobis(error, at_node), torch.stack(parts, -1), _mahalanobis(apart, difference), narrowed
+        _mahalanobis(error, at_node),
+        torch.stack(parts, -1),
+        _mahalanobis(apart, difference),
+        0.5 * (_log_determinant(together) - spread),
+        0.5 * (spread - _log_determinant(alone[:, :, None] + alone[:, None])),
     )
 
 

@@ -7,7 +7,6 @@ Both are drawn by the same rule, so that neither their size nor their noise tell
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -28,28 +27,33 @@ _BIAS = 0.1  # of odometry, in its standard deviations: scale and heading drift 
 
 @dataclass(frozen=True)
 class Noise:
-    """Ranges of standard deviations of one odometry step, drawn evenly in the logarithm.
+    """Ranges of standard deviations, drawn evenly in the logarithm: translation in steps, rotation in radians, log scale.
 
-    translation: in steps; rotation: radians; scale: its logarithm
-    belief:      by what factor, at most, believed standard deviations are wrong, up or down
+    odometry: of one step; loop: of a loop; belief: by what factor, at most, believed deviations are wrong, up or down
     """
 
-    translation: tuple[float, float] = (0.01, 0.05)
-    rotation: tuple[float, float] = (0.003, 0.02)
-    scale: tuple[float, float] = (0.002, 0.02)
-    belief: float = 2.0
+    odometry: tuple[tuple[float, float], ...] = ((0.02, 0.15), (0.005, 0.05), (0.005, 0.05))
+    loop: tuple[tuple[float, float], ...] = ((0.02, 0.1), (0.005, 0.03), (0.005, 0.03))
+    belief: float = 10.0
 
 
-USUAL = Noise()
-DRIFTING = Noise(scale=(0.02, 0.05))
+UNKNOWN = Noise()  # covariances to an order of magnitude, as systems have them that never measured theirs
+KNOWN = Noise(belief=1.5)
 
 
 def simulate(
-    walk: Walk, nodes: int, false_share: float, count: int, seed: int, noise: Noise = USUAL
+    walk: Walk,
+    nodes: int,
+    false_share: tuple[float, float],
+    count: int,
+    seed: int,
+    noise: Noise = UNKNOWN,
 ) -> Graphs:
-    """`count` graphs; of the loops of each, the share `false_share` is false, as far as whole numbers allow."""
+    """`count` graphs; of the loops of each, a share between the two numbers is false, up to whole loops."""
     generator = torch.Generator().manual_seed(seed)
-    return Graphs.cat([_one(walk, nodes, false_share, generator, noise) for _ in range(count)])
+    low, high = false_share
+    shares = (low + (high - low) * torch.rand(count, generator=generator)).tolist()
+    return Graphs.cat([_one(walk, nodes, share, generator, noise) for share in shares])
 
 
 def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise: Noise) -> Graphs:
@@ -62,12 +66,11 @@ def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise
         if genuine is not None and false is not None:
             break
     S_cw = sim3_inverse(T_wc)
-    sigmas = _sigmas(noise, generator)
-    looseness = math.exp(float(torch.rand(1, generator=generator)) * math.log(4.0))
+    sigmas, loop_sigmas = (_sigmas(ranges, generator) for ranges in (noise.odometry, noise.loop))
     odometry = _perturbed(S_cw[1:] @ T_wc[:-1], sigmas, generator, bias=_BIAS)
     pairs = torch.cat([genuine[0], false[0]])
     exact = torch.cat([genuine[1], false[1]])
-    loops = _perturbed(exact, looseness * sigmas, generator)
+    loops = _perturbed(exact, loop_sigmas, generator)
     is_genuine = torch.arange(total) < total - num_false
     # As everywhere, the later of two nodes is the one that asks; the order of loops says nothing.
     flipped = (pairs[:, 0] > pairs[:, 1])[:, None, None]
@@ -80,7 +83,7 @@ def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise
         (belief[0] * sigmas).expand(1, nodes - 1, 7),
         pairs.sort(-1).values[order][None],
         loops[order][None],
-        (belief[1] * looseness * sigmas).expand(1, total, 7),
+        (belief[1] * loop_sigmas).expand(1, total, 7),
         is_genuine[order][None],
         torch.ones(1, total, dtype=torch.bool),
     )
@@ -160,9 +163,8 @@ def _perturbed(exact: Tensor, sigmas: Tensor, generator: Generator, bias: float 
     return sim3_exp(sigmas * (noise + bias * shared)) @ exact
 
 
-def _sigmas(noise: Noise, generator: Generator) -> Tensor:
+def _sigmas(ranges: tuple[tuple[float, float], ...], generator: Generator) -> Tensor:
     drawn = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-    ranges = (noise.translation, noise.rotation, noise.scale)
     t, r, s = (low * (high / low) ** share for share, (low, high) in zip(drawn, ranges, strict=True))
     return torch.tensor([t] * 3 + [r] * 3 + [s], dtype=torch.float64)
 
