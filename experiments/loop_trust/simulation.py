@@ -18,10 +18,11 @@ from torchslam.geometry import rigid, sim3_exp, sim3_inverse
 
 _APART = 10  # nodes between the ends of a loop, at least
 _NEAR = 1.6  # steps between nodes that see the same
-_ELSEWHERE = 4.0  # steps between places that are not the same, at least
+_ELSEWHERE = 3.0  # steps between places that are not the same, at least
 _CLUSTER = 8  # loops of a cluster, at most
 _LOOPS = (16, 32)  # of a graph, genuine and false
 _ALONE = 0.2  # the share of false clusters that are single loops of any size and direction
+_MISSES = 60  # draws in a row without a new loop, after which a walk is given up
 _BIAS = 0.1  # of odometry, in its standard deviations: scale and heading drift for a reason
 
 
@@ -68,20 +69,19 @@ def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise
     S_cw = sim3_inverse(T_wc)
     sigmas, loop_sigmas = (_sigmas(ranges, generator) for ranges in (noise.odometry, noise.loop))
     odometry = _perturbed(S_cw[1:] @ T_wc[:-1], sigmas, generator, bias=_BIAS)
-    pairs = torch.cat([genuine[0], false[0]])
     exact = torch.cat([genuine[1], false[1]])
-    loops = _perturbed(exact, loop_sigmas, generator)
+    pairs, loops = _forwards(
+        torch.cat([genuine[0], false[0]]), _perturbed(exact, loop_sigmas, generator)
+    )
     is_genuine = torch.arange(total) < total - num_false
-    # As everywhere, the later of two nodes is the one that asks; the order of loops says nothing.
-    flipped = (pairs[:, 0] > pairs[:, 1])[:, None, None]
-    loops = torch.where(flipped, sim3_inverse(loops), loops)
-    order = torch.argsort(pairs.amax(-1), stable=True)
+    # The order of loops is that of the nodes that asked: it says nothing of their truth.
+    order = torch.argsort(pairs[:, 1], stable=True)
     belief = [_factor(noise.belief, generator) for _ in range(2)]
     return Graphs(
         S_cw[None],
         odometry[None],
         (belief[0] * sigmas).expand(1, nodes - 1, 7),
-        pairs.sort(-1).values[order][None],
+        pairs[order][None],
         loops[order][None],
         (belief[1] * loop_sigmas).expand(1, total, 7),
         is_genuine[order][None],
@@ -89,21 +89,43 @@ def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise
     )
 
 
+def false_loops(
+    T_wc: Tensor, count: int, sigmas: Tensor, generator: Generator
+) -> tuple[Tensor, Tensor] | None:
+    """Nodes (count, 2), i < j, and measurements (count, 4, 4) of false loops on a walk (K, 4, 4) whose unit is a step.
+
+    None where the walk has no room for them.
+    """
+    found = _gathered(T_wc, count, True, generator)
+    if found is None:
+        return None
+    return _forwards(found[0], _perturbed(found[1], sigmas, generator))
+
+
+def _forwards(pairs: Tensor, loops: Tensor) -> tuple[Tensor, Tensor]:
+    """The same loops from the earlier node to the later one."""
+    flipped = (pairs[:, 0] > pairs[:, 1])[:, None, None]
+    return pairs.sort(-1).values, torch.where(flipped, sim3_inverse(loops), loops)
+
+
 def _gathered(T_wc: Tensor, wanted: int, false: bool, generator: Generator) -> tuple[Tensor, Tensor] | None:
     """Nodes (wanted, 2) and exact relative poses (wanted, 4, 4) of loops in clusters; None where a walk has no more."""
     pairs, relative, misses = [torch.empty(0, 2, dtype=torch.int64)], [T_wc.new_empty(0, 4, 4)], 0
     known: set[tuple[int, int]] = set()
     while len(known) < wanted:
+        if misses > _MISSES:
+            return None
         alone = false and float(torch.rand(1, generator=generator)) < _ALONE
         size = int(torch.randint(1, _CLUSTER + 1, (1,), generator=generator))
         D = _displacement(T_wc, generator) if false else torch.eye(4, dtype=T_wc.dtype)
+        if D is None:
+            misses += 1
+            continue
         found = _single(T_wc, generator) if alone else _cluster(T_wc, D, generator)
         unordered = {(min(pair), max(pair)): pair for pair in found.tolist()}
         fresh = [pair for key, pair in unordered.items() if key not in known]
         fresh = fresh[: min(size, wanted - len(known))]
         misses = misses + 1 if not fresh else 0
-        if misses > 100:
-            return None
         if not fresh:
             continue
         known.update((min(pair), max(pair)) for pair in fresh)
@@ -115,13 +137,12 @@ def _gathered(T_wc: Tensor, wanted: int, false: bool, generator: Generator) -> t
     return torch.cat(pairs), torch.cat(relative)
 
 
-def _displacement(T_wc: Tensor, generator: Generator) -> Tensor:
-    """The similarity of the world that makes one place look like another one."""
+def _displacement(T_wc: Tensor, generator: Generator) -> Tensor | None:
+    """The similarity of the world that makes one place look like another one; None where a draw hit one place."""
     centres = T_wc[:, :3, 3]
-    while True:
-        a, b = torch.randint(len(T_wc), (2,), generator=generator).tolist()
-        if abs(a - b) >= _APART and float((centres[a] - centres[b]).norm()) > _ELSEWHERE:
-            break
+    a, b = torch.randint(len(T_wc), (2,), generator=generator).tolist()
+    if abs(a - b) < _APART or float((centres[a] - centres[b]).norm()) <= _ELSEWHERE:
+        return None
     spread = T_wc.new_tensor([0.3] * 3 + [0.1] * 3 + [0.1])
     offset = sim3_exp(spread * torch.randn(7, generator=generator, dtype=T_wc.dtype))
     return T_wc[b] @ offset @ sim3_inverse(T_wc[a])

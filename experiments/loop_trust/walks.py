@@ -41,9 +41,9 @@ def wander(nodes: int, generator: Generator) -> Tensor:
 
 
 def lissajous(nodes: int, generator: Generator) -> Tensor:
-    """A knot in space that crosses itself, walked one and a half times or more."""
+    """A knot in space that crosses itself, walked more than once."""
     phase = 2 * math.pi * torch.rand(3, generator=generator, dtype=torch.float64)
-    turns = 1.5 + float(torch.rand(1, generator=generator))
+    turns = 1.1 + 0.4 * float(torch.rand(1, generator=generator))
     t = torch.linspace(0, 2 * math.pi * turns, 4000, dtype=torch.float64)
     curve = torch.stack(
         [torch.sin(2 * t + phase[0]), torch.sin(3 * t + phase[1]), 0.3 * torch.sin(t + phase[2])], -1
