@@ -45,7 +45,9 @@ class Graphs:
         """All graphs of all parts; those with fewer loops get empty rows."""
         most = max(part.mask.shape[1] for part in parts)
         padded = [part.padded(most) for part in parts]
-        return Graphs(*(torch.cat([getattr(part, field.name) for part in padded]) for field in fields(Graphs)))
+        return Graphs(
+            *(torch.cat([getattr(part, field.name) for part in padded]) for field in fields(Graphs))
+        )
 
     def padded(self, loops: int) -> Graphs:
         """The same graphs with rows for more loops, which are none."""

@@ -42,9 +42,7 @@ class Sizes:
 def training_graphs(sizes: Sizes) -> Graphs:
     """Graphs of the training families with up to 60 % false loops."""
     walks = enumerate(TRAINING.values())
-    return Graphs.cat(
-        [simulate(walk, NODES, (0.0, 0.6), sizes.training, seed=100 + k) for k, walk in walks]
-    )
+    return Graphs.cat([simulate(walk, NODES, (0.0, 0.6), sizes.training, seed=100 + k) for k, walk in walks])
 
 
 def cues_of(graphs: Graphs) -> Cues:
@@ -100,7 +98,11 @@ def errors_of(methods: dict[str, list[Method]], graphs: Graphs) -> Errors:
 
 
 def cells_of(
-    methods: dict[str, list[Method]], walks: dict[str, Walk], share: float, count: int, noises: dict[str, Noise]
+    methods: dict[str, list[Method]],
+    walks: dict[str, Walk],
+    share: float,
+    count: int,
+    noises: dict[str, Noise],
 ) -> dict[str, Errors]:
     """Errors by family and kind of noise."""
     cells = {}
@@ -113,7 +115,10 @@ def cells_of(
 
 
 def evaluate(
-    networks: list[tuple[LoopTrust, LoopTrust]], chosen: dict[str, Method], sizes: Sizes, walks: dict[str, Walk]
+    networks: list[tuple[LoopTrust, LoopTrust]],
+    chosen: dict[str, Method],
+    sizes: Sizes,
+    walks: dict[str, Walk],
 ) -> str:
     """The tables on families of graphs."""
     methods: dict[str, list[Method]] = {"odometry": [Odometry()]}
@@ -177,9 +182,13 @@ def evaluate_real(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--validate", action="store_true", help="test on other graphs of the training families")
+    parser.add_argument(
+        "--validate", action="store_true", help="test on other graphs of the training families"
+    )
     parser.add_argument("--quick", action="store_true", help="a few steps and graphs: does it run?")
-    parser.add_argument("--runs", type=Path, nargs="*", default=[], help="folders of results of torchslam run")
+    parser.add_argument(
+        "--runs", type=Path, nargs="*", default=[], help="folders of results of torchslam run"
+    )
     parser.add_argument("--steps", type=int, help="of the training through the solver")
     parser.add_argument("--no-readme", action="store_true", help="print the tables, leave the README")
     arguments = parser.parse_args()

@@ -28,7 +28,7 @@ _BIAS = 0.1  # of odometry, in its standard deviations: scale and heading drift 
 
 @dataclass(frozen=True)
 class Noise:
-    """Ranges of standard deviations, drawn evenly in the logarithm: translation in steps, rotation in radians, log scale.
+    """Ranges of standard deviations, drawn evenly in the logarithm: translation (steps), rotation (rad), log scale.
 
     odometry: of one step; loop: of a loop; belief: by what factor, at most, believed deviations are wrong, up or down
     """
@@ -70,9 +70,7 @@ def _one(walk: Walk, nodes: int, false_share: float, generator: Generator, noise
     sigmas, loop_sigmas = (_sigmas(ranges, generator) for ranges in (noise.odometry, noise.loop))
     odometry = _perturbed(S_cw[1:] @ T_wc[:-1], sigmas, generator, bias=_BIAS)
     exact = torch.cat([genuine[1], false[1]])
-    pairs, loops = _forwards(
-        torch.cat([genuine[0], false[0]]), _perturbed(exact, loop_sigmas, generator)
-    )
+    pairs, loops = _forwards(torch.cat([genuine[0], false[0]]), _perturbed(exact, loop_sigmas, generator))
     is_genuine = torch.arange(total) < total - num_false
     # The order of loops is that of the nodes that asked: it says nothing of their truth.
     order = torch.argsort(pairs[:, 1], stable=True)
