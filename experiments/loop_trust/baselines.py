@@ -186,7 +186,10 @@ def candidates() -> dict[str, list[Method]]:
     return {
         "Cauchy": [Cauchy(scale) for scale in (0.3, 1.0, 3.0, 10.0)],
         "DCS": [DynamicCovarianceScaling(phi) for phi in (1.0, 5.0, 20.0, 80.0)],
-        "GNC": [GraduatedNonConvexity(bound, truncated) for bound in bounds for truncated in (True, False)],
+        "GNC": [
+            *(GraduatedNonConvexity(bound) for bound in bounds),
+            GraduatedNonConvexity(bounds[1], truncated=False),
+        ],
         "PCM": [
             PairwiseConsistency(factor * CHI_SQUARE, gated)
             for factor in (0.5, 1.0, 2.0, 4.0, 16.0)

@@ -35,11 +35,18 @@ class Noise:
 
     odometry: tuple[tuple[float, float], ...] = ((0.02, 0.15), (0.005, 0.05), (0.005, 0.05))
     loop: tuple[tuple[float, float], ...] = ((0.02, 0.1), (0.005, 0.03), (0.005, 0.03))
-    belief: float = 10.0
+    belief: float = 1.0
 
 
-UNKNOWN = Noise()  # covariances to an order of magnitude, as systems have them that never measured theirs
-KNOWN = Noise(belief=1.5)
+_BADLY = ((0.05, 0.2), (0.05, 0.1), (0.05, 0.1))
+NOISES: dict[str, Noise] = {
+    "known noise": Noise(belief=1.5),
+    # To an order of magnitude, as systems believe that never measured theirs.
+    "unknown noise": Noise(belief=10.0),
+    # So much that a false loop may lie within it: a camera without a scale, on a long way.
+    "strong drift": Noise(odometry=_BADLY, belief=10.0),
+}
+TRAINED = Noise(odometry=((0.02, 0.2), (0.005, 0.1), (0.005, 0.1)), belief=10.0)
 
 
 def simulate(
@@ -48,7 +55,7 @@ def simulate(
     false_share: tuple[float, float],
     count: int,
     seed: int,
-    noise: Noise = UNKNOWN,
+    noise: Noise = TRAINED,
 ) -> Graphs:
     """`count` graphs; of the loops of each, a share between the two numbers is false, up to whole loops."""
     generator = torch.Generator().manual_seed(seed)

@@ -17,10 +17,10 @@ from torchslam.learning import Log, Training
 class Settings:
     """warm: steps and graphs of a step of the classification; steps, batch: of the training through the solver."""
 
-    warm_steps: int = 1000
+    warm_steps: int = 400
     warm_batch: int = 24
     warm_rate: float = 3e-3
-    steps: int = 160
+    steps: int = 40
     batch: int = 8
     rate: float = 1e-3
     seed: int = 0

@@ -118,8 +118,8 @@ class Rounds(nn.Module):
         ):
             message = torch.relu(here(h)[:, :, None] + there(h)[:, None] + between(pair)) * other
             share = torch.sigmoid(gate(message)) * other
-            told = (share * message).sum(2) / count
-            agreed = (share * message).sum(2) / (share.sum(2) + 0.1)
+            heard = (share * message).sum(2)
+            told, agreed = heard / count, heard / (share.sum(2) + 0.1)
             whole = ((used * h).sum(1, keepdim=True) / count).expand_as(h)
             h = h + update(torch.cat([h, told, agreed, whole], -1))
         return self.leave(h).squeeze(-1)
@@ -148,6 +148,14 @@ class LoopTrust(nn.Module):
         return logits + self.second(seen(cues, logits, squared), cues.paired, cues.mask)
 
 
+def weight(logits: Tensor) -> Tensor:
+    """The weight of a loop in the solver: the probability squared.
+
+    A false loop is some hundred standard deviations off: a weight of one in a thousand still bends the graph.
+    """
+    return torch.sigmoid(logits).square()
+
+
 def seen(cues: Cues, logits: Tensor, squared: Tensor) -> Tensor:
     """(G, N, A + 3) cues with the weight of the first round, and its residual, also beside that of others trusted."""
     left = squared.log1p().clamp_max(_LARGEST).float()
@@ -162,10 +170,10 @@ def trusted(
 ) -> list[tuple[Tensor, Tensor]]:
     """Weights (G, N) and nodes (G, K, 4, 4) of both rounds."""
     logits = network.logits(cues)
-    weights = torch.sigmoid(logits)
+    weights = weight(logits)
     S_cw = solve(graphs, weights, backward=backward)
     squared = chi_squares(graphs, S_cw.detach())
-    weights_2 = torch.sigmoid(network.corrected(cues, logits, squared))
+    weights_2 = weight(network.corrected(cues, logits, squared))
     return [(weights, S_cw), (weights_2, solve(graphs, weights_2, S_cw.detach(), backward=backward))]
 
 
@@ -179,5 +187,5 @@ class Learned:
     def __call__(self, graphs: Graphs) -> Tensor:
         cues = describe(graphs)
         if self.rounds == 1:
-            return solve(graphs, torch.sigmoid(self.network.logits(cues)))
+            return solve(graphs, weight(self.network.logits(cues)))
         return trusted(self.network, graphs, cues)[-1][1]
