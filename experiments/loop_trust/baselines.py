@@ -184,15 +184,15 @@ def candidates() -> dict[str, list[Method]]:
     """Per competitor, all its settings; graphs of the training families choose."""
     bounds = [factor * CHI_SQUARE for factor in (1.0, 4.0, 16.0)]
     return {
-        "Cauchy": [Cauchy(scale) for scale in (0.3, 1.0, 3.0, 10.0)],
-        "DCS": [DynamicCovarianceScaling(phi) for phi in (1.0, 5.0, 20.0, 80.0)],
+        "Cauchy": [Cauchy(scale) for scale in (1.0, 2.0, 4.0, 8.0)],
+        "DCS": [DynamicCovarianceScaling(phi) for phi in (5.0, 20.0, 80.0, 320.0)],
         "GNC": [
             *(GraduatedNonConvexity(bound) for bound in bounds),
             GraduatedNonConvexity(bounds[1], truncated=False),
         ],
         "PCM": [
             PairwiseConsistency(factor * CHI_SQUARE, gated)
-            for factor in (0.5, 1.0, 2.0, 4.0, 16.0)
+            for factor in (1.0, 4.0, 16.0, 64.0)
             for gated in (False, True)
         ],
     }

@@ -19,6 +19,7 @@ from torchslam.world.map_file import read_map
 
 _APART = 10  # keyframes between the ends of a loop, at least
 _LOOPS = 24  # genuine ones, at most, evenly spaced among those that were found
+_SHARED = 20  # points that two keyframes of a loop have in common in the finished map
 _TOLERANCE_S = 0.1
 # Nobody has measured these: of a step, and of a loop, in median steps, radians and log scale.
 _ODOMETRY_SIGMAS, _LOOP_SIGMAS = [0.05] * 3 + [0.01] * 4, [0.1] * 3 + [0.02] * 4
@@ -87,7 +88,7 @@ def _loops(slam_map: Map, camera: Camera, keyframes: Tensor) -> tuple[Tensor, Te
     """(N, 2) nodes and (N, 4, 4) similarities between them, as the system measures them to close a loop."""
     config, pairs, S_ji = Config(), [], []
     for j in range(_APART, len(keyframes)):
-        near = slam_map.covisible(int(keyframes[j]), slam_map.num_keyframes, min_shared=1)
+        near = slam_map.covisible(int(keyframes[j]), slam_map.num_keyframes, min_shared=_SHARED)
         for i in range(j - _APART):
             one, two = int(keyframes[j]), int(keyframes[i])
             if not bool((near == two).any()):

@@ -65,7 +65,8 @@ def trained(
     network, warm = (LoopTrust(cues.alone.shape[-1], cues.paired.shape[-1], settings.seed) for _ in range(2))
     network.eval()
     warm.eval()
-    path = folder / f"network_{settings.seed}.pt" if folder else None
+    name = f"network_{settings.seed}_{settings.warm_steps}_{settings.steps}.pt"
+    path = folder / name if folder else None
     if path and path.exists():
         states = torch.load(path, weights_only=True)
         network.load_state_dict(states[0])
