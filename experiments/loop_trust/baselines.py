@@ -145,7 +145,8 @@ def largest_clique(fits: Tensor, usable: Tensor) -> list[int]:
     """Rows of the largest set in which every two fit (N, N), of those usable (N,)."""
     graph = networkx.Graph()
     graph.add_nodes_from(usable.nonzero()[:, 0].tolist())
-    graph.add_edges_from(tuple(pair) for pair in fits.triu(1).nonzero().tolist())
+    joined = fits & usable[:, None] & usable
+    graph.add_edges_from(tuple(pair) for pair in joined.triu(1).nonzero().tolist())
     return sorted(networkx.max_weight_clique(graph, weight=None)[0])
 
 

@@ -18,7 +18,7 @@ from torchslam.world.map import Map
 from torchslam.world.map_file import read_map
 
 _APART = 10  # keyframes between the ends of a loop, at least
-_LOOPS = 24  # genuine ones, at most, evenly spaced among those that were found
+_LOOPS = 30  # pairs of keyframes that are tried, evenly spaced among those that share points
 _SHARED = 20  # points that two keyframes of a loop have in common in the finished map
 _TOLERANCE_S = 0.1
 # Nobody has measured these: of a step, and of a loop, in median steps, radians and log scale.
@@ -86,21 +86,21 @@ def _keyframes(slam_map: Map, run: Path) -> tuple[Tensor, Tensor, Tensor]:
 
 def _loops(slam_map: Map, camera: Camera, keyframes: Tensor) -> tuple[Tensor, Tensor]:
     """(N, 2) nodes and (N, 4, 4) similarities between them, as the system measures them to close a loop."""
-    config, pairs, S_ji = Config(), [], []
+    candidates = []
     for j in range(_APART, len(keyframes)):
         near = slam_map.covisible(int(keyframes[j]), slam_map.num_keyframes, min_shared=_SHARED)
-        for i in range(j - _APART):
-            one, two = int(keyframes[j]), int(keyframes[i])
-            if not bool((near == two).any()):
-                continue
-            relation = relate(slam_map, one, slam_map, two, camera, config)
-            if relation is not None:
-                T_cw = slam_map.T_cw
-                pairs.append([i, j])
-                S_ji.append(T_cw[one] @ sim3_inverse(relation.S_21) @ se3_inverse(T_cw[two]))
-    chosen = torch.linspace(0, max(len(pairs) - 1, 0), min(len(pairs), _LOOPS)).round().long()
-    found = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2)
-    return found[chosen], (torch.stack(S_ji).double()[chosen] if S_ji else torch.empty(0, 4, 4).double())
+        candidates += [(i, j) for i in range(j - _APART) if bool((near == keyframes[i]).any())]
+    even = torch.linspace(0, max(len(candidates) - 1, 0), min(len(candidates), _LOOPS)).round().long()
+    pairs, S_ji, T_cw = [], [], slam_map.T_cw
+    for i, j in (candidates[row] for row in even.tolist()):
+        one, two = int(keyframes[j]), int(keyframes[i])
+        relation = relate(slam_map, one, slam_map, two, camera, Config())
+        if relation is not None:
+            pairs.append((i, j))
+            S_ji.append(T_cw[one] @ sim3_inverse(relation.S_21) @ se3_inverse(T_cw[two]))
+    if not pairs:
+        return torch.empty(0, 2, dtype=torch.int64), torch.empty(0, 4, 4, dtype=torch.float64)
+    return torch.tensor(pairs), torch.stack(S_ji).double()
 
 
 def _scaled(T: Tensor, factor: float) -> Tensor:

@@ -132,7 +132,7 @@ class LoopTrust(nn.Module):
 
     def __init__(self, alone: int, paired: int, seed: int = 0) -> None:
         super().__init__()
-        with torch.random.fork_rng():
+        with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.first = Rounds(alone, paired)
             self.second = Rounds(alone + 3, paired)

@@ -77,7 +77,7 @@ def test_pairwise_distance_is_that_of_the_cycle(easy: Graphs) -> None:
 @pytest.mark.parametrize(
     "method",
     [
-        Cauchy(0.3),
+        Cauchy(2.0),
         DynamicCovarianceScaling(20.0),
         GraduatedNonConvexity(4 * CHI_SQUARE),
         GraduatedNonConvexity(4 * CHI_SQUARE, truncated=False),
