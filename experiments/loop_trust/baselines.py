@@ -18,6 +18,7 @@ _ROUNDS = 20  # of reweighting
 _STEPS = 2  # of the solver in a round
 _GROWTH = 1.4  # of the control parameter of GNC, as its authors have it
 _GNC_ROUNDS = 60
+_GNC_STEPS = 10  # in a round: with two, it lost genuine loops to what was not solved yet
 _DIFFERENT = 1e-3  # between weights of two rounds that are not done
 _CHUNK = 10  # graphs that are solved as one problem
 
@@ -94,7 +95,7 @@ class GraduatedNonConvexity:
             control = (2 * worst / self.bound).clamp_min(1.0)
         for _ in range(_GNC_ROUNDS):
             before, weights = weights, self.weights(squared, control)
-            S_cw = solve(graphs, weights, S_cw, _STEPS)
+            S_cw = solve(graphs, weights, S_cw, _GNC_STEPS)
             squared = chi_squares(graphs, S_cw)
             done = (before - weights).abs()[graphs.mask].amax() < _DIFFERENT
             if self.truncated and done and bool(((weights < _DIFFERENT) | (weights > 1 - _DIFFERENT)).all()):
