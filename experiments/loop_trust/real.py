@@ -47,7 +47,7 @@ def real_graphs(run: Path, false_share: float, count: int, seed: int = 0) -> Gra
     odometry = se3_inverse(T_online[1:]) @ T_online[:-1]
     generator = torch.Generator().manual_seed(seed)
     num_false = round(false_share / (1 - false_share) * len(pairs))
-    graphs = []
+    graphs: list[Graphs] = []
     while len(graphs) < count:
         false = false_loops(T_true, num_false, torch.tensor(_LOOP_SIGMAS).double(), generator)
         if false is None:

@@ -104,7 +104,8 @@ def resampled(curve: Tensor, nodes: int) -> Tensor:
 
 def _streets(nodes: int, generator: Generator, blocks: int, lengths: tuple[int, int]) -> Tensor:
     """(nodes, 3) a random walk over `blocks` by `blocks` blocks of given lengths, never straight back."""
-    crossing, came, places = (0, 0), (0, 0), []
+    crossing, came = (0, 0), (0, 0)
+    places: list[tuple[float, float, float]] = []
     while len(places) < nodes:
         ways = [
             (dx, dy)
