@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from experiments.loop_trust import run
 from experiments.loop_trust.baselines import (
     CHI_SQUARE,
     Cauchy,
@@ -177,6 +178,27 @@ def test_training_learns_to_tell_loops_and_then_trajectories() -> None:
     assert float(weights[graphs.genuine].mean()) > float(weights[graphs.mask & ~graphs.genuine].mean())
     everything = ate(nodes_of(Everything(), graphs), graphs.S_cw_true)
     assert bool((ate(S_cw, graphs.S_cw_true).log().mean() < everything.log().mean()).all())
+
+
+def test_the_experiment_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    cheap: dict[str, list[Method]] = {
+        "Cauchy": [Everything()],
+        "DCS": [Everything(), Odometry()],
+        "GNC": [Odometry()],
+        "PCM": [PairwiseConsistency(CHI_SQUARE), PairwiseConsistency(4 * CHI_SQUARE)],
+    }
+    monkeypatch.setattr(run, "candidates", lambda: cheap)
+    monkeypatch.setattr(run, "SEEDS", (0, 1))
+    monkeypatch.setattr(run, "NODES", 30)
+    monkeypatch.setattr(run, "TRAINING", {"ring": ring})
+    monkeypatch.setattr(run, "UNSEEN", {"eight": UNSEEN["eight"]})
+    monkeypatch.setattr("sys.argv", ["run", "--quick"])
+    readme = (run.HERE / "README.md").read_bytes()
+    run.main()
+    told = capsys.readouterr().out
+    assert "eight, strong drift" in told
+    assert "- PCM: chi² " in told
+    assert (run.HERE / "README.md").read_bytes() == readme
 
 
 def test_ratios_are_of_geometric_means() -> None:
