@@ -35,7 +35,7 @@ class Sizes:
 
     training: int = 700
     choosing: int = 2
-    tested: int = 6
+    tested: int = 12
     beside: int = 0
 
 
