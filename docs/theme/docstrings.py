@@ -25,9 +25,13 @@ PRONOUNS = {"Returns", "Raises", "Source", "Sources"}
 
 @dataclass
 class Block:
-    """Lines of a docstring that belong together: prose, code, or fields as pairs of names and text."""
+    """Lines of a docstring that belong together: prose, code, or fields as pairs of names and text.
+
+    joined: whether no empty line parts it from the block before
+    """
 
     kind: str
+    joined: bool = False
     lines: list[str] = field(default_factory=list)
     pairs: list[tuple[str, str]] = field(default_factory=list)
 
@@ -41,6 +45,9 @@ class HouseDocstrings(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
         self._index = {obj.name: obj.path for obj in _public(pkg)}
         for obj in list(_everything(pkg)):
+            for parameter in getattr(obj, "parameters", ()):
+                if str(parameter.default).startswith("(lambda"):  # the factory of a field
+                    parameter.default = "..."
             if obj.docstring is not None:
                 obj.docstring.value = self._markdown(obj, obj.docstring.value)
 
@@ -52,6 +59,8 @@ class HouseDocstrings(griffe.Extension):
                 parts.append("```python\n" + "\n".join(_dedented(block.lines)) + "\n```")
             elif block.kind == "prose":
                 parts.append(_escaped(" ".join(block.lines), self._linker(obj, parameters)))
+            elif block.kind == "table":
+                parts.append("\n".join(block.lines))
             elif block.kind == "list":
                 parts.append("\n".join(_escaped(line, self._linker(obj, parameters)) for line in block.lines))
             else:
@@ -62,20 +71,16 @@ class HouseDocstrings(griffe.Extension):
         self, obj: griffe.Object, pairs: list[tuple[str, str]], parameters: set[str], attributes: set[str]
     ) -> str:
         """Sections of parameters and attributes as the Google style has them; a list of what is neither."""
-        link, parts, last = self._linker(obj, parameters), [], ""
+        link = self._linker(obj, parameters)
+        sections: dict[str, list[str]] = {"Args": [], "Attributes": [], "": []}
         for names, text in pairs:
-            described = _escaped(text, link)
+            described = _escaped(text.removesuffix(";"), link)
             for name in names.split(", ") if not names.startswith('"') else [names]:
                 bare = name.lstrip("*")
-                title = "Args:" if bare in parameters else "Attributes:" if bare in attributes else ""
-                if title:
-                    parts.append(f"{'' if title == last else title + chr(10)}    {name}: {described}")
-                else:
-                    parts.append(f"- `{name}`: {described}")
-                if title != last and len(parts) > 1:
-                    parts[-1] = "\n" + parts[-1]
-                last = title
-        return "\n".join(parts)
+                title = "Args" if bare in parameters else "Attributes" if bare in attributes else ""
+                sections[title].append(f"    {name}: {described}" if title else f"- `{name}`: {described}")
+        titled = [f"{title}:\n" * bool(title) + "\n".join(lines) for title, lines in sections.items() if lines]
+        return "\n\n".join(titled)
 
     def _linker(self, obj: griffe.Object, own: set[str]) -> Any:
         def link(span: str) -> str:
@@ -148,19 +153,51 @@ def _blocks(text: str, known: set[str]) -> list[Block]:
             _open(blocks, "code", last.kind == "code").lines.append(line)
         elif pairs:
             _open(blocks, "fields", last.kind == "fields").pairs.extend(pairs)
+        elif line.startswith("|"):
+            _open(blocks, "table", last.kind == "table").lines.append(line)
         elif line.startswith("- "):
             _open(blocks, "list", last.kind == "list").lines.append(line)
         elif last.kind == "list" and indented:
             last.lines[-1] += " " + line.strip()
         else:
-            _open(blocks, "prose", last.kind == "prose" and not blank).lines.append(line.strip())
+            _open(blocks, "prose", last.kind == "prose" and not blank, not blank).lines.append(line.strip())
         blank = False
-    return blocks
+    return _parted(blocks, known)
 
 
-def _open(blocks: list[Block], kind: str, goes_on: bool) -> Block:
+def _parted(blocks: list[Block], known: set[str]) -> list[Block]:
+    """Fields end with their first sentence where the line goes on with others, such as what is returned."""
+    parted: list[Block] = []
+    for block in blocks:
+        last = parted[-1] if parted else Block("")
+        goes_on = block.kind == "prose" and block.joined and last.kind == "fields"
+        if goes_on and not block.lines[0][0].isupper():
+            names, text = last.pairs[-1]
+            whole = " ".join([text, *block.lines])
+            end = re.search(r"[.:](?= [A-Z])", whole)
+            rest = "" if end is None else whole[end.end() :].strip()
+            of_all = [pair for pair in last.pairs if pair[1] != text]
+            last.pairs = [*of_all, (names, whole[: end.start()] if end and rest else whole)]
+            last.pairs[-1:] = _split(*last.pairs[-1], known | set(names.split(", ")))
+            block.lines = [rest]
+            if not rest:
+                continue
+        elif block.kind == last.kind == "prose" and block.joined:
+            last.lines += block.lines
+            continue
+        parted.append(block)
+        if block.kind == "fields":
+            names, text = block.pairs[-1]
+            field_text, returned, rest = text.partition(". Returns ")
+            if returned:
+                block.pairs[-1] = (names, field_text)
+                parted.append(Block("prose", True, ["Returns " + rest]))
+    return parted
+
+
+def _open(blocks: list[Block], kind: str, goes_on: bool, joined: bool = False) -> Block:
     if not goes_on:
-        blocks.append(Block(kind))
+        blocks.append(Block(kind, joined))
     return blocks[-1]
 
 

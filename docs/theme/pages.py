@@ -21,7 +21,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
-    for name, text in (("settings.md", _settings()), ("commands.md", _commands())):
+    for name, text in (
+        ("settings.md", _settings()),
+        ("commands.md", _commands()),
+        ("map_file.md", _map_file()),
+    ):
         files.append(File.generated(config, name, content=text))
     return files
 
@@ -71,4 +75,27 @@ def _commands() -> str:
     for name, (_, summary) in COMMANDS.items():
         command = build_parser(name)._subparsers._group_actions[0].choices[name]  # type: ignore[union-attr,index]
         parts += [f"## torchslam {name}", summary[0].upper() + summary[1:] + ".", f"```text\n{command.format_help()}```"]
+    return "\n\n".join(parts) + "\n"
+
+
+def _map_file() -> str:
+    """The columns of `map.safetensors`."""
+    from torchslam.world import schema
+    from torchslam.world.map_file import FORMAT
+
+    parts = [
+        f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds everything that a run keeps: of each world its tables, "
+        "and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by row, the "
+        "columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a descriptor. "
+        "A column of kind float is of the floating-point type of the geometry, float64 unless the camera says otherwise; "
+        "a descriptor is of bytes or floats.",
+        "`torchslam.world.map_file.read_worlds(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
+        "Any safetensors reader gets at the tensors.",
+    ]
+    for name in ("points", "keyframes", "frames", "observations"):
+        rows = [
+            f"| `{column}` | ({', '.join(map(str, each.shape))}{',' * (len(each.shape) == 1)}) | {each.kind} | {each.about} |"
+            for column, each in getattr(schema, name.upper()).items()
+        ]
+        parts.append("\n".join([f"## {name}", "", "| column | a row | kind | what it is |", "|---|---|---|---|", *rows]))
     return "\n\n".join(parts) + "\n"

@@ -67,9 +67,12 @@ def estimate_absolute_pose(
 ) -> AbsolutePose:
     """Poses of B cameras by RANSAC over P3P, with local optimisation and a least-squares refinement.
 
-    points_w: (B, N, 3); pixels: (B, N, 2); mask: (B, N), rows outside it, or with NaN, are ignored; threshold:
-    reprojection error of an inlier in pixels. The same arguments and seed give the same result. Too few points,
-    points on a line, or pure noise give `success` False for that camera.
+    points_w:  (B, N, 3); pixels: (B, N, 2)
+    threshold: reprojection error of an inlier in pixels
+    mask:      (B, N), rows outside it, or with NaN, are ignored
+
+    The same arguments and seed give the same result. Too few points, points on a line, or pure noise give `success`
+    False for that camera.
 
     Where an input requires a gradient, T_cw carries that of the final least squares with respect to points, pixels
     and camera parameters, with the set of rows it uses fixed (implicit function theorem, exact Hessian).
