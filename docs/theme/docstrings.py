@@ -79,7 +79,9 @@ class HouseDocstrings(griffe.Extension):
                 bare = name.lstrip("*")
                 title = "Args" if bare in parameters else "Attributes" if bare in attributes else ""
                 sections[title].append(f"    {name}: {described}" if title else f"- `{name}`: {described}")
-        titled = [f"{title}:\n" * bool(title) + "\n".join(lines) for title, lines in sections.items() if lines]
+        titled = [
+            f"{title}:\n" * bool(title) + "\n".join(lines) for title, lines in sections.items() if lines
+        ]
         return "\n\n".join(titled)
 
     def _linker(self, obj: griffe.Object, own: set[str]) -> Any:
@@ -88,7 +90,11 @@ class HouseDocstrings(griffe.Extension):
             if found is None or found[1] in own:
                 return span
             path = self._path(obj, found[1])
-            return span if path is None else f'<autoref optional identifier="{path}"><code>{span[1:-1]}</code></autoref>'
+            return (
+                span
+                if path is None
+                else f'<autoref optional identifier="{path}"><code>{span[1:-1]}</code></autoref>'
+            )
 
         return link
 
@@ -106,9 +112,9 @@ class HouseDocstrings(griffe.Extension):
 
 def _public(pkg: griffe.Module) -> Iterator[griffe.Object]:
     for obj in _everything(pkg):
-        if (obj.is_class or obj.is_function) and obj.parent is not None and obj.parent.is_module:
-            if not obj.name.startswith("_"):
-                yield obj
+        is_global = (obj.is_class or obj.is_function) and obj.parent is not None and obj.parent.is_module
+        if is_global and not obj.name.startswith("_"):
+            yield obj
 
 
 def _everything(obj: griffe.Object) -> Iterator[griffe.Object]:
@@ -144,7 +150,9 @@ def _blocks(text: str, known: set[str]) -> list[Block]:
             if last.kind == "code":
                 last.lines.append("")
             continue
-        indented = line.startswith("    ") or (line.startswith(" ") and last.kind in ("fields", "code", "list"))
+        indented = line.startswith("    ") or (
+            line.startswith(" ") and last.kind in ("fields", "code", "list")
+        )
         pairs = [] if indented else _pairs(line.strip(), known, last.kind == "fields" and not blank)
         if indented and last.kind == "fields" and not blank:
             names, so_far = last.pairs.pop()

@@ -54,14 +54,24 @@ def _sections(settings: Any, prefix: str) -> Iterator[str]:
         if isinstance(value, Settings):
             inner.append((each.name, value))
         else:
-            shown = f'"{value}"' if isinstance(value, str) else str(value).lower() if value in (True, False) else value
+            shown = (
+                f'"{value}"'
+                if isinstance(value, str)
+                else str(value).lower()
+                if value in (True, False)
+                else value
+            )
             about = each.metadata.get("about", "")
             allowed = "true or false" if isinstance(value, bool) else str(each.metadata["allowed"])
-            allowed = "any text" if isinstance(value, str) and not each.metadata["allowed"].choices else allowed
+            allowed = (
+                "any text" if isinstance(value, str) and not each.metadata["allowed"].choices else allowed
+            )
             rows.append(f"| `{each.name}` | {about} | `{shown}` | {allowed} |")
     if rows:
         title = f"## `[{prefix}]`" if prefix else "## Outside of sections"
-        yield "\n".join([title, "", "| setting | what it is | default | allowed |", "|---|---|---|---|", *rows])
+        yield "\n".join(
+            [title, "", "| setting | what it is | default | allowed |", "|---|---|---|---|", *rows]
+        )
     for name, value in inner:
         yield from _sections(value, f"{prefix}.{name}" if prefix else name)
 
@@ -71,10 +81,18 @@ def _commands() -> str:
     from torchslam.cli import COMMANDS, build_parser
 
     os.environ["COLUMNS"] = "100"
-    parts = ["# Command line", "Exit status: 0 done, 2 an error (one line on stderr says which), 3 no map could be initialised or no frame be localised, 130 and 143 ended by Ctrl-C and by SIGTERM."]
+    parts = [
+        "# Command line",
+        "Exit status: 0 done, 2 an error (one line on stderr says which), 3 no map could be initialised or no frame be "
+        "localised, 130 and 143 ended by Ctrl-C and by SIGTERM.",
+    ]
     for name, (_, summary) in COMMANDS.items():
         command = build_parser(name)._subparsers._group_actions[0].choices[name]  # type: ignore[union-attr,index]
-        parts += [f"## torchslam {name}", summary[0].upper() + summary[1:] + ".", f"```text\n{command.format_help()}```"]
+        parts += [
+            f"## torchslam {name}",
+            summary[0].upper() + summary[1:] + ".",
+            f"```text\n{command.format_help()}```",
+        ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -84,18 +102,18 @@ def _map_file() -> str:
     from torchslam.world.map_file import FORMAT
 
     parts = [
-        f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds everything that a run keeps: of each world its tables, "
-        "and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by row, the "
-        "columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a descriptor. "
-        "A column of kind float is of the floating-point type of the geometry, float64 unless the camera says otherwise; "
-        "a descriptor is of bytes or floats.",
+        f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds everything that a run keeps: of each world its "
+        "tables, and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by "
+        "row, the columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a "
+        "descriptor. Floats are float64 as a run writes them; a descriptor is bytes or floats.",
         "`torchslam.world.map_file.read_worlds(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
         "Any safetensors reader gets at the tensors.",
     ]
     for name in ("points", "keyframes", "frames", "observations"):
-        rows = [
-            f"| `{column}` | ({', '.join(map(str, each.shape))}{',' * (len(each.shape) == 1)}) | {each.kind} | {each.about} |"
-            for column, each in getattr(schema, name.upper()).items()
-        ]
-        parts.append("\n".join([f"## {name}", "", "| column | a row | kind | what it is |", "|---|---|---|---|", *rows]))
+        rows = []
+        for column, each in getattr(schema, name.upper()).items():
+            shape = ", ".join(map(str, each.shape)) + "," * (len(each.shape) == 1)
+            rows.append(f"| `{column}` | ({shape}) | {each.kind} | {each.about} |")
+        head = [f"## {name}", "", "| column | a row | kind | what it is |", "|---|---|---|---|"]
+        parts.append("\n".join([*head, *rows]))
     return "\n\n".join(parts) + "\n"
