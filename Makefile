@@ -24,7 +24,7 @@ INSTALLED_DOCS := $(VENV)/.torchslam-installed-docs
 INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 
-.PHONY: help demo test fuzz mutation lint types format docs docs-serve benchmarks profile clean distclean
+.PHONY: help demo test test-docs fuzz mutation lint types format docs docs-serve benchmarks profile clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -35,6 +35,9 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-docs: $(INSTALLED_DEV)  ## run all that the documentation says can be run: every tutorial
+	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
 
 fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB
 	$(BIN)/python -m tests.fuzz
