@@ -10,6 +10,7 @@ from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTSIDE = ("experiments/**/*.md", "experiments/**/*.png", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -28,6 +29,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     ):
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Links of a file in the root of the repository lead into docs/; here they begin there."""
+    return markdown.replace("](docs/", "](") if page.file.src_uri == "CONTRIBUTING.md" else markdown
 
 
 def _settings() -> str:
