@@ -2,42 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
-import torchslam
 from tests.docs.running import blocks, first_missing, run_page
 from torchslam.cli import main
 
 DOCS = Path(__file__).parents[2] / "docs"
 RUN_HERE = sorted(page for page in DOCS.rglob("*.md") if any(blocks(page)))
-SLOW = {"own_video.md"}  # finds its camera by several runs
-
-
-@pytest.fixture(scope="session")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """40 frames of the rendered room, 320x240, 15 a second."""
-    path = tmp_path_factory.mktemp("video") / "video.mp4"
-    sequence = torchslam.open_sequence("synthetic:room", resize_to="320x240", stride=2, limit=40)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 15, sequence.size)
-    for index in range(len(sequence)):
-        writer.write(np.ascontiguousarray(sequence.colour(index).numpy()[..., ::-1]))
-    writer.release()
-    return path
-
-
-@pytest.fixture
-def folder(tmp_path: Path, video: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where a page begins: a folder with a video, and a webcam that shows it."""
-    shutil.copy(video, tmp_path)
-    monkeypatch.chdir(tmp_path)
-    opened = cv2.VideoCapture
-    monkeypatch.setattr(cv2, "VideoCapture", lambda source: opened(str(video) if source == 0 else source))
-    return tmp_path
+SLOW = {"own_video.md", "colmap_splat.md", "train.md"}  # several runs, a refinement, a training
 
 
 def results_of_the_first_tutorial() -> None:
