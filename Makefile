@@ -36,7 +36,7 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-test-docs: $(INSTALLED_DEV)  ## run all that the documentation says can be run: every tutorial
+test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## run all that the documentation says can be run: every tutorial
 	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
 
 fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB

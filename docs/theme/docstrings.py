@@ -126,6 +126,8 @@ def _everything(obj: griffe.Object) -> Iterator[griffe.Object]:
 
 def _parameters(obj: griffe.Object) -> set[str]:
     if obj.is_class:
+        if "dataclass" in obj.labels:
+            return set()  # its fields are attributes
         constructor = obj.members.get("__init__")
         return _parameters(constructor) if constructor is not None and constructor.is_function else set()
     if not obj.is_function:

@@ -50,6 +50,7 @@ DONE = 0
 NO_MAP = 3
 RADIAL = 2  # coefficients of the distortion that may be found
 CHECKPOINT_EVERY = 20  # keyframes
+SAME_CAMERA = 1e-8  # relative: a calibration file has nine digits
 Errors = TypeVar("Errors")
 
 
@@ -253,7 +254,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     known, mine = slam.camera, sequence.camera.to(torch.float64)
     if known.size != mine.size or (
         sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
-        and (known.model != mine.model or not torch.equal(known.params.cpu(), mine.params))
+        and (known.model != mine.model or not torch.allclose(known.params.cpu(), mine.params, SAME_CAMERA, 0))
     ):
         raise ResultsError(
             f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
