@@ -29,6 +29,7 @@ def folder(tmp_path: Path, video: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     """Where a page begins."""
     shutil.copy(video, tmp_path)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     opened = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda source: opened(str(video) if source == 0 else source))
     return tmp_path
