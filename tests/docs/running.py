@@ -1,8 +1,8 @@
 """What a page of the documentation says can be run: its fenced blocks, in order, in one folder.
 
 `python` blocks share one namespace; one with a title is written to the file of that name instead. In `console` blocks
-lines after `$ ` are commands; the lines below a command must be in its output, in this order, where `...` stands for any
-text within a line and a line `...` for any lines. Blocks of other languages are shown, not run.
+lines after `$ ` are commands; the lines below a command must be in its output, in this order, where `...` stands for
+any text within a line and a line `...` for any lines. Blocks of other languages are shown, not run.
 """
 
 from __future__ import annotations
