@@ -227,15 +227,15 @@ def _pairs(line: str, known: set[str], among_fields: bool) -> list[tuple[str, st
 
 
 def _split(names: str, text: str, known: set[str]) -> list[tuple[str, str]]:
-    """Fields that share a line: `a: (3,); b, c: (4, 4)`."""
-    pairs = [(names, "")]
-    for part in re.split(r"; ", text):
+    """Fields that share a line: `a: (3,); b, c: (4, 4)`, or `a: (3,), b: (4, 4)`."""
+    first, *rest = re.split(rf"(; |, (?={NAMES}: ))", text)
+    pairs = [(names, first)]
+    for mark, part in zip(rest[::2], rest[1::2], strict=True):
         found = FIELD.match(part)
-        is_new = found is not None and {name.lstrip("*") for name in found[1].split(", ")} <= known
-        if is_new and found is not None and pairs[-1][1]:
+        if found is not None and {name.lstrip("*") for name in found[1].split(", ")} <= known:
             pairs.append((found[1], found[2]))
         else:
-            pairs[-1] = (pairs[-1][0], f"{pairs[-1][1]}; {part}" if pairs[-1][1] else part)
+            pairs[-1] = (pairs[-1][0], pairs[-1][1] + mark + part)
     return pairs
 
 

@@ -37,7 +37,7 @@ class Thing:
 def thing(points: int, mask: int) -> int:
     """Make one.
 
-    points: (N, 3). Returns (N,), which
+    points: (N, 3), mask: (N,), all; none. Returns (N,), which
     goes on here. mask: is prose now.
     Raises ValueError for what is none.
     """
@@ -89,7 +89,7 @@ def test_names_become_links(docstrings: dict[str, str]) -> None:
 
 def test_what_is_returned_is_no_part_of_a_parameter(docstrings: dict[str, str]) -> None:
     text = docstrings["thing"]
-    assert "Args:\n    points: (N, 3)\n" in text
+    assert "Args:\n    points: (N, 3)\n    mask: (N,), all; none\n" in text
     assert "Returns (N,), which goes on here. mask: is prose now. Raises ValueError" in text
 
 

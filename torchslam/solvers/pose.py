@@ -76,7 +76,7 @@ def refine_pose(
     """Minimise robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
 
     T_cw:      (B, 4, 4) start
-    points_w:  (B, N, 3); pixels: (B, N, 2); either may be of a batch of one, and broadcasts
+    points_w:  (B, N, 3), pixels: (B, N, 2); points or pixels of a batch of one broadcast
     weights:   (B, N) inverse variances in px^-2, one if None
     mask:      (B, N) bool, all if None; rows that are not finite are left out in any case
     scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
