@@ -83,18 +83,22 @@ class Camera:
 
     @property
     def fx(self) -> Tensor:
+        """(...) focal length along x, pixels."""
         return self.params[..., 0]
 
     @property
     def fy(self) -> Tensor:
+        """(...) focal length along y, pixels."""
         return self.params[..., 1]
 
     @property
     def cx(self) -> Tensor:
+        """(...) x of the principal point, pixels."""
         return self.params[..., 2]
 
     @property
     def cy(self) -> Tensor:
+        """(...) y of the principal point, pixels."""
         return self.params[..., 3]
 
     @property
@@ -104,10 +108,12 @@ class Camera:
 
     @property
     def width(self) -> int:
+        """Of the images, pixels."""
         return self.size[0]
 
     @property
     def height(self) -> int:
+        """Of the images, pixels."""
         return self.size[1]
 
     @property
