@@ -14,23 +14,30 @@ RESULTS ?= results/demo
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --constraint constraints.txt
 
+# From the sources here, wherever another checkout is installed. The theme's word about its own future is none of ours.
+MKDOCS := NO_MKDOCS_2_WARNING=1 PYTHONPATH=. $(BIN)/mkdocs
+
 # Stamps: an environment is made again only when what it is made from has changed.
 INSTALLED := $(VENV)/.torchslam-installed
 INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
+INSTALLED_DOCS := $(VENV)/.torchslam-installed-docs
 INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 
-.PHONY: help demo test fuzz mutation lint types format benchmarks profile clean distclean
+.PHONY: help demo test test-docs fuzz mutation lint types format docs docs-serve benchmarks profile clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */\1\t/' | expand -t 14
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1\t/' | expand -t 14
 
 demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a table
 	$(BIN)/torchslam demo --output results/demo
 
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## run all that the documentation says can be run: every tutorial
+	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
 
 fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB
 	$(BIN)/python -m tests.fuzz
@@ -49,6 +56,12 @@ format: $(INSTALLED_DEV)  ## rewrite the sources in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(INSTALLED_DOCS)  ## the documentation, as pages in site/
+	$(MKDOCS) build --strict
+
+docs-serve: $(INSTALLED_DOCS)  ## the documentation on http://127.0.0.1:8000, made again whenever it changes
+	$(MKDOCS) serve --strict
+
 benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against the peers
 	$(BIN)/python -m experiments.benchmarks.features
 	$(BIN)/python -m experiments.benchmarks.geometry
@@ -63,7 +76,7 @@ profile: $(INSTALLED)  ## milliseconds by stage of the run in RESULTS (results/d
 	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)
 
 clean:  ## remove results and caches, keep the environment
-	rm -rf results build dist mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf results build dist site mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean  ## remove the environment too
@@ -90,6 +103,11 @@ $(INSTALLED_DEV): $(INSTALLED)
 $(INSTALLED_MUTATION): $(INSTALLED_DEV)
 	@echo 'installing the tool for mutation testing into $(VENV): a minute, once'
 	@$(PIP) --group mutation
+	@touch $@
+
+$(INSTALLED_DOCS): $(INSTALLED)
+	@echo 'installing the tools for the documentation into $(VENV): a minute, once'
+	@$(PIP) --group docs
 	@touch $@
 
 $(INSTALLED_BENCHMARKS): $(INSTALLED)

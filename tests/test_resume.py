@@ -398,6 +398,14 @@ def test_maps_that_cannot_be_gone_on_in(
     assert "--localize needs a --map" in capsys.readouterr().err
 
 
+def test_the_camera_of_a_map_is_known_to_as_many_digits_as_a_calibration_file_has(
+    tmp_path: Path, cut: type[Cut]
+) -> None:
+    rounded = WALK.camera.with_params(WALK.camera.params * (1 + 4e-10))
+    write_worlds(tmp_path / "map", [], rounded)
+    assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 0
+
+
 # --- a real power cut ----------------------------------------------------------------------------------------
 
 CHILD = """

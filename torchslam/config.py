@@ -363,6 +363,12 @@ class BundleConfig(Settings, section="bundle"):
 
 @dataclass(frozen=True)
 class Config(Settings):
+    """All settings, section by section: `Config(loops=LoopsConfig(enabled=False))`, or read by `load_config`.
+
+    Frozen, like its sections: `dataclasses.replace` makes another one. Raises ConfigError for a value that is not
+    allowed, however it is made.
+    """
+
     seed: int = setting(0, "of all random choices", low=0, high=2**63 - 1)
     scale: str = setting(
         "unit",

@@ -344,9 +344,13 @@ class State(Enum):
     """What the system is doing."""
 
     INITIALIZING = "initializing"
+    """There is no map yet."""
     TRACKING = "tracking"
+    """There is a pose, and it may be believed."""
     UNCERTAIN = "uncertain"
+    """There is a pose, but too little agrees with it, or it was just found again: nothing is built on it yet."""
     LOST = "lost"
+    """There is a map, and no pose."""
 
 
 @dataclass(frozen=True)

@@ -234,9 +234,11 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
         return SLAM(sequence.camera.to(plan.device), config), Progressed()
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
     known, mine = slam.camera, sequence.camera.to(torch.float64)
+    same = known.params.shape == mine.params.shape  # to the nine digits of a calibration file
+    same = same and torch.allclose(known.params.cpu(), mine.params, rtol=1e-8, atol=0)
     if known.size != mine.size or (
         sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
-        and (known.model != mine.model or not torch.equal(known.params.cpu(), mine.params))
+        and (known.model != mine.model or not same)
     ):
         raise ResultsError(
             f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "

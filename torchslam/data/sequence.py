@@ -29,8 +29,11 @@ class Calibrated(Enum):
     """What is known of a sequence's camera."""
 
     GIVEN = "given"
+    """By the user, with the data, or found out by the images."""
     GUESSED = "guessed"
+    """Only near the truth: a field of view, the focal length of EXIF."""
     MISSING = "missing"
+    """The images decide."""
 
 
 class Sequence(ABC):
@@ -58,7 +61,7 @@ class Sequence(ABC):
         guessed: bool = False,
         notes: Iterable[str] = (),
     ) -> None:
-        """size: of the images; needed where there is no camera. guessed: whether the camera is only near the truth."""
+        """size: of the images; needed where there is no camera; guessed: whether the camera is only near the truth."""
         self.name = name
         self.kind = kind
         known = size if camera is None else camera.size

@@ -52,7 +52,7 @@ def write_ply(
 ) -> None:
     """Write points and camera centres as one cloud.
 
-    points_w, colors: (L, 3), red, green, blue as uint8
+    points_w:         (L, 3); colors: (L, 3) uint8 red, green, blue
     centres_w:        (K, 3) camera centres, red, with 0 observations
     normals_w:        (L, 3); the normal of a point looks back to the cameras that saw it. Zero if None
     observations:     (L,) in how many keyframes a point was seen. 0 if None

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 EXTRACTORS = ("orb", "opencv-orb", "xfeat", "aliked")
+"""Names that `extractor` knows."""
 
 
 def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None = None) -> nn.Module:

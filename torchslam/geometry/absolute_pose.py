@@ -68,9 +68,12 @@ def estimate_absolute_pose(
 ) -> AbsolutePose:
     """Poses of B cameras by RANSAC over P3P, with local optimisation and a least-squares refinement.
 
-    points_w: (B, N, 3); pixels: (B, N, 2); mask: (B, N), rows outside it, or with NaN, are ignored; threshold:
-    reprojection error of an inlier in pixels. The same arguments and seed give the same result. Too few points,
-    points on a line, or pure noise give `success` False for that camera.
+    points_w:  (B, N, 3); pixels: (B, N, 2)
+    threshold: reprojection error of an inlier in pixels
+    mask:      (B, N), rows outside it, or with NaN, are ignored
+
+    The same arguments and seed give the same result. Too few points, points on a line, or pure noise give `success`
+    False for that camera.
 
     `torch.compile(fullgraph=True)` takes it as one operator, with the same bits: how many samples it draws depends on
     the data, which no graph may ask.

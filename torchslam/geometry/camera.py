@@ -23,11 +23,12 @@ class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
     model:  "pinhole", "radial_tangential" or "fisheye"
-    params: (..., P) fx, fy, cx, cy in pixels, then the distortion: none; k1, k2, p1, p2, k3; or k1, k2, k3, k4
+    params: (..., P) fx, fy, cx, cy in pixels, then what the model has of distortion, as OpenCV orders and defines it:
+            nothing for a pinhole, k1, k2, p1, p2, k3 for radial_tangential, k1, k2, k3, k4 for fisheye
     size:   (width, height) in pixels
 
-    Coefficients as in OpenCV. Every method is differentiable with respect to points, pixels and `params`. It is a
-    pytree of `params`: `torch.func` and `torch.utils.data.default_collate` take it.
+    Every method is differentiable with respect to points, pixels and `params`. A camera is a pytree with `params` as
+    its only leaf, so that `torch.func` and `torch.utils.data.default_collate` take it.
     """
 
     model: str
@@ -82,18 +83,22 @@ class Camera:
 
     @property
     def fx(self) -> Tensor:
+        """(...) focal length along x, pixels."""
         return self.params[..., 0]
 
     @property
     def fy(self) -> Tensor:
+        """(...) focal length along y, pixels."""
         return self.params[..., 1]
 
     @property
     def cx(self) -> Tensor:
+        """(...) x of the principal point, pixels."""
         return self.params[..., 2]
 
     @property
     def cy(self) -> Tensor:
+        """(...) y of the principal point, pixels."""
         return self.params[..., 3]
 
     @property
@@ -103,10 +108,12 @@ class Camera:
 
     @property
     def width(self) -> int:
+        """Of the images, pixels."""
         return self.size[0]
 
     @property
     def height(self) -> int:
+        """Of the images, pixels."""
         return self.size[1]
 
     @property
@@ -118,9 +125,7 @@ class Camera:
 
     @cached_property
     def limit(self) -> Tensor:
-        """(...) up to where the distortion is monotone: a radius x/z (a ray angle for a fisheye), or
-        infinity.
-        """
+        """(...) how far out the distortion is monotone: a radius in x/z, y/z, for a fisheye an angle; or infinity."""
         return self._distortion.limit(self.params.detach()[..., 4:])
 
     @property
@@ -156,9 +161,10 @@ class Camera:
     def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of points in the camera frame.
 
-        points_c: (..., N, 3). Returns pixels (..., N, 2), always finite, and valid (..., N): in front of the
-        camera and within the monotone part of the distortion. Invalid points get the middle of the image and
-        no gradient.
+        points_c: (..., N, 3)
+
+        Returns pixels (..., N, 2), always finite, and valid (..., N): in front of the camera and within the monotone
+        part of the distortion. Invalid points get the middle of the image and no gradient.
         """
         normalized, valid = self._normalize_points(points_c)
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
@@ -202,8 +208,7 @@ class Camera:
     def normalize(self, pixels: Tensor) -> Tensor:
         """Undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
 
-        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the
-        centre.
+        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the centre.
         """
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)

@@ -16,6 +16,14 @@ import torch
 from torch import Tensor
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
+"""What a residual costs beyond the scale.
+
+"none":          its square, as before it: least squares
+"huber":         its length
+"cauchy":        the logarithm of its square
+"geman_mcclure": ever less, at most the square of the scale
+"truncated":     no more than at the scale: beyond it there is no gradient
+"""
 
 
 class Robustified(NamedTuple):

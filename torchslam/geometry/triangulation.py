@@ -64,8 +64,10 @@ def triangulate(
 ) -> Triangulation:
     """Triangulates matches of two views, with the least squared error in undistorted coordinates.
 
-    T_1w, T_2w: (..., 4, 4); pixels_1, pixels_2: (..., N, 2); mask: (..., N). Rows outside the mask may hold
-    anything. normalized: the pixels undistorted, twice (..., N, 2), where the caller has them already.
+    T_1w, T_2w: (..., 4, 4) world to camera; pixels_1, pixels_2: (..., N, 2)
+    mask:       (..., N), rows outside it may hold anything
+    normalized: the pixels undistorted, twice (..., N, 2), where the caller has them already
+
     Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject by `angles`,
     `depths` and `errors`.
     Source: Lindstrom, "Triangulation made easy", 2010 (two iterations, exact to far below the noise).

@@ -25,7 +25,8 @@ __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
 class BundleSolution:
     """The minimum of a bundle adjustment; of a batch, everything leads with B.
 
-    T_cw:       (F, 4, 4); points_w: (P, 3); camera
+    T_cw:       (F, 4, 4); points_w: (P, 3)
+    camera:     one or many, as the problem had them, with other parameters where they were free
     cost:       () half the sum of robustified squared whitened residuals, and priors of what moves, detached
     success:    () bool, all frames that anything counts of start finite, and all that moves is determined, up to the
                 gauge. If not, the estimate is still the best that was found, but it has no gradient.

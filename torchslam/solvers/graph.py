@@ -162,7 +162,8 @@ Graph = TypeVar("Graph", bound=ObservationGraph)
 class GraphSolution:
     """The minimiser of a graph, differentiable with respect to its pixels, weights and camera.
 
-    T_cw:      (F, 4, 4); points_w: (P, 3); camera
+    T_cw:      (F, 4, 4); points_w: (P, 3)
+    camera:    of all frames, with other parameters where it was free
     success:   (F,) bool. A frame that its observations do not determine stays where it was, without gradient; if the
                keyframes of a world together are not determined, none of them succeeds.
     moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.

@@ -1,0 +1,55 @@
+"""Whatever the documentation says can be run is run here, page by page, in an empty folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.docs.running import blocks, first_missing, run_page
+from torchslam.cli import main
+
+DOCS = Path(__file__).parents[2] / "docs"
+RUN_HERE = sorted(page for page in DOCS.rglob("*.md") if any(blocks(page)))
+SLOW = {"own_video.md", "colmap_splat.md", "train.md"}  # several runs, a refinement, a training
+
+
+def results_of_the_first_tutorial() -> None:
+    command = ["run", "video.mp4", "--camera", "250,250,159.5,119.5", "--output", "results/mine"]
+    assert main(command) == 0
+
+
+BEFORE = {"colmap_splat.md": results_of_the_first_tutorial}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.name in SLOW else [])
+        for page in RUN_HERE
+    ],
+)
+def test_page_runs(page: Path, folder: Path) -> None:
+    BEFORE.get(page.name, lambda: None)()
+    run_page(page)
+
+
+def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Page\n\n```python\nx = 1\n```\n\n```python\n\nassert x == 2\n```\n")
+    with pytest.raises(AssertionError, match=r"page\.md:8 failed(.|\n)*page\.md\", line 9"):
+        run_page(page)
+
+
+@pytest.mark.parametrize(
+    ("expected", "missing"),
+    [
+        ("b 2\n", None),
+        ("a ...\nc 3\n", None),
+        ("b ...\na 1\n", "a 1"),
+        ("...\nb 3\n", "b 3"),
+        ("", None),
+    ],
+)
+def test_what_a_command_prints_is_compared(expected: str, missing: str | None) -> None:
+    assert first_missing(expected, "a 1\n  b 2\nc 3\n") == missing
