@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
     from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
 
-__version__ = "0.1.0"
+    __version__: str
 
 __all__ = [
     "ALIKED",
@@ -88,6 +88,8 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """A public name, imported when it is first asked for: torch alone takes a second or two."""
+    if name == "__version__":
+        return _version()
     for home, names in HOMES.items():
         if name in names.split():
             value = globals()[name] = getattr(import_module(home), name)
@@ -95,5 +97,15 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def _version() -> str:
+    """That of the installed package, `0+unknown` for a source tree that is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("torchslam")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})
