@@ -10,6 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from torchslam.missing import explained
+
 if TYPE_CHECKING:
     from torchslam.config import Config, load_config
     from torchslam.data import open_sequence
@@ -92,7 +94,10 @@ def __getattr__(name: str) -> Any:
         return _version()
     for home, names in HOMES.items():
         if name in names.split():
-            value = globals()[name] = getattr(import_module(home), name)
+            try:
+                value = globals()[name] = getattr(import_module(home), name)
+            except ModuleNotFoundError as error:
+                raise explained(error) from error
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

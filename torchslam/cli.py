@@ -15,6 +15,7 @@ from typing import Any
 
 import torchslam
 from torchslam.errors import TorchslamError
+from torchslam.missing import explained
 
 ERROR = 2
 INTERRUPTED = 130
@@ -50,19 +51,27 @@ COMMANDS = {
     ),
 }
 
-WITHOUT_THREADS = ("config", "info")  # compute nothing: torch is imported where a sequence is opened, if at all
+WITHOUT_THREADS = (
+    "config",
+    "info",
+)  # compute nothing: torch is imported where a sequence is opened, if at all
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = build_parser(next(iter(arguments), "")).parse_args(arguments)
-    if options.command not in WITHOUT_THREADS:
-        _compute_in_one_thread()
     try:
+        options = build_parser(next(iter(arguments), "")).parse_args(arguments)
+        if options.command not in WITHOUT_THREADS:
+            _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
         print(f"torchslam: error: {error}", file=sys.stderr)
+        return ERROR
+    except ModuleNotFoundError as error:
+        if (reason := explained(error)) is error:
+            raise
+        print(f"torchslam: error: {reason}", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt:
         print("torchslam: interrupted", file=sys.stderr)
