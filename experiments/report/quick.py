@@ -75,7 +75,7 @@ def matching() -> dict[str, float]:
     sequence, extract = open_sequence("synthetic:room"), ORB(1000)
     with torch.inference_mode():
         one, other = extract(sequence.image(0)), extract(sequence.image(1))
-        return {"ms": milliseconds(lambda: match(one.descriptors, other.descriptors))}
+        return {"ms": milliseconds(lambda: match(one, other))}
 
 
 BENCHMARKS: dict[str, Callable[[], dict[str, float]]] = {
