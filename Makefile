@@ -3,11 +3,13 @@
 #   PYTHON=python  the interpreter that creates it
 #   SAMPLE=200 SEED=0  how many changes `make mutation` tries, and which; SAMPLE=0 tries all: hours
 #   RESULTS=path   the folder of results that `make profile` reads
+#   REPORT_ARGS="..."  arguments for experiments.report.run, e.g. REPORT_ARGS="shelf_bin --accept 'a stricter gate'"
 #   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
 
 PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
+REPORT_ARGS ?=
 SAMPLE ?= 200
 SEED ?= 0
 RESULTS ?= results/demo
@@ -23,8 +25,11 @@ INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
 INSTALLED_DOCS := $(VENV)/.torchslam-installed-docs
 INSTALLED_MUTATION := $(VENV)/.torchslam-installed-mutation
 INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
+INSTALLED_RELEASE := $(VENV)/.torchslam-installed-release
+PYTHONS := 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-docs fuzz mutation lint types format docs docs-serve benchmarks profile clean distclean
+.PHONY: help demo test test-docs fuzz mutation lint types pythons format docs docs-serve benchmarks profile report wheel lock \
+	sbom audit clean distclean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -52,6 +57,9 @@ lint: $(INSTALLED_DEV) types  ## ruff and mypy
 types: $(INSTALLED_DEV)  ## mypy alone
 	$(BIN)/mypy
 
+pythons: $(INSTALLED_DEV)  ## mypy for every Python that the package promises
+	for version in $(PYTHONS); do $(BIN)/mypy --python-version $$version || exit 1; done
+
 format: $(INSTALLED_DEV)  ## rewrite the sources in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -74,6 +82,27 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 
 profile: $(INSTALLED)  ## milliseconds by stage of the run in RESULTS (results/demo)
 	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)
+
+report: $(INSTALLED_BENCHMARKS)  ## all sequences and the quick benchmarks: one line more in docs/figures/history.jsonl, drawn
+	$(BIN)/python -m experiments.report.run $(REPORT_ARGS)
+
+wheel: $(INSTALLED_RELEASE)  ## wheel and source distribution, in dist/
+	$(BIN)/python -m build
+
+lock: $(INSTALLED_RELEASE)  ## requirements-test.lock anew: what the tests need, by version and hash, but torch
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade --config-file requirements-test.toml \
+		--constraints constraints.txt --no-emit-package torch --custom-compile-command 'make lock' \
+		--group pyproject.toml:test --group pyproject.toml:lint pyproject.toml --output-file requirements-test.lock
+
+sbom: $(INSTALLED_RELEASE)  ## dist/torchslam.cdx.json: all that is installed, with versions and licences (CycloneDX)
+	mkdir -p dist
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --output-file dist/torchslam.cdx.json $(BIN)/python
+
+# Strict: a package that could not be looked up would otherwise pass as one without fault.
+audit: $(INSTALLED_RELEASE)  ## known vulnerabilities in what the lock file and constraints.txt name
+	mkdir -p dist
+	grep -hE '^[a-z0-9.-]+==' requirements-test.lock constraints.txt | sed 's/ *\\$$//' | sort -u > dist/audited.txt
+	$(BIN)/pip-audit --strict --disable-pip --no-deps --progress-spinner off --requirement dist/audited.txt
 
 clean:  ## remove results and caches, keep the environment
 	rm -rf results build dist site mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis
@@ -113,4 +142,9 @@ $(INSTALLED_DOCS): $(INSTALLED)
 $(INSTALLED_BENCHMARKS): $(INSTALLED)
 	@echo 'installing the peers for the benchmarks into $(VENV): a minute, once'
 	@$(PIP) --group benchmarks
+	@touch $@
+
+$(INSTALLED_RELEASE): $(INSTALLED)
+	@echo 'installing the tools for releases into $(VENV): a minute, once'
+	@$(PIP) --group release
 	@touch $@

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -154,6 +152,8 @@ def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
         "12",
         "--set",
         "features.num_keypoints=300",
+        "--set",
+        "simulated.noise_px=0.02",  # without any, the camera would be judged to the last bit
     ]
     assert main(["run", ROOM + "&blank=1", "--output", str(tmp_path), *arguments]) == 0
     figures = json.loads((tmp_path / "metrics.json").read_text())
@@ -339,28 +339,6 @@ def test_the_list_of_commands_says_what_each_of_them_says() -> None:
     for home, summary in COMMANDS.values():
         first = (import_module(f"torchslam.commands.{home}").__doc__ or "").split("\n")[0].rstrip(".")
         assert summary == first[0].lower() + first[1:]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "absent"),
-    [
-        (["--help"], {"torch", "numpy", "cv2", "kornia"}),
-        (["--version"], {"torch", "numpy", "cv2", "kornia"}),
-        (["fly"], {"torch", "numpy", "cv2", "kornia"}),
-        (["info", "synthetic:room?frames=2&blank=1"], {"kornia", "matplotlib", "torchslam.slam"}),
-    ],
-)
-def test_nothing_is_imported_before_it_is_needed(arguments: list[str], absent: set[str]) -> None:
-    script = (
-        "import atexit, sys; atexit.register(lambda: print('imported:', *sys.modules)); "
-        "from torchslam.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False
-    )
-    imported = done.stdout.partition("imported: ")[2].split()
-    assert "torchslam.cli" in imported, done.stderr
-    assert not absent & set(imported)
 
 
 def test_public_names_are_imported_when_they_are_asked_for() -> None:

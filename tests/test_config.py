@@ -365,3 +365,19 @@ def test_a_section_says_what_it_allows_in_words() -> None:
             Own(**{name: 2})
     with pytest.raises(ConfigError, match=r"own\.plain must be at least 0 and finite, not -1"):
         Own(plain=-1)
+
+
+def test_a_name_is_a_configuration_that_comes_with_torchslam_and_a_path_is_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fast").write_text("seed = 5\n")
+    assert load_config("fast").patches.enabled
+    assert load_config("default") == Config()
+    assert load_config("./fast").seed == load_config(Path("fast")).seed == 5
+    Path("mine").write_text("seed = 6\n")
+    assert load_config("mine").seed == 6
+    with pytest.raises(
+        ConfigError, match="fats does not exist, nor a configuration of that name; there are default"
+    ):
+        load_config("fats")

@@ -76,6 +76,8 @@ def test_results_of_a_run_elsewhere_are_written(device: torch.device, tmp_path: 
         "10",
         "--features",
         "simulated",
+        "--set",
+        "simulated.noise_px=0.1",  # without any, the camera would be judged to the last bit
         "--device",
         str(device),
         "-o",

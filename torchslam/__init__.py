@@ -10,6 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from torchslam.missing import explained
+
 if TYPE_CHECKING:
     from torchslam.config import Config, load_config
     from torchslam.data import open_sequence
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
     from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
 
-__version__ = "0.1.0"
+    __version__: str
 
 __all__ = [
     "ALIKED",
@@ -88,12 +90,27 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """A public name, imported when it is first asked for: torch alone takes a second or two."""
+    if name == "__version__":
+        return _version()
     for home, names in HOMES.items():
         if name in names.split():
-            value = globals()[name] = getattr(import_module(home), name)
+            try:
+                value = globals()[name] = getattr(import_module(home), name)
+            except ModuleNotFoundError as error:
+                raise explained(error) from error
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def _version() -> str:
+    """That of the installed package, `0+unknown` for a source tree that is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("torchslam")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

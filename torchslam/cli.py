@@ -11,9 +11,11 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
-from torchslam import __version__
+import torchslam
 from torchslam.errors import TorchslamError
+from torchslam.missing import explained
 
 ERROR = 2
 INTERRUPTED = 130
@@ -49,25 +51,49 @@ COMMANDS = {
     ),
 }
 
+WITHOUT_THREADS = (
+    "config",
+    "info",
+)  # compute nothing: torch is imported where a sequence is opened, if at all
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
     # Before NumPy is imported: its threads would stand idle, and keep a second process from being a copy of this one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = build_parser(next(iter(arguments), "")).parse_args(arguments)
-    import torch  # not before the arguments are known to be right
-
-    if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)  # a frame's tensors are small: threads cost more than they bring
     try:
+        options = build_parser(next(iter(arguments), "")).parse_args(arguments)
+        if options.command not in WITHOUT_THREADS:
+            _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
         print(f"torchslam: error: {error}", file=sys.stderr)
         return ERROR
+    except ModuleNotFoundError as error:
+        if (reason := explained(error)) is error:
+            raise
+        print(f"torchslam: error: {reason}", file=sys.stderr)
+        return ERROR
     except KeyboardInterrupt:
         print("torchslam: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+class Version(argparse.Action):
+    """Looked up only when asked for: reading the metadata takes half as long as all the rest of the help."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:
+        print(f"torchslam {torchslam.__version__}")
+        parser.exit()
+
+
+def _compute_in_one_thread() -> None:
+    """Unless the user says otherwise: a frame's tensors are small, threads cost more than they bring."""
+    import torch  # not before the arguments are known to be right
+
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
 
 
 def build_parser(chosen: str) -> argparse.ArgumentParser:
@@ -76,8 +102,8 @@ def build_parser(chosen: str) -> argparse.ArgumentParser:
         prog="torchslam",
         description="Monocular visual SLAM: images in, the camera's trajectory and a sparse map out.",
     )
-    parser.add_argument("--version", action="version", version=f"torchslam {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    parser.add_argument("--version", action=Version, nargs=0, help="show the version and exit")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
     for name, (home, summary) in COMMANDS.items():
         command = commands.add_parser(
             name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter

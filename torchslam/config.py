@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from torchslam.named_configs import find
 from torchslam.plugins import FRONT_ENDS, MATCHERS
 from torchslam.settings import Settings, choices, enlarged, merged, setting, to_toml
 
@@ -406,6 +407,8 @@ CHOICES = choices(Config)
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
     """The defaults, changed by a TOML file, changed by overrides of the form `section.key=value`.
 
+    path: of the file, or as a string the name of one of `configs/`, such as "fast"
+
     Raises ConfigError for a missing or malformed file, an unknown key, or a value of the wrong type or not allowed.
     """
-    return merged(Config(), path, overrides)
+    return merged(Config(), None if path is None else find(path), overrides)

@@ -32,7 +32,7 @@ ORB_SLAM3 = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=NAMES)
-    parser.add_argument("--config", type=Path, default=None)
+    parser.add_argument("--config", default=None)
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
     parser.add_argument("--no-readme", action="store_true", help="print only")
     arguments = parser.parse_args()

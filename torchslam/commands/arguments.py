@@ -1,21 +1,28 @@
-"""Arguments that several commands share, and what they say about sequence and configuration."""
+"""Arguments that several commands share, and what they say about sequence and configuration.
+
+torch is imported where a sequence is opened or a device is named: the help needs neither.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from torchslam.config import CHOICES, Config, load_config
-from torchslam.data import Sequence, open_sequence
-from torchslam.data.presets import PRESETS
+from torchslam.named_configs import names
+
+if TYPE_CHECKING:
+    import torch
+
+    from torchslam.data import Sequence
 
 SEQUENCE_HELP = (
     "folder (ETH3D, TUM, KITTI, KITTI raw, EuRoC, 7-Scenes, TartanAir, ICL-NUIM, or images), pattern of images, "
     "video, zip, ROS bag (.bag, .mcap, folder), camera number, rtsp:// address, or synthetic:room"
 )
+PRESETS = "tum-fr1, tum-fr2, tum-fr3, euroc, kitti, 7-scenes, tartanair, icl"
+"""The names in `torchslam.data.presets`, which needs torch."""
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +31,7 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
         "--camera",
         metavar="CAMERA",
         help="FX,FY,CX,CY[,K1,K2,P1,P2,K3] in pixels; a calibration file (OpenCV, ROS, Kalibr, ORB-SLAM3, COLMAP, "
-        f"nerfstudio); a preset ({', '.join(PRESETS)}); a guess that the images improve: fov=65 (degrees), "
+        f"nerfstudio); a preset ({PRESETS}); a guess that the images improve: fov=65 (degrees), "
         "f=0.8w (image widths), exif; or auto: the images decide. Replaces the calibration found with the images",
     )
     reading = parser.add_argument_group("which frames, and how")
@@ -50,6 +57,8 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
 
 def sequence(options: argparse.Namespace) -> Sequence:
     """The sequence that the arguments of `add_sequence` name; what is to know about it goes to stderr."""
+    from torchslam.data import open_sequence
+
     found = open_sequence(
         options.path,
         options.camera,
@@ -68,7 +77,9 @@ def sequence(options: argparse.Namespace) -> Sequence:
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file of settings; the rest are defaults"
+        "--config",
+        metavar="FILE|NAME",
+        help=f"TOML file of settings, or one that comes with torchslam: {', '.join(names())}; the rest are defaults",
     )
     parser.add_argument(
         "--set",
@@ -110,7 +121,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device",
         type=_device,
-        default=torch.device("cpu"),
+        default="cpu",  # a word: a device would need torch
         metavar="DEVICE",
         help="where to compute, for example cuda (default: %(default)s)",
     )
@@ -127,6 +138,8 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
 
 
 def _device(text: str) -> torch.device:
+    import torch
+
     try:
         device = torch.device(text)
         torch.zeros(1, device=device).item()  # "meta" only pretends to compute

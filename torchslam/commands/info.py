@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from torchslam.commands import arguments
-from torchslam.output.report import table
+from torchslam.output.two_columns import table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,6 +11,7 @@ import torch
 
 from torchslam.evaluation import Evaluation
 from torchslam.geometry import transform
+from torchslam.output.two_columns import table as table
 from torchslam.run import Run
 from torchslam.values import State, StepResult
 
@@ -127,12 +128,6 @@ def stage_times(results: Sequence[StepResult]) -> dict[str, dict[str, float]]:
         stage: {"median": median(values), "mean": mean(values), "frames": len(values)}
         for stage, values in times.items()
     }
-
-
-def table(rows: Mapping[str, str]) -> str:
-    """Two columns: label and value."""
-    width = max(map(len, rows), default=0)
-    return "\n".join(f"  {label:<{width}}   {value}" for label, value in rows.items())
 
 
 def summary(figures: Mapping[str, Any]) -> dict[str, str]:
