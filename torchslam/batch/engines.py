@@ -72,7 +72,7 @@ def ray_data(
             _through_text(work),
             num_cpus=1,
             num_gpus=gpus or None,
-            max_retries=RETRIES,
+            ray_remote_args_fn=lambda: {"max_retries": RETRIES},
             compute=data.TaskPoolStrategy(size=workers),
         )
         for item in done.iter_rows():

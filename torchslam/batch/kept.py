@@ -39,8 +39,9 @@ def keep(
     work:      writes into a folder, which is given its place when all is written, and returns columns as JSON has them
     overwrite: replace results that have other marks; otherwise they are an error
 
-    No Exception leaves it: it becomes the columns `status` and `error`, and is kept with its traceback in `errors/`.
-    What failed is tried again by the next call. KeyboardInterrupt and SystemExit pass, and leave nothing.
+    No Exception leaves it: it becomes the columns `status` and `error`, and is kept in `errors/`, with its traceback
+    where nobody raised it on purpose. What failed is tried again by the next call. KeyboardInterrupt and SystemExit
+    pass, and leave nothing.
     """
     known: Columns = {"name": name, "configuration": ""}
     place = output / RUNS / name
@@ -62,7 +63,8 @@ def keep(
         (output / ERRORS / f"{name}.json").unlink(missing_ok=True)
         return columns | {"is_new": True}
     except Exception as error:
-        return failed(output, known, _in_words(error), traceback.format_exc())
+        is_meant = isinstance(error, TorchslamError | OSError)
+        return failed(output, known, _in_words(error), "" if is_meant else traceback.format_exc())
 
 
 def failed(output: Path, known: Columns, words: str, trace: str = "") -> Columns:

@@ -39,7 +39,8 @@ def plot_batch(
             _sorted(left, [100.0 * (share or 0.0) for share in posed])
             _sorted(right, [100.0 * error for error in errors if error is not None])
         left.set(xlabel="posed frames (%)", xlim=(0.0, 103.0))
-        right.set(xlabel="ATE (% of the path)", xscale="log")
+        right.set(xlabel="ATE (% of the path)", xscale="log", xlim=_decades(errors))
+        right.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
         figure.suptitle(title, x=0.01, ha="left", fontsize=10.0)
     return figure
 
@@ -72,7 +73,6 @@ def _by_name(
         right.annotate(
             label, (percent[row], row), (6, 0), textcoords="offset points", va="center", fontsize=8
         )
-    right.margins(x=0.2)
 
 
 def _sorted(axes: Axes, values: Sequence[float]) -> None:
@@ -80,3 +80,10 @@ def _sorted(axes: Axes, values: Sequence[float]) -> None:
     ordered = np.sort(np.array(values, dtype=float))
     axes.step(ordered, 100.0 * np.arange(1, len(ordered) + 1) / max(len(ordered), 1), color=style.ESTIMATE)
     axes.set(ylabel=f"of {len(ordered)} sequences (%)", ylim=(0.0, 103.0))
+
+
+def _decades(errors: Sequence[float | None]) -> tuple[float, float]:
+    """Powers of ten around the errors, in percent."""
+    exponents = [np.log10(100.0 * error) for error in errors if error is not None and error > 0]
+    low, high = np.floor(min(exponents, default=0.0)), np.ceil(max(exponents, default=0.0))
+    return 10.0**low, 10.0 ** max(high, low + 1)
