@@ -92,7 +92,14 @@ def test_times_are_in_files_of_their_own(whole: Path) -> None:
 def test_the_results_are_those_of_a_run(whole: Path, tmp_path: Path) -> None:
     settings = [part for setting in SETTINGS for part in ("--set", setting)]
     assert main(["run", ROOM, "--output", str(tmp_path), *settings]) == 0
-    for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply", "config.toml"):
+    for name in (
+        "trajectory.txt",
+        "online.txt",
+        "keyframes.txt",
+        "map.safetensors",
+        "map.ply",
+        "config.toml",
+    ):
         assert (tmp_path / name).read_bytes() == (whole / RUNS / "one" / name).read_bytes(), name
 
 

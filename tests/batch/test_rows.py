@@ -12,7 +12,9 @@ from torchslam.errors import ConfigError, SequenceError
 
 
 def test_a_text_has_a_path_on_each_line(tmp_path: Path) -> None:
-    (tmp_path / "l.txt").write_text("# mine\n\nmonday/rgb\ntuesday.mp4  # the second\nsynthetic:room?frames=3\n")
+    (tmp_path / "l.txt").write_text(
+        "# mine\n\nmonday/rgb\ntuesday.mp4  # the second\nsynthetic:room?frames=3\n"
+    )
     rows = read_list(tmp_path / "l.txt")
     assert [row.sequence for row in rows] == ["monday/rgb", "tuesday.mp4", "synthetic:room?frames=3"]
     assert [row.name for row in rows] == ["rgb", "tuesday", "synthetic-room-frames=3"]
@@ -96,7 +98,9 @@ def test_missing_lists_and_endless_ones(tmp_path: Path) -> None:
 
 
 def test_rows_without_a_name_get_one_that_no_other_has() -> None:
-    rows = named([Row("", "a/rgb"), Row("rgb-2", "b"), Row("", "c/RGB/"), Row("", "..."), Row("", "d/ä ö.mp4")])
+    rows = named(
+        [Row("", "a/rgb"), Row("rgb-2", "b"), Row("", "c/RGB/"), Row("", "..."), Row("", "d/ä ö.mp4")]
+    )
     assert [row.name for row in rows] == ["rgb", "rgb-2", "RGB-3", "sequence", "sequence-2"]
 
 

@@ -98,10 +98,17 @@ def named(rows: Iterable[Row], where: str = "rows") -> list[Row]:
     taken, found = set(given), []
     for row in rows:
         if not row.name:
-            row = replace(row, name=_free(_short(row.sequence), taken))
+            row = replace(row, name=_free(short_name(row.sequence), taken))
             taken.add(row.name.casefold())
         found.append(row)
     return found
+
+
+def short_name(sequence: str) -> str:
+    """What a sequence is called by its path: letters, digits, and `-` in place of anything else."""
+    text = sequence if synthetic.matches(sequence) else Path(sequence).stem
+    text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
+    return text[:LONGEST_NAME] or "sequence"
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -110,13 +117,6 @@ def _free(name: str, taken: set[str]) -> str:
         number += 1
         found = f"{name}-{number}"
     return found
-
-
-def _short(sequence: str) -> str:
-    """What a sequence is called by its path: letters, digits, and `-` in place of anything else."""
-    text = sequence if synthetic.matches(sequence) else Path(sequence).stem
-    text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
-    return text[:LONGEST_NAME] or "sequence"
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
