@@ -39,6 +39,8 @@ COLUMNS: dict[str, type] = {
     "camera": str,
     "configuration": str,
 }
+LARGEST = 1 << 62
+"""Of a figure: nothing that is counted or measured is larger."""
 TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "ms_median", "ms_p95"), float)}
 
 
@@ -50,7 +52,7 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
     """
     configurations = [_configuration(task) for task in tasks]
     rows: list[Columns] | None = None
-    while (found := _gather(tasks, configurations, output)) != rows:
+    while (found := gather(tasks, configurations, output)) != rows:
         rows = found
         _put(output / CSV, _csv(rows, COLUMNS).encode())
         _put(output / TIMES_CSV, _csv(_times(rows, output), TIME_COLUMNS).encode())
@@ -68,11 +70,20 @@ def counts(rows: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(found)
 
 
-def _gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
+def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
+    """The rows of the table as the records in the folder of a batch have them; a record of something else is an error.
+
+    configurations: of the tasks, as by `one.configuration`; empty where there is none
+    """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):
-        record = read_kept(output, task.row.name, settings) | {"sequence": task.row.sequence}
-        rows.append({name: _typed(record.get(name), kind) for name, kind in COLUMNS.items()})
+        name = task.row.name
+        try:
+            record = read_kept(output, name, settings)
+        except ResultsError as error:
+            record = {"status": ERROR, "error": str(error)}
+        record |= {"name": name, "sequence": task.row.sequence}
+        rows.append({column: _typed(record.get(column), kind) for column, kind in COLUMNS.items()})
     return rows
 
 
@@ -84,10 +95,12 @@ def _configuration(task: Task) -> str:
 
 
 def _typed(value: object, kind: type) -> Any:
-    """A value of a record; None for what is no such value."""
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    return value if type(value) is kind else None
+    """A value of a record; None for what is no such value, or is beyond what the table can hold."""
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) if abs(value) < LARGEST else None
+    if type(value) is not kind or (isinstance(value, int) and not 0 <= value < LARGEST):
+        return None
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
