@@ -11,15 +11,19 @@ from torchslam.batch.one import TIMES
 from torchslam.batch.table import TIMES_CSV
 from torchslam.cli import main
 
-SETTINGS = ("features.kind=simulated", "features.num_keypoints=200", "simulated.points_per_view=150")
+SETTINGS = (
+    *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
+    "simulated.noise_px=0.5",  # else the search for a better camera goes on for long
+    *("initialization.min_matches=40", "initialization.min_points=30", "initialization.min_frames=0"),
+)
 OPTIONS = ["--no-pictures", *(part for setting in SETTINGS for part in ("--set", setting))]
-ROOM = "synthetic:room?frames=14&blank=1"
+ROOM = "synthetic:room?frames=10&blank=1"
 LIST = f"""sequence,name,overrides
 {ROOM},one,
 {ROOM},two,seed=2
 missing/folder,three,
 {ROOM},four,features.num_keypoints=0
-synthetic:standstill?frames=6&blank=1,five,
+synthetic:standstill?frames=3&blank=1,five,
 """
 STATUSES = ["done", "done", "error", "error", "no map"]
 
