@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from torchslam.batch import Row, Task
 from torchslam.batch.one import TIMES
 from torchslam.batch.table import TIMES_CSV
 from torchslam.cli import main
@@ -56,3 +58,13 @@ def content(output: Path) -> dict[str, bytes]:
         for path in files
         if path.name not in (TIMES, TIMES_CSV)
     }
+
+
+def table(output: Path) -> list[dict[str, str]]:
+    with (output / "table.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def task(output: Path, sequence: str = ROOM, **more: object) -> Task:
+    row = Row("mine", sequence, overrides=SETTINGS, **more)  # type: ignore[arg-type]
+    return Task(row, str(output), pictures=False)

@@ -6,6 +6,7 @@ import importlib
 import json
 import logging
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -68,13 +69,17 @@ def ray_data(
         # As text: Arrow would have a type for a column of None and another one for the next block.
         items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
         left = set(range(len(rows)))
-        done = data.from_items(items, override_num_blocks=len(items)).map(
-            _through_text(work),
-            num_cpus=1,
-            num_gpus=gpus or None,
-            ray_remote_args_fn=lambda: {"max_retries": RETRIES},
-            compute=data.TaskPoolStrategy(size=workers),
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # max_retries is to go in Ray 2.64, and nothing is to take its place
+            done = data.from_items(items, override_num_blocks=len(items)).map(
+                _through_text(work),
+                num_cpus=1,
+                num_gpus=gpus or None,
+                max_retries=RETRIES,
+                compute=data.TaskPoolStrategy(size=workers),
+            )
         for item in done.iter_rows():
             left.discard(item["number"])
             yield item["number"], json.loads(item["row"])

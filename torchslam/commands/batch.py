@@ -6,10 +6,10 @@ LIST is a text with a path on each line (`#` for comments), or a CSV file with a
 relative to its folder.
 
 In DIR: runs/NAME/ with the results of each sequence, as `torchslam run` writes them but for times, which are in
-times.json; errors/NAME.json for those that failed; table.csv, table.parquet where pyarrow is
-installed, times.csv and table.png. One process or many, in one go or after having been killed: apart from times the
-same bytes. A sequence is run on one thread; what is there already, by settings, version of the program, and names,
-sizes and times of change of the files read, is not run again. What failed is tried again by the next call.
+times.json; errors/NAME.json for those that failed; table.csv, table.parquet where pyarrow is installed, times.csv and
+table.png. One process or many, in one go or after having been killed: apart from times the same bytes. A sequence is
+run on one thread; what is there already, by settings, program, and names, sizes and times of change of the files below
+its path, is not run again. What failed is tried again by the next call.
 
 Several jobs may share DIR, each with its `--shard`; the table has the rows of all. In an array of jobs:
   Slurm       sbatch --array=0-7 --wrap 'torchslam batch LIST -o DIR --shard auto'
