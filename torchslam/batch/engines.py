@@ -108,12 +108,7 @@ def _import_ray() -> tuple[Any, Any]:
 
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)  # what went wrong is in the rows
-    # Workers take one thread each: what Ray itself gives a task of one processor.
-    options: Columns = {
-        "log_to_driver": False,
-        "logging_level": logging.ERROR,
-        "runtime_env": {"env_vars": {"OMP_NUM_THREADS": "1"}},
-    }
+    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address is None:
         options |= {
             "num_cpus": workers,
@@ -125,6 +120,11 @@ def _start(ray: Any, workers: int | None, address: str | None) -> None:
         options["address"] = address
     try:
         ray.init(**options)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # Ray raises what it likes
         line = " ".join(str(error).split())[:500]
-        raise ConfigError(f"--address {address}: no Ray cluster: {line}") from None
+        where = (
+            "the Ray cluster of this machine did not start"
+            if address is None
+            else f"no Ray cluster at {address}"
+        )
+        raise ConfigError(f"--engine ray: {where}: {type(error).__name__}: {line}") from error
