@@ -115,7 +115,7 @@ def open_row(row: Row) -> Sequence:
 
     Raises SequenceError, CalibrationError or TrajectoryError.
     """
-    if live.matches(row.sequence):
+    if live.matches(row.sequence) and not Path(row.path(row.sequence)).exists():
         raise SequenceError(f"{row.sequence}: a live source has no end, and is not the same again")
     camera = row.camera
     if camera is not None and Path(row.path(camera)).is_file():
