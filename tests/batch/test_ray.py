@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.batch.conftest import batch, content
+from tests.batch.workers import answer
 from torchslam.batch import Engine
 
 pytest.importorskip("ray", reason="the extra `ray` is not installed")
@@ -20,12 +19,6 @@ def test_same_bytes_with_one_worker_or_two(whole: Path, listed: Path, tmp_path: 
     more = ["--engine", "ray", "--workers", str(workers)]
     assert batch(listed, tmp_path, more) == 4
     assert content(tmp_path) == content(whole)
-
-
-def answer(row: dict[str, Any]) -> dict[str, Any]:
-    if row["number"] == 1:
-        os._exit(1)
-    return {"twice": 2 * row["number"], "nothing": None}
 
 
 def test_a_worker_that_dies_takes_its_row_alone() -> None:

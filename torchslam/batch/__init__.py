@@ -33,7 +33,10 @@ __all__ = [
     "run_row",
     "write_table",
 ]
-LOST = f"the process that ran it died, {RETRIES + 1} times: out of memory, perhaps"
+LOST = (
+    f"the process that ran it died, {RETRIES + 1} times, or could not begin: "
+    "too little memory, or no torchslam where it ran"
+)
 
 
 def run_batch(

@@ -41,7 +41,7 @@ class Engine:
         """The numbers of the rows with what the function made of them, as they are done.
 
         work: a function of a module; rows and what is made of them are what JSON can say. None where the process that
-        had the row died, as of too little memory.
+        had the row died, as of too little memory, or could not begin.
         Raises ConfigError where Ray is not installed or not found at the address.
         """
         rows = list(rows)
@@ -107,7 +107,7 @@ def _import_ray() -> tuple[Any, Any]:
 
 
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
-    logging.getLogger("ray.data").setLevel(logging.CRITICAL)  # what went wrong is in the rows
+    logging.getLogger("ray.data").setLevel(logging.ERROR)  # says why a worker died, or could not begin
     options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address is None:
         options |= {
