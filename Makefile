@@ -136,7 +136,7 @@ $(INSTALLED_MUTATION): $(INSTALLED_DEV)
 
 $(INSTALLED_DOCS): $(INSTALLED)
 	@echo 'installing the tools for the documentation into $(VENV): a minute, once'
-	@$(PIP) --group docs
+	@$(PIP) --editable '.[docs]'
 	@touch $@
 
 $(INSTALLED_BENCHMARKS): $(INSTALLED)

@@ -1,23 +1,27 @@
-"""What the experiments share: where sequences lie, one run with its figures, Markdown tables."""
+"""What the experiments share: where sequences lie, batches of runs with their figures, Markdown tables."""
 
 from __future__ import annotations
 
+import argparse
 import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-import torch
-
-from torchslam.config import Config
+from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
+from torchslam.batch.identity import digest, of_files, program
+from torchslam.batch.kept import RUNS, keep
+from torchslam.batch.rows import short_name
+from torchslam.batch.table import read_times
+from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
-from torchslam.data.sequence import Sequence
-from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.output.report import metrics
-from torchslam.slam import SLAM
+from torchslam.output.results import read_metrics
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
-def sequences(names: list[str]) -> list[Sequence]:
+def sequences(names: list[str]) -> list[Frames]:
     """Open those of the sequences that are at hand; say which are not."""
     found = []
     for name in names:
@@ -30,14 +34,87 @@ def sequences(names: list[str]) -> list[Sequence]:
     return found
 
 
-def figures(sequence: Sequence, config: Config) -> dict:
-    """Run a sequence and return its metrics, with `failure` where there is no map."""
-    torch.set_num_threads(1)
-    run = SLAM(sequence.camera, config).run(sequence)
-    evaluation = None
-    if sequence.groundtruth is not None and len(run.trajectory) >= MIN_POSES:
-        evaluation = evaluate(run.trajectory, sequence.groundtruth)
-    return metrics(run, evaluation) | {"failure": run.failure}
+def at_hand(names: Iterable[str]) -> list[str]:
+    """Those of the names that are rendered sequences, or folders and files of `DATA_DIR`; says which are not."""
+    found = []
+    for name in names:
+        if name.startswith("synthetic:") or (DATA_DIR / name).exists():
+            found.append(name)
+        else:
+            print(f"{name}: not at {DATA_DIR}, left out")
+    return found
+
+
+def row_of(name: str, *apart: str, overrides: Iterable[str] = (), **more: Any) -> Row:
+    """A row of a batch: a sequence that is `at_hand`; `apart`: words that tell it from other runs over the same."""
+    place = name if name.startswith("synthetic:") else str(DATA_DIR / name)
+    label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *apart))
+    return Row(label, place, overrides=tuple(overrides), **more)
+
+
+def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
+    """Where the runs of an experiment go, and who does them; what is there already is not done again."""
+    parser.add_argument("--output", type=Path, default=Path("results") / experiment, metavar="DIR")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
+    parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
+
+
+def figures_of_all(rows: Sequence[Row], options: argparse.Namespace, pictures: bool = False) -> list[Columns]:
+    """Run the rows with the options of `add_engine`; returns the metrics of each, times included.
+
+    Raises SystemExit where one ended with an error.
+    """
+    output = options.output.absolute()
+    tasks = [Task(row, str(output), overwrite=True, pictures=pictures) for row in rows]
+    check(run_batch(tasks, Engine(options.engine, options.workers), told=_tell))
+    folders = [output / RUNS / row.name for row in rows]
+    return [read_metrics(folder) | read_times(folder) for folder in folders]
+
+
+def kept(
+    name: str, label: str, settings: Iterable[str], work: Callable[[Path], Columns], output: str, code: Path
+) -> Columns:
+    """The columns of a piece of an experiment that is no row of a batch, done unless it was done before: see `keep`.
+
+    name:  unique, as a part of the name of a folder; label: what it is called in the experiment
+    work:  as of `keep`; code: folder of the experiment, whose program counts as does that of torchslam and the data
+    """
+
+    def marks() -> Columns:
+        config = digest({"label": label, "settings": list(settings), "program": program()})
+        return {"configuration": config, "input": of_files([f"{code}/*.py", str(DATA_DIR)])}
+
+    return keep(Path(output), name, marks, work, overwrite=True)
+
+
+def each_case(
+    work: Callable[[Columns], Columns],
+    cases: Sequence[Columns],
+    options: argparse.Namespace,
+    told: Callable[[Columns], None],
+) -> list[Columns]:
+    """What a function that never raises, as by `kept`, makes of the cases; `told` each of them when it is done.
+
+    Cases are what JSON can say. Raises SystemExit where a process died.
+    """
+    found: dict[int, Columns] = {}
+    for number, columns in Engine(options.engine, options.workers).each(work, cases):
+        if columns is None:
+            raise SystemExit(f"{cases[number]}: the process that ran it died")
+        found[number] = columns
+        told(columns)
+    return [found[number] for number in range(len(cases))]
+
+
+def check(found: Iterable[Columns]) -> None:
+    """Raises SystemExit that names what ended with an error."""
+    errors = [f"{columns['name']}: {columns['error']}" for columns in found if columns["status"] == ERROR]
+    if errors:
+        raise SystemExit("\n".join(errors))
+
+
+def _tell(columns: Columns) -> None:
+    print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

@@ -1,7 +1,7 @@
-"""The command line: `torchslam run | refine | demo | eval | plot | export | info | config | download`.
+"""The command line: `torchslam run | batch | refine | demo | eval | plot | export | info | config | download`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
-130 and 143 ended by Ctrl-C and by SIGTERM.
+4 some sequences of a batch with an error, 130 and 143 ended by Ctrl-C and by SIGTERM.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ INTERRUPTED = 130
 # Module, and the first line of its docstring: only that of the command at hand is imported.
 COMMANDS = {
     "run": ("run", "run SLAM on a sequence and write trajectory, map, figures and pictures"),
+    "batch": (
+        "batch",
+        "run many sequences, each once, with one table: alone, as shards of an array of jobs, or on Ray",
+    ),
     "refine": (
         "refine",
         "make poses of another program better by the images, and write them in the form that they had",

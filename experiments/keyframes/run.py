@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
-from experiments.common import figures, sequences, table, write_between
-from torchslam.config import load_config
+from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
 
 NAMES = ("redkitchen", "kitti07", "machine_hall", "shelf_bin")
 FRAMES = 400
@@ -24,18 +22,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(NAMES))
     parser.add_argument("--no-readme", action="store_true", help="print only")
+    add_engine(parser, "keyframes")
     options = parser.parse_args()
+    cases = [(name, rule) for name in at_hand(options.names) for rule in RULES]
+    runs = [row_of(name, rule, overrides=RULES[rule], limit=FRAMES) for name, rule in cases]
     rows = []
-    for sequence in sequences(options.names):
-        part = sequence.part(0, min(FRAMES, len(sequence)))
-        for rule, settings in RULES.items():
-            begin = time.process_time()
-            found = figures(part, load_config(None, settings))
-            cpu = 1e3 * (time.process_time() - begin) / len(part)
-            row = [sequence.name, rule, str(found["keyframes"])]
-            row += [f"{found['ate_m']:.4f}", f"{found['posed']} of {len(part)}", f"{cpu:.0f}"]
-            rows.append(row)
-            print(*row, sep=" | ", flush=True)
+    for (name, rule), found in zip(cases, figures_of_all(runs, options), strict=True):
+        cpu = 1e3 * found["cpu_s"] / found["frames"]
+        row = [name, rule, str(found["keyframes"])]
+        row += [f"{found['ate_m']:.4f}", f"{found['posed']} of {found['frames']}", f"{cpu:.0f}"]
+        rows.append(row)
+        print(*row, sep=" | ", flush=True)
     if not options.no_readme:
         write_between(Path(__file__).parent / "README.md", table(HEADER, rows))
 

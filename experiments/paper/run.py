@@ -6,22 +6,16 @@ python -m experiments.paper.run [SEQUENCE ...] [--output DIR]
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from PIL import Image
 
-from experiments.common import DATA_DIR, table, write_between
-from torchslam.config import Config, load_config
-from torchslam.data import Sequence, open_sequence
-from torchslam.errors import TrajectoryError
-from torchslam.evaluation import evaluate
-from torchslam.output.pictures import draw
-from torchslam.output.report import metrics
-from torchslam.output.results import PLOTS, read_results, write_results
-from torchslam.slam import SLAM
+from experiments.common import DATA_DIR, add_engine, figures_of_all, row_of, table, write_between
+from torchslam.batch.kept import RUNS
+from torchslam.output.results import PLOTS
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parents[1] / "configs" / "paper.toml"
@@ -46,51 +40,50 @@ def main() -> None:
     parser.add_argument(
         "names", nargs="*", metavar="SEQUENCE", help="all by default, and then into the README"
     )
-    parser.add_argument("--output", type=Path, default=Path("results/paper"), metavar="DIR")
+    add_engine(parser, "paper")
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows, failures, pictures = [], [], []
-    for sequence in find(options.names or SEQUENCES):
-        shown = []
-        for kind in FEATURES:
-            directory = options.output / f"{sequence.name}_{kind}"
-            figures = run(sequence, load_config(CONFIG, [f"features.kind={kind}"]), directory)
-            rows.append(row(sequence.name, kind, figures))
-            if figures["failure"]:
-                failures.append(f"\n{sequence.name}, {kind}: {figures['failure']}.\n")
-            print(*rows[-1], figures["failure"], sep="\t", flush=True)
-            shown.append(directory / PLOTS / "scene.png")
-        pictures.append([sequence.name, *(picture(scene) for scene in shown)])
+    places = find(options.names or SEQUENCES)
+    cases = [(place, kind) for place in places for kind in FEATURES]
+    runs = [
+        replace(
+            row_of(place, kind, overrides=[f"features.kind={kind}"], config=str(CONFIG)),
+            name=f"{called(place)}_{kind}",
+        )
+        for place, kind in cases
+    ]
+    rows, failures, pictures = [], [], {called(place): list[str]() for place in places}
+    for (place, kind), made, figures in zip(
+        cases, runs, figures_of_all(runs, options, pictures=True), strict=True
+    ):
+        name = called(place)
+        rows.append(row(name, kind, figures))
+        if figures["failure"]:
+            failures.append(f"\n{name}, {kind}: {figures['failure']}.\n")
+        print(*rows[-1], figures["failure"], sep="\t", flush=True)
+        pictures[name].append(picture(options.output / RUNS / made.name / PLOTS / "scene.png"))
     if not options.names:
-        text = table(HEADER, rows) + "".join(failures) + "\n" + table(["sequence", *FEATURES], pictures)
+        shown = [[name, *cells] for name, cells in pictures.items()]
+        text = table(HEADER, rows) + "".join(failures) + "\n" + table(["sequence", *FEATURES], shown)
         write_between(HERE / "README.md", text)
 
 
-def find(names: Iterable[str]) -> Iterator[Sequence]:
-    """The sequences that are at hand: rendered, among the real ones, or downloaded; says which are not."""
+def find(names: Iterable[str]) -> list[str]:
+    """Where the sequences are that are at hand: rendered, among the real ones, or downloaded; says which are not."""
+    found = []
     for name in names:
         folders = [root / name for root in (DATA_DIR, DOWNLOADS) if (root / name).is_dir()]
         if name.startswith("synthetic:"):
-            yield open_sequence(name)
+            found.append(name)
         elif folders:
-            yield open_sequence(folders[0])
+            found.append(str(folders[0].absolute()))
         else:
             print(f"{name}: neither in {DATA_DIR} nor in {DOWNLOADS}/, left out")
+    return found
 
 
-def run(sequence: Sequence, config: Config, directory: Path) -> dict[str, Any]:
-    """One run with its results and pictures written; returns its figures."""
-    finished = SLAM(sequence.camera, config).run(sequence)
-    evaluation = None
-    if sequence.groundtruth is not None and not finished.failure:
-        try:
-            evaluation = evaluate(finished.trajectory, sequence.groundtruth)
-        except TrajectoryError as error:
-            print(f"{sequence.name}: {error}")
-    figures = metrics(finished, evaluation)
-    write_results(finished, sequence, figures, directory)
-    draw(read_results(directory), directory)
-    return figures
+def called(place: str) -> str:
+    """The name of a sequence in the table."""
+    return place.removeprefix("synthetic:").split("/")[-1]
 
 
 def row(name: str, kind: str, figures: dict[str, Any]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from dataclasses import dataclass
@@ -12,7 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import DATA_DIR, table, write_between
+from experiments.common import DATA_DIR, add_engine, check, each_case, kept, table, write_between
+from torchslam.batch import DONE, Columns
+from torchslam.batch.kept import RECORD, RUNS, read_record
 from torchslam.calibration import FoundCamera, Round, calibrate, refine
 from torchslam.calibration.words import contradiction
 from torchslam.config import Config, load_config
@@ -26,7 +27,6 @@ from torchslam.slam import SLAM
 from torchslam.values import Trajectory
 
 HERE = Path(__file__).parent
-RESULTS = HERE / "results"
 WRONG = 1.2  # how far off a given focal length is that a run should warn of
 HEADER = [
     "sequence",
@@ -183,26 +183,38 @@ def warned(label: str, case: Case) -> None:
         print(f"{label}, given {float(camera.focal):.1f} px: {said}", flush=True)
 
 
+def attempt(case: Columns) -> Columns:
+    """Find the camera of a case unless that was done before; returns its row as `cells`. No Exception leaves it.
+
+    case: its `label`; `output`: folder of the results
+    """
+
+    def work(folder: Path) -> Columns:
+        torch.set_num_threads(1)
+        return {"status": DONE, "cells": found(case["label"], CASES[case["label"]])}
+
+    return kept(case["label"], case["label"], [], work, case["output"], HERE)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("labels", nargs="*", choices=[[], *CASES], help="cases to run; all by default")
     parser.add_argument(
         "--warnings", action="store_true", help="what runs with a wrong focal length say, instead"
     )
+    add_engine(parser, "self_calibration")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    RESULTS.mkdir(exist_ok=True)
-    for label, case in CASES.items():
-        if arguments.labels and label not in arguments.labels:
-            continue
-        if arguments.warnings:
-            warned(label, case)
-        else:
-            (RESULTS / f"{label}.json").write_text(json.dumps(found(label, case)))
-    files = [RESULTS / f"{label}.json" for label in CASES]
-    rows = [json.loads(file.read_text()) for file in files if file.exists()]
-    if not arguments.warnings:
-        write_between(HERE / "README.md", table(HEADER, rows))
+    labels = [label for label in CASES if not arguments.labels or label in arguments.labels]
+    if arguments.warnings:
+        torch.set_num_threads(1)
+        for label in labels:
+            warned(label, CASES[label])
+        return
+    output = arguments.output.absolute()
+    cases = [{"label": label, "output": str(output)} for label in labels]
+    check(each_case(attempt, cases, arguments, lambda columns: print(columns["name"], columns["status"])))
+    records = [read_record(output / RUNS / label / RECORD) for label in CASES]
+    write_between(HERE / "README.md", table(HEADER, [record["cells"] for record in records if record]))
 
 
 if __name__ == "__main__":

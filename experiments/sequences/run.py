@@ -6,8 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from experiments.common import figures, sequences, table, write_between
-from torchslam.config import load_config
+from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
 
 NAMES = ["redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20", "standstill", "synthetic:room"]
 ASKED = {
@@ -35,13 +34,15 @@ def main() -> None:
     parser.add_argument("--config", default=None)
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
     parser.add_argument("--no-readme", action="store_true", help="print only")
+    add_engine(parser, "sequences")
     arguments = parser.parse_args()
+    names = at_hand(arguments.names)
+    config = None if arguments.config is None else str(arguments.config.absolute())
+    runs = [row_of(name, config=config, overrides=arguments.set) for name in names]
     rows = []
-    for name in arguments.names:
-        for sequence in sequences([name]):
-            result = figures(sequence, load_config(arguments.config, arguments.set))
-            rows.append(row(name, result))
-            print(json.dumps({"sequence": name} | result), flush=True)
+    for name, result in zip(names, figures_of_all(runs, arguments), strict=True):
+        rows.append(row(name, result))
+        print(json.dumps({"sequence": name} | result), flush=True)
     header = ["sequence", "posed", "ATE (m)", "ATE / path", "keyframes", "points", "frames/s", "median (ms)"]
     header += ["95 % (ms)", "asked for", "ORB-SLAM3 (m, posed)"]
     text = table(header, rows)

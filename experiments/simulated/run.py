@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
-from experiments.common import figures, sequences, table, write_between
-from torchslam.config import load_config
+from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
 
 NOISY = ["simulated.noise_px=0.5", "simulated.outliers=0.1"]
 CASES = [
@@ -19,17 +19,24 @@ CASES = [
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_engine(parser, "simulated")
+    options = parser.parse_args()
+    known = at_hand(dict.fromkeys(name for name, _, _ in CASES))
+    cases = [case for case in CASES if case[0] in known]
+    runs = [
+        row_of(name, label, overrides=["features.kind=simulated", *overrides])
+        for name, label, overrides in cases
+    ]
     rows = []
-    for name, label, overrides in CASES:
-        for sequence in sequences([name]):
-            result = figures(sequence, load_config(None, ["features.kind=simulated", *overrides]))
-            since_start = result["frames"] - (result["initialised_at"] or 0)
-            share = result["ate_m"] / result["path_length_m"]
-            rows.append(
-                [name, label, f"{result['posed']} of {result['frames']}", f"{result['lost']} of {since_start}",
-                 f"{result['ate_m']:.2g}", f"{result['path_length_m']:.1f}", f"{share:.1e}"]
-            )  # fmt: skip
-            print(*rows[-1], sep="\t", flush=True)
+    for (name, label, _), result in zip(cases, figures_of_all(runs, options), strict=True):
+        since_start = result["frames"] - (result["initialised_at"] or 0)
+        share = result["ate_m"] / result["path_length_m"]
+        rows.append(
+            [name, label, f"{result['posed']} of {result['frames']}", f"{result['lost']} of {since_start}",
+             f"{result['ate_m']:.2g}", f"{result['path_length_m']:.1f}", f"{share:.1e}"]
+        )  # fmt: skip
+        print(*rows[-1], sep="\t", flush=True)
     header = ["trajectory", "features", "posed", "lost after the start", "ATE (m)", "path (m)", "ATE / path"]
     write_between(Path(__file__).parent / "README.md", table(header, rows))
 

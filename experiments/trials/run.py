@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from fnmatch import fnmatch
 from pathlib import Path
 
 import cv2
 import torch
 
-from experiments.common import table, write_between
+from experiments.common import add_engine, check, each_case, kept, table, write_between
 from experiments.trials.gradient import report
 from experiments.trials.outcome import HEADER, Outcome, cells, perform
 from experiments.trials.trials import TRIALS, Trial
+from torchslam.batch import DONE, Columns
+from torchslam.batch.kept import RUNS
+from torchslam.batch.rows import short_name
 from torchslam.errors import SequenceError
 from torchslam.run import Run
 
 HERE = Path(__file__).parent
 README = HERE / "README.md"
+GRADIENT = "gradient.md"
 NOT_RUN = "not yet run"
+LEFT_OUT = "left out"
+"""Beginning of what is said of a trial whose frames are not at hand."""
 
 
 def chosen(patterns: list[str]) -> list[str]:
@@ -42,11 +49,40 @@ def write(rows: dict[str, list[str]]) -> None:
     write_between(README, table(HEADER, [rows.get(name, [name, *blank]) for name in TRIALS]))
 
 
-def follow_up(trial: Trial, outcome: Outcome, run: Run) -> None:
-    """What is looked at beyond the row of the table."""
+def attempt(case: Columns) -> Columns:
+    """Run a trial unless it was run before; returns its row as `cells`. No Exception leaves it.
+
+    case: `name` of the trial, `settings` after its own, `output`: folder of the results
+    """
+    name, settings = case["name"], case["settings"]
+    return kept(
+        short_name(name),
+        name,
+        settings,
+        lambda folder: _attempt(name, settings, folder),
+        case["output"],
+        HERE,
+    ) | {"trial": name}
+
+
+def _attempt(name: str, settings: list[str], folder: Path) -> Columns:
+    trial = TRIALS[name]
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        outcome, run = perform(trial, settings)
+    except SequenceError as error:
+        raise SequenceError(f"{LEFT_OUT}: {error}") from error
     if trial.is_differentiated:
-        assert outcome.recalls, "no loop was closed"
-        report(run, trial.sequence(), HERE / "gradient.md", [(r.frame, r.place) for r in outcome.recalls])
+        follow_up(trial, outcome, run, folder / GRADIENT)
+    return {"status": DONE, "cells": cells(name, outcome, trial.unit)}
+
+
+def follow_up(trial: Trial, outcome: Outcome, run: Run, file: Path) -> None:
+    """What is looked at beyond the row of the table."""
+    assert outcome.recalls, "no loop was closed"
+    file.write_text((HERE / GRADIENT).read_text(encoding="utf-8"), encoding="utf-8")
+    report(run, trial.sequence(), file, [(recall.frame, recall.place) for recall in outcome.recalls])
 
 
 def main() -> None:
@@ -54,21 +90,26 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="trials; * and ? stand for any: 'loss/*', '*/shelf_bin'")
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
     parser.add_argument("--no-readme", action="store_true", help="print only")
+    add_engine(parser, "trials")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    for name in chosen(arguments.names):
-        trial = TRIALS[name]
-        try:
-            outcome, run = perform(trial, arguments.set)
-        except SequenceError as error:
-            print(f"{name}: left out: {error}")
-            continue
-        row = cells(name, outcome, trial.unit)
-        print(*row, sep=" | ", flush=True)
+    output = arguments.output.absolute()
+
+    def told(columns: Columns) -> None:
+        if columns["status"] != DONE:
+            print(f"{columns['trial']}: {columns['error']}", flush=True)
+            return
+        print(*columns["cells"], sep=" | ", flush=True)
         if not arguments.no_readme:
-            follow_up(trial, outcome, run)
-            write(rows_in(README.read_text(encoding="utf-8")) | {name: row})
+            gradient = output / RUNS / columns["name"] / GRADIENT
+            if gradient.exists():
+                shutil.copyfile(gradient, HERE / GRADIENT)
+            write(rows_in(README.read_text(encoding="utf-8")) | {columns["trial"]: columns["cells"]})
+
+    cases = [
+        {"name": name, "settings": arguments.set, "output": str(output)} for name in chosen(arguments.names)
+    ]
+    found = each_case(attempt, cases, arguments, told)
+    check(columns for columns in found if not columns.get("error", "").startswith(LEFT_OUT))
 
 
 if __name__ == "__main__":

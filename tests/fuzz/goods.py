@@ -234,6 +234,14 @@ CALIBRATIONS: dict[str, Files] = {
 }
 """Calibration files of every program whose files are read; the first of each is what is opened."""
 
+BATCH_CSV = (
+    "sequence,name,camera,config,overrides,groundtruth,start,stop,stride,fps,limit,resize,mask\n"
+    'a/rgb,first,"60,61,31.5,23.5",c.toml,seed=3; features.num_keypoints=500,t.txt,1.5s,1:30,2,12.5,9,0.5,m.png\n'
+    '"b, c",,fov=65,,,,0,7,,,,48x36,\n'
+    "synthetic:room?frames=3,,,,seed=7,,,,,,,,\n"
+)
+BATCH_TEXT = "# three\na/rgb\n../b.mp4  # a video\nsynthetic:room?frames=3\n"
+
 CAMERA_ARGUMENTS = [
     "60,61,31.5,23.5",
     "fisheye,60,61,31.5,23.5,0,0,0,0",

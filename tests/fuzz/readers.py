@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +19,10 @@ from tests.fuzz import goods
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
+from torchslam.batch import Row, Task, read_list
+from torchslam.batch.kept import RUNS
+from torchslam.batch.one import configuration
+from torchslam.batch.table import gather, read_times
 from torchslam.checkpoint import read_checkpoint
 from torchslam.cli import main
 from torchslam.config import Config, load_config, to_toml
@@ -36,6 +42,7 @@ from torchslam.world.map_file import read_worlds, write_worlds
 CAMERA = "60,61,31.5,23.5"
 IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "colour.png", "colour.jpg", "16.png")
 WEIGHTS = {"a.b": torch.zeros(3), "c": torch.ones(2, 2)}
+RECORD_OF = "0123456789abcdef"
 FRAMES = 4
 """Frames of a sequence that are read."""
 
@@ -82,6 +89,9 @@ def readers() -> dict[str, Reader]:
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
         Reader("--set", lambda: {"argument": b""}, _override, 800),
         Reader("command line", goods.tum, _command, 300),
+        Reader("batch csv", lambda: {"l.csv": goods.BATCH_CSV.encode()}, partial(_list, name="l.csv"), 600),
+        Reader("batch text", lambda: {"l.txt": goods.BATCH_TEXT.encode()}, partial(_list, name="l.txt"), 300),
+        Reader("batch record", _row_and_times, _record, 400),
     ]
     found += [Reader(f"image {kind}", partial(_kind, goods.images, kind), _image, 250) for kind in IMAGES]
     found += [
@@ -100,6 +110,21 @@ def readers() -> dict[str, Reader]:
 
 def _kind(make: Callable[[], dict[str, Files]], kind: str) -> Files:
     return make()[kind]
+
+
+def _row_and_times() -> Files:
+    record = {
+        "name": "a",
+        "configuration": RECORD_OF,
+        "input": "2",
+        "status": "done",
+        "error": "",
+        "posed": 3,
+    }
+    record |= {"frames": 4, "ate_m": 0.25, "path_length_m": 1.5, "camera": "as given", "initialised_at": None}
+    times = {"cpu_s": 1.5, "fps": 12.0, "stage_ms": {"total": {"median": 2.0}}}
+    files = {"row.json": record, "times.json": times}
+    return {name: json.dumps(content, indent=2).encode() for name, content in files.items()}
 
 
 def _some(kind: str, *names: str) -> Files:
@@ -214,6 +239,32 @@ def _whole(config: Config) -> None:
         ConfigError
     ):  # of what grows, beyond its range: is said when the images are known
         config.for_size((4000, 3000))
+
+
+def _list(root: Path, name: str) -> None:
+    rows = read_list(root / name)
+    names = [row.name for row in rows]
+    assert len({name.casefold() for name in names}) == len(rows) > 0
+    assert all(Path(name).name == name and name.isprintable() and not name.startswith(".") for name in names)
+    for row in rows:
+        assert Task.from_dict(json.loads(json.dumps(Task(row, "").as_dict()))) == Task(row, "")
+        with contextlib.suppress(ConfigError):  # of settings, which is the row's error
+            configuration(Task(row, ""))
+
+
+def _record(root: Path) -> None:
+    """Whatever a record is, the row of the table is there, and can be written."""
+    place = root / RUNS / "a"
+    for path in root.glob("*.json"):
+        place.mkdir(parents=True, exist_ok=True)
+        path.rename(place / path.name)
+    (row,) = gather([Task(Row("a", "missing"), str(root))], [RECORD_OF], root)
+    assert isinstance(row["status"], str)
+    assert json.dumps(row, ensure_ascii=False).encode()
+    assert all(
+        value is None or not isinstance(value, float) or abs(value) < math.inf for value in row.values()
+    )
+    read_times(place)
 
 
 def _image(root: Path) -> None:

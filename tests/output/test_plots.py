@@ -50,10 +50,20 @@ def figures(
         "tracking": lambda: plots.plot_tracking(results),
         "stages": lambda: plots.plot_stage_times(results),
         "features": lambda: features_figure(torch.Generator().manual_seed(0)),
+        "few": lambda: batch_figure(7),
+        "many": lambda: batch_figure(100),
     }
 
 
-NAMES = ["scene", "top_view", "errors", "tracking", "stages", "features"]
+def batch_figure(count: int) -> Figure:
+    """Every third one without a map, the others the better the later they come."""
+    statuses = ["no map" if row % 3 == 2 else "done" for row in range(count)]
+    posed = [None if status == "no map" else 1 - 1 / (2 + row) for row, status in enumerate(statuses)]
+    errors = [None if share is None else (1 - share) / 20 for share in posed]
+    return plots.plot_batch([f"walk {row}" for row in range(count)], statuses, posed, errors, "Walks")
+
+
+NAMES = ["scene", "top_view", "errors", "tracking", "stages", "features", "few", "many"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -74,6 +84,20 @@ def test_axes_are_labelled_with_units(name: str, figures: dict[str, Callable[[],
     axes = figures[name]().axes
     assert any("(" in panel.get_xlabel() or panel.get_xlabel() == "frame" for panel in axes)
     assert any(panel.get_ylabel() for panel in axes)
+
+
+def test_few_sequences_are_shown_by_name_and_many_by_their_distribution() -> None:
+    posed, error = batch_figure(7).axes
+    assert [label.get_text() for label in posed.get_yticklabels()] == [f"walk {row}" for row in range(7)]
+    assert [text.get_text() for text in posed.texts] == ["no map", "no map"]
+    np.testing.assert_allclose(error.lines[0].get_xdata(), [100 / 20 / (2 + row) for row in (0, 1, 3, 4, 6)])
+    assert error.get_xlim() == (0.1, 10.0)
+    posed, error = batch_figure(100).axes
+    assert posed.get_ylabel() == "of 100 sequences (%)"
+    assert error.get_ylabel() == "of 67 sequences (%)"
+    assert posed.lines[0].get_ydata()[-1] == 100.0
+    for count in (0, 1):
+        plots.png(plots.plot_batch(["a"] * count, ["open"] * count, [None] * count, [None] * count))
 
 
 def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w: torch.Tensor) -> None:

@@ -27,6 +27,11 @@ PRESETS = "tum-fr1, tum-fr2, tum-fr3, euroc, kitti, 7-scenes, tartanair, icl"
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", help=SEQUENCE_HELP)
+    add_reading(parser)
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """With which camera a sequence is read, and which of its frames."""
     parser.add_argument(
         "--camera",
         metavar="CAMERA",
@@ -37,14 +42,14 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
     reading = parser.add_argument_group("which frames, and how")
     reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
     reading.add_argument("--stop", metavar="N|TIME", help="end before this frame: 240, 20s or 2:00")
-    reading.add_argument("--stride", type=_positive, default=1, metavar="N", help="take every N-th frame")
+    reading.add_argument("--stride", type=positive, default=1, metavar="N", help="take every N-th frame")
     reading.add_argument(
         "--fps",
         type=float,
         metavar="RATE",
         help="take at most RATE frames per second; images without times are taken to be RATE a second (else 30)",
     )
-    reading.add_argument("--limit", type=_positive, metavar="N", help="take only the first N of these frames")
+    reading.add_argument("--limit", type=positive, metavar="N", help="take only the first N of these frames")
     reading.add_argument(
         "--resize", metavar="WxH|W|FACTOR", help="640x480, 640 or 0.5: the images, and the camera with them"
     )
@@ -106,6 +111,11 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 def config(options: argparse.Namespace) -> Config:
     """The configuration that the arguments of `add_config` name: the file, then --set, then the other options."""
+    return load_config(options.config, overrides(options))
+
+
+def overrides(options: argparse.Namespace) -> list[str]:
+    """What the arguments of `add_config` change in the file, as `section.key=value`."""
     named = {
         "features.kind": options.features,
         "features.weights": options.weights,
@@ -113,8 +123,7 @@ def config(options: argparse.Namespace) -> Config:
         "scale": options.scale,
         "seed": options.seed,
     }
-    own = [f"{key}={value}" for key, value in named.items() if value is not None]
-    return load_config(options.config, [*options.overrides, *own])
+    return [*options.overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -130,7 +139,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 def add_processes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes",
-        type=_positive,
+        type=positive,
         metavar="N",
         help="with 2 or more, others than the one that tracks find features ahead, and with 3 adjust the map beside "
         "it: the same results, sooner (default: 3 where there are two processors and enough frames, else 1)",
@@ -157,7 +166,8 @@ def not_negative(text: str) -> int:
     return number
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """A number from 1 on, of an argument."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")

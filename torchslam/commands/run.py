@@ -11,16 +11,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
 from torchslam.checkpoint import read_checkpoint
 from torchslam.commands import arguments
-from torchslam.commands.camera import find_camera, judged
 from torchslam.commands.folder import Checkpoints, prepare
 from torchslam.commands.progress import ProgressBar
 from torchslam.commands.stopping import Stopping
@@ -29,27 +26,26 @@ from torchslam.data import Sequence
 from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
-from torchslam.errors import ConfigError, ResultsError, TrajectoryError
-from torchslam.evaluation import ate_apart, evaluate
+from torchslam.errors import ConfigError, ResultsError
 from torchslam.export.colours import paint
 from torchslam.export.recording import import_rerun
+from torchslam.figures import figures_of
+from torchslam.found_camera import RADIAL, find_camera
 from torchslam.front_end import source
 from torchslam.output.calibration_file import is_found
 from torchslam.output.pictures import draw
-from torchslam.output.report import doubts, metrics, summary, table
+from torchslam.output.report import doubts, summary, table
 from torchslam.output.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
 from torchslam.output.view import VIEW, write_view
 from torchslam.output.view_frames import VIDEO, LiveView, Screen, Watching, film_of
 from torchslam.processes import helped
 from torchslam.run import Progressed, Run, run_sequence
 from torchslam.slam import SLAM
-from torchslam.values import StepResult, Trajectory
+from torchslam.values import StepResult
 
 DONE = 0
 NO_MAP = 3
-RADIAL = 2  # coefficients of the distortion that may be found
 CHECKPOINT_EVERY = 20  # keyframes
-Errors = TypeVar("Errors")
 
 
 @dataclass(frozen=True)
@@ -218,7 +214,15 @@ def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequen
         return sequence, ""
     radial = RADIAL if plan.distortion or is_guess else 0
     goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
-    return find_camera(sequence, config, plan.output, plan.device, radial, goes_on)
+    return find_camera(
+        sequence,
+        config,
+        plan.output,
+        plan.device,
+        radial,
+        goes_on,
+        lambda words: print(f"torchslam: camera: {words}", file=sys.stderr),
+    )
 
 
 def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progressed]:
@@ -268,13 +272,9 @@ def _write(
 
     camera: what there is to say of it before the run; latencies: milliseconds, of a live source
     """
-    figures = metrics(
-        finished,
-        _measured(finished, sequence, lambda truth: evaluate(finished.trajectory, truth)),
-        _measured(finished, sequence, lambda truth: ate_apart(finished.online_parts, truth)),
+    figures = figures_of(
+        finished, sequence, camera, lambda words: print(f"torchslam: warning: {words}", file=sys.stderr)
     )
-    figures["camera"] = judged(finished, camera)
-    figures["dropped"] = sequence.dropped
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
         figures["latency_ms"] = {"median": median, "p95": p95}
@@ -285,14 +285,3 @@ def _write(
     draw(results, plan.output)
     write_view(results, plan.output)
     return figures
-
-
-def _measured(finished: Run, sequence: Sequence, measure: Callable[[Trajectory], Errors]) -> Errors | None:
-    """Errors against ground truth, where there is one and the run has poses to compare."""
-    if sequence.groundtruth is None or finished.failure:
-        return None
-    try:
-        return measure(sequence.groundtruth)
-    except TrajectoryError as error:
-        print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
-        return None

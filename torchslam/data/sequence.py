@@ -242,6 +242,7 @@ class Transformed(Sequence):
 
     indices: which frames; None: all
     camera:  for images of another size than `whole` has; `size` alone where the camera is missing
+    groundtruth: another one; then `pose` is to be that of `Sequence`
     """
 
     def __init__(
@@ -252,13 +253,14 @@ class Transformed(Sequence):
         camera: Camera | None = None,
         size: tuple[int, int] | None = None,
         notes: Iterable[str] = (),
+        groundtruth: Trajectory | None = None,
     ) -> None:
         super().__init__(
             whole.name,
             whole.kind,
             whole._camera if camera is None else camera,
             whole.timestamps if indices is None else whole.timestamps[list(indices)],
-            whole.groundtruth,
+            whole.groundtruth if groundtruth is None else groundtruth,
             size=size or whole.size,
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),

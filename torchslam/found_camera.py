@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -19,14 +19,24 @@ from torchslam.output.calibration_file import check_replaceable, write_calibrati
 from torchslam.output.results import CALIBRATION
 from torchslam.run import Run
 
+RADIAL = 2
+"""Coefficients of the distortion that may be found."""
+
 
 def find_camera(
-    sequence: Sequence, config: Config, output: Path, device: torch.device, radial: int, resume: bool
+    sequence: Sequence,
+    config: Config,
+    output: Path,
+    device: torch.device,
+    radial: int,
+    resume: bool = False,
+    told: Callable[[str], None] = lambda words: None,
 ) -> tuple[Sequence, str]:
     """The sequence with the camera that its images ask for, and what there is to say of it; the file is written.
 
     radial: how many coefficients of the distortion are free
     resume: take the camera of the run that this one goes on with
+    told:   what there is to say while it is looked for, line by line
     """
     if config.features.kind == "simulated":
         raise ConfigError("simulated features are made with the camera: there is none to be found")
@@ -38,7 +48,12 @@ def find_camera(
     with warnings.catch_warnings():  # the run itself will say which frames cannot be read
         warnings.simplefilter("ignore", UserWarning)
         calibrated = calibrate(
-            sequence, config, radial, sequence.calibrated is Calibrated.GUESSED, device, told=_tell
+            sequence,
+            config,
+            radial,
+            sequence.calibrated is Calibrated.GUESSED,
+            device,
+            told=lambda done: told(_in_short(done)),
         )
     said = in_words(calibrated)
     frames = calibrated.rounds[-1].frames
@@ -46,7 +61,7 @@ def find_camera(
     if calibrated.refined is not None:
         remarks.append(f"relative standard error of the focal length: {calibrated.refined.std:.2g}")
     write_calibration(path, calibrated.camera, remarks)
-    print(f"torchslam: camera: {said}", file=sys.stderr)
+    told(said)
     return sequence.with_camera(calibrated.camera.to("cpu")), said
 
 
@@ -63,9 +78,9 @@ def judged(finished: Run, found: str) -> str:
     return f"{against}; --refine-camera looks for a better one" if against else ""
 
 
-def _tell(done: Round) -> None:
+def _in_short(done: Round) -> str:
     focal, refined = float(done.camera.focal), done.refined
     asks = (
         "no map" if refined is None else f"{float(refined.camera.focal):.0f} px, {refined.std:.1%} uncertain"
     )
-    print(f"torchslam: camera: {done.frames} frames with {focal:.0f} px ask for {asks}", file=sys.stderr)
+    return f"{done.frames} frames with {focal:.0f} px ask for {asks}"

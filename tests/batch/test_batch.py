@@ -1,0 +1,271 @@
+"""Batches: alone and in shards, killed and gone on with, with rows that fail; always the same bytes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
+from tests.test_cli import write_tum_folder
+from torchslam.batch import Engine, Row, Task, run_batch, run_row
+from torchslam.batch import table as tables
+from torchslam.batch.identity import of_files
+from torchslam.batch.kept import ERRORS, RECORD, RUNS
+from torchslam.cli import main
+from torchslam.errors import ConfigError
+
+
+def times_of_change(output: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in output.glob(f"{RUNS}/*/{RECORD}")}
+
+
+# --- a whole batch -------------------------------------------------------------------------------------------
+
+
+def test_the_table_has_a_row_for_each_sequence_with_status_and_error(whole: Path) -> None:
+    rows = table(whole)
+    assert [row["name"] for row in rows] == ["one", "two", "three", "four", "five"]
+    assert [row["status"] for row in rows] == STATUSES
+    assert "does not exist" in rows[2]["error"]
+    assert "features.num_keypoints must be at least 1" in rows[3]["error"]
+    assert "stands still" in rows[4]["error"]
+    figures = json.loads((whole / RUNS / "one" / "metrics.json").read_text())
+    assert float(rows[0]["ate_m"]) == figures["ate_m"] > 0
+    assert int(rows[0]["posed"]) == figures["posed"] == 10
+    assert rows[2]["ate_m"] == rows[4]["ate_m"] == ""
+    assert rows[0]["configuration"] != rows[1]["configuration"]
+    assert (whole / "table.png").read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in (whole / ERRORS).iterdir()} == {"three.json", "four.json"}
+    assert {path.name for path in (whole / RUNS).iterdir()} == {"one", "two", "five"}
+
+
+def test_parquet_says_the_same(whole: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = parquet.read_table(whole / "table.parquet").to_pylist()
+    assert [row["status"] for row in rows] == STATUSES
+    assert [row["ate_m"] for row in rows[:3]] == [*(float(row["ate_m"]) for row in table(whole)[:2]), None]
+    assert rows[0]["posed"] == 10
+
+
+def test_without_pyarrow_there_is_no_parquet(
+    listed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    run_batch([task(tmp_path, "missing")])
+    assert (tmp_path / "table.csv").exists()
+    assert not (tmp_path / "table.parquet").exists()
+
+
+def test_times_are_in_files_of_their_own(whole: Path) -> None:
+    times = json.loads((whole / RUNS / "one" / "times.json").read_text())
+    assert times["fps"] > 0
+    assert times["cpu_s"] > 0
+    assert "total" in times["stage_ms"]
+    with (whole / "times.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [bool(row["fps"]) for row in rows] == [True, True, False, False, True]
+    assert "fps" not in json.loads((whole / RUNS / "one" / "metrics.json").read_text())
+
+
+def test_the_results_are_those_of_a_run(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])
+    settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    assert main(["run", ROOM, "--output", str(tmp_path), *settings]) == 0
+    for name in (
+        "trajectory.txt",
+        "online.txt",
+        "keyframes.txt",
+        "map.safetensors",
+        "map.ply",
+        "config.toml",
+    ):
+        assert (tmp_path / name).read_bytes() == (whole / RUNS / "one" / name).read_bytes(), name
+
+
+def test_plot_draws_what_a_batch_wrote(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole / RUNS / "one", tmp_path / "one")
+    assert main(["plot", str(tmp_path / "one")]) == 0
+    drawn = {path.name for path in (tmp_path / "one" / "plots").iterdir()}
+    assert "scene.png" in drawn
+    assert "stages.png" not in drawn  # whose times nobody wrote there
+
+
+# --- what is done is not done again --------------------------------------------------------------------------
+
+
+def test_what_is_done_is_not_done_again(
+    whole: Path, listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(whole, again)
+    assert batch(listed, again) == 4
+    said = capsys.readouterr()
+    assert "3 of them were there before" in said.out
+    assert "torchslam: 1/5 one: 10 of 10 frames posed" in said.err
+    assert times_of_change(again) == times_of_change(whole)
+    assert content(again) == content(whole)
+
+
+def test_what_failed_is_tried_again(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "again")
+    listed = tmp_path / "list.csv"
+    listed.write_text(LIST)
+    write_tum_folder(tmp_path / "missing" / "folder", frames=2)
+    listed.write_text("sequence,name\nmissing/folder,three\n")
+    assert batch(listed, tmp_path / "again", ["--set", "features.kind=opencv-orb"]) == 0
+    assert not (tmp_path / "again" / ERRORS / "three.json").exists()
+    assert [row["status"] for row in table(tmp_path / "again")] == ["no map"]
+
+
+def test_other_settings_need_overwrite(tmp_path: Path) -> None:
+    assert run_row(task(tmp_path).as_dict())["is_new"]
+    before = content(tmp_path)
+    other = Task(Row("mine", ROOM, overrides=(*SETTINGS, "seed=9")), str(tmp_path), pictures=False)
+    refused = run_row(other.as_dict())
+    assert refused["status"] == "error"
+    assert "--overwrite" in refused["error"]
+    assert {name: content(tmp_path)[name] for name in before} == before
+    replaced = run_row(Task(other.row, str(tmp_path), overwrite=True, pictures=False).as_dict())
+    assert replaced["status"] == "done"
+    assert "seed = 9" in (tmp_path / RUNS / "mine" / "config.toml").read_text()
+    assert [path.name for path in (tmp_path / RUNS).iterdir()] == ["mine"]
+    assert list((tmp_path / ERRORS).iterdir()) == []
+
+
+def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / RUNS / "mine").mkdir(parents=True)
+    (tmp_path / RUNS / "mine" / "thesis.tex").write_text("years of work")
+    refused = run_row(Task(task(tmp_path).row, str(tmp_path), overwrite=True, pictures=False).as_dict())
+    assert "something else" in refused["error"]
+    assert (tmp_path / RUNS / "mine" / "thesis.tex").exists()
+
+
+def test_a_damaged_record_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / RUNS / "mine").mkdir(parents=True)
+    for text in ("{", "[]", '{"status": 3}'):
+        (tmp_path / RUNS / "mine" / RECORD).write_text(text)
+        assert RECORD in run_row(task(tmp_path).as_dict())["error"]
+
+
+def test_the_files_of_a_sequence_are_known_by_name_size_and_time(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "rgb" / "0.png").write_bytes(b"1")
+    (folder / "nowhere").symlink_to(tmp_path / "nothing")
+    first = of_files([str(folder)])
+    assert of_files([str(folder)]) == first
+    assert of_files([str(folder), str(tmp_path / "missing")]) != first
+    os.utime(folder / "rgb" / "0.png", ns=(1, 1))
+    second = of_files([str(folder)])
+    assert second != first
+    (folder / "rgb" / "1.png").write_bytes(b"1")
+    assert of_files([str(folder)]) not in (first, second)
+    assert of_files([str(folder / "rgb" / "*.png")]) != of_files([str(folder / "rgb" / "0*.png")])
+    assert of_files(["synthetic:room"]) != of_files(["synthetic:planar"])
+
+
+# --- shards, kills -------------------------------------------------------------------------------------------
+
+
+def test_shards_together_are_the_whole(whole: Path, listed: Path, tmp_path: Path) -> None:
+    statuses = []
+    for shard in ("2/3", "0/3", "1/3"):
+        batch(listed, tmp_path, ["--shard", shard])
+        statuses.append([row["status"] for row in table(tmp_path)])
+    assert statuses[0] == ["open", "open", "error", "open", "open"]
+    assert statuses[1] == ["done", "open", "error", "error", "open"]
+    assert content(tmp_path) == content(whole)
+
+
+def test_the_last_to_write_the_table_has_seen_all(
+    whole: Path, listed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another shard finishes a row, and writes the table, between this one's look at the results and its writing."""
+    late = whole / RUNS / "two"
+    put = tables._put
+
+    def slow(path: Path, content: bytes) -> None:
+        if path.name == "table.csv" and not (tmp_path / RUNS / "two").exists():
+            shutil.copytree(late, tmp_path / RUNS / "two")
+        put(path, content)
+
+    monkeypatch.setattr(tables, "_put", slow)
+    batch(listed, tmp_path, ["--shard", "0/5"])
+    assert [row["status"] for row in table(tmp_path)][:2] == ["done", "done"]
+
+
+def until(happens: object, patience: float = 120.0) -> None:
+    end = time.monotonic() + patience
+    while not happens():  # type: ignore[operator]
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.01)
+
+
+def test_killed_and_started_again(whole: Path, listed: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "torchslam.cli", "batch", str(listed), "-o", str(tmp_path), *OPTIONS]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    # The second sequence is being run: its folder has begun.
+    until(lambda: (tmp_path / RUNS / "one").exists() and (tmp_path / RUNS / ".two.part").exists())
+    process.kill()
+    process.wait()
+    assert not (tmp_path / RUNS / "two").exists()
+    first = times_of_change(tmp_path)["one"]
+    assert batch(listed, tmp_path) == 4
+    assert times_of_change(tmp_path)["one"] == first
+    assert content(tmp_path) == content(whole)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
+    whole: Path,
+    listed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    number: int,
+    status: int,
+) -> None:
+    shutil.copytree(whole / RUNS / "one", tmp_path / RUNS / "one")
+    monkeypatch.setattr("torchslam.batch.one._run", lambda todo, folder: os.kill(os.getpid(), number))
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit, match=str(status)):
+        batch(listed, tmp_path)
+    assert signal.getsignal(number) is before
+    assert "the same command goes on" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / RUNS).iterdir()] == ["one"]
+    assert not (tmp_path / ERRORS).exists()
+
+
+# --- the command ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--workers", "2"], "need --engine ray"),
+        (["--address", "auto"], "need --engine ray"),
+        (["--shard", "5/5"], "shards count from 0/5"),
+        (["--set", "seed=-1"], "seed must be"),
+    ],
+)
+def test_what_no_row_can_help_is_one_line_and_status_2(
+    listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
+) -> None:
+    assert batch(listed, tmp_path, more) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / RUNS).exists()
+
+
+def test_ray_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"pip install 'torchslam\[ray\]'"):
+        list(Engine("ray").each(run_row, [{}]))

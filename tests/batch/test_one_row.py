@@ -1,0 +1,95 @@
+"""One row of a batch: no error leaves it, one thread, corrupt images, a ground truth of its own."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.batch.conftest import table, task
+from tests.test_cli import write_tum_folder
+from torchslam.batch import Row, Task, run_row
+from torchslam.batch.kept import ERRORS, RUNS, keep
+from torchslam.data import read_trajectory, write_trajectory
+
+
+def test_a_task_survives_a_way_through_text_and_pickle(tmp_path: Path) -> None:
+    first = task(tmp_path, limit=3)
+    assert Task.from_dict(json.loads(json.dumps(first.as_dict()))) == first
+    assert pickle.loads(pickle.dumps(run_row)) is run_row
+
+
+def test_a_row_computes_on_one_thread_and_leaves_the_threads_alone(tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    def work(folder: Path) -> dict[str, object]:
+        seen.append(torch.get_num_threads())
+        return {"status": "done"}
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("torchslam.batch.one._run", lambda todo, folder: work(folder))
+            run_row(task(tmp_path).as_dict())
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1]
+
+
+def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
+    def bug(folder: Path) -> dict[str, object]:
+        (folder / "half").write_text("written")
+        raise ZeroDivisionError("float division\nby zero")
+
+    columns = keep(tmp_path, "mine", dict, bug)
+    assert columns["status"] == "error"
+    assert columns["error"].startswith("ZeroDivisionError: float division by zero (test_one_row.py:")
+    assert "Traceback" in json.loads((tmp_path / ERRORS / "mine.json").read_text())["traceback"]
+
+    def stop(folder: Path) -> dict[str, object]:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        keep(tmp_path, "mine", dict, stop)
+    assert list((tmp_path / RUNS).iterdir()) == []
+
+
+def test_an_error_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    columns = run_row(task(tmp_path / "file").as_dict())
+    assert columns["status"] == "error"
+    assert "could not be written" in columns["error"]
+
+
+def test_corrupt_images_are_counted(tmp_path: Path) -> None:
+    folder = write_tum_folder(tmp_path / "room", frames=3)
+    (folder / "rgb" / "1.png").write_bytes(b"no image")
+    fast = ("features.kind=opencv-orb", "features.num_keypoints=300")
+    row = Row("mine", str(folder), overrides=fast)
+    columns = run_row(Task(row, str(tmp_path), pictures=False).as_dict())
+    assert (columns["status"], columns["frames"], columns["skipped"]) == ("no map", 3, 1)
+    for image in (folder / "rgb").iterdir():
+        image.write_bytes(b"no image")
+    columns = run_row(Task(row, str(tmp_path / "all"), pictures=False).as_dict())
+    assert columns["status"] in ("error", "no map")
+    assert columns["error"]
+
+
+def test_live_sources_are_refused(tmp_path: Path) -> None:
+    assert "a live source has no end" in run_row(task(tmp_path, "rtsp://127.0.0.1/a").as_dict())["error"]
+
+
+def test_ground_truth_from_a_file_of_its_own(whole: Path, tmp_path: Path) -> None:
+    truth = read_trajectory(whole / RUNS / "one" / "groundtruth.txt")
+    T_wc = truth.T_wc.clone()
+    T_wc[:, :3, 3] *= 10
+    write_trajectory(tmp_path / "t.txt", type(truth)(truth.timestamps, T_wc))
+    columns = run_row(task(tmp_path, groundtruth=str(tmp_path / "t.txt")).as_dict())
+    assert columns["path_length_m"] == pytest.approx(10 * float(table(whole)[0]["path_length_m"]), rel=1e-6)
+    columns = run_row(task(tmp_path / "b", groundtruth="none.txt", folder=str(tmp_path)).as_dict())
+    assert "none.txt: cannot be read" in columns["error"]

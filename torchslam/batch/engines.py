@@ -1,0 +1,130 @@
+"""Who calls a function on each row: this process, one after the other, or the workers of Ray Data."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from torchslam.errors import ConfigError
+
+Columns = dict[str, Any]
+Work = Callable[[Columns], Columns]
+ENGINES = ("in-process", "ray")
+RETRIES = 2
+"""Of a row whose worker died, of too little memory perhaps; Ray would try for ever."""
+STORE_BYTES = 100 << 20
+"""Of a local cluster's store of objects: rows are small, images do not pass through it."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """kind: of `ENGINES`; workers, address: of Ray, see `ray_data`; gpus: that each worker needs"""
+
+    kind: str = ENGINES[0]
+    workers: int | None = None
+    address: str | None = None
+    gpus: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ENGINES:
+            raise ConfigError(f"--engine must be one of {', '.join(ENGINES)}, not {self.kind}")
+        if self.kind != "ray" and (self.workers not in (None, 1) or self.address is not None):
+            raise ConfigError("--workers and --address need --engine ray")
+
+    def each(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
+        """The numbers of the rows with what the function made of them, as they are done.
+
+        work: a function of a module; rows and what is made of them are what JSON can say. None where the process that
+        had the row died, as of too little memory, or could not begin.
+        Raises ConfigError where Ray is not installed or not found at the address.
+        """
+        rows = list(rows)
+        if self.kind == "ray":
+            yield from ray_data(work, rows, self.workers, self.address, self.gpus)
+            return
+        for number, row in enumerate(rows):
+            yield number, work(json.loads(json.dumps(row)))
+
+
+def ray_data(
+    work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
+) -> Iterator[tuple[int, Columns | None]]:
+    """As `Engine.each`, by tasks of one row and one processor each.
+
+    workers: at most so many at a time; None: as many as there are processors
+    address: of a cluster (`auto`, `ray://HOST:10001`), on whose nodes this package is installed and the files are at
+             the same places; None: one of this machine, for as long as this takes
+    """
+    ray, data = _import_ray()
+    _start(ray, workers, address)
+    try:
+        context = data.DataContext.get_current()
+        context.enable_progress_bars, context.max_errored_blocks = False, -1
+        # As text: Arrow would have a type for a column of None and another one for the next block.
+        items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
+        left = set(range(len(rows)))
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # max_retries is to go in Ray 2.64, and nothing is to take its place
+            done = data.from_items(items, override_num_blocks=len(items)).map(
+                _through_text(work),
+                num_cpus=1,
+                num_gpus=gpus or None,
+                max_retries=RETRIES,
+                compute=data.TaskPoolStrategy(size=workers),
+            )
+        for item in done.iter_rows():
+            left.discard(item["number"])
+            yield item["number"], json.loads(item["row"])
+        for number in sorted(left):
+            yield number, None
+    finally:
+        ray.shutdown()
+
+
+def _through_text(work: Work) -> Callable[[Columns], Columns]:
+    def on_item(item: Columns) -> Columns:
+        return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
+
+    return on_item
+
+
+def _import_ray() -> tuple[Any, Any]:
+    os.environ.setdefault(
+        "RAY_USAGE_STATS_ENABLED", "0"
+    )  # else it tells its makers of each cluster it starts
+    try:
+        return importlib.import_module("ray"), importlib.import_module("ray.data")
+    except ImportError as error:
+        raise ConfigError(f"--engine ray needs pip install 'torchslam[ray]': {error}") from None
+
+
+def _start(ray: Any, workers: int | None, address: str | None) -> None:
+    logging.getLogger("ray.data").setLevel(logging.ERROR)  # says why a worker died, or could not begin
+    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if address is None:
+        options |= {
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "object_store_memory": STORE_BYTES,
+            "address": "local",
+        }
+    else:
+        options["address"] = address
+    try:
+        ray.init(**options)
+    except Exception as error:  # Ray raises what it likes
+        line = " ".join(str(error).split())[:500]
+        where = (
+            "the Ray cluster of this machine did not start"
+            if address is None
+            else f"no Ray cluster at {address}"
+        )
+        raise ConfigError(f"--engine ray: {where}: {type(error).__name__}: {line}") from error

@@ -1,0 +1,189 @@
+"""The list of a batch: which sequences, each with what is said of it alone."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from torchslam.data.synthetic import sequence as synthetic
+from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, read_text
+from torchslam.errors import SequenceError
+
+MAX_BYTES = 1 << 26
+"""Of a list: half a million rows of a hundred characters."""
+LONGEST_NAME = 100
+"""Characters of a name, of which folders are called."""
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
+APART = ";"
+"""Between the settings in one cell."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run.
+
+    name:      of its folder of results, which no two rows share
+    sequence:  as it is written; groundtruth: a trajectory in TUM format instead of the one beside the images
+    camera, start, stop, stride, fps, limit, resize, mask: as `torchslam.open_sequence` takes them
+    config:    file of settings; overrides: `section.key=value`, which come after it
+    folder:    that names of files are relative to
+    """
+
+    name: str
+    sequence: str
+    camera: str | None = None
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    groundtruth: str | None = None
+    start: str | None = None
+    stop: str | None = None
+    stride: int | None = None
+    fps: float | None = None
+    limit: int | None = None
+    resize: str | None = None
+    mask: str | None = None
+    folder: str = ""
+
+    def path(self, name: str) -> str:
+        """Where a file or folder that the row names is."""
+        return name if synthetic.matches(name) else str(Path(self.folder, name))
+
+    def completed(self, defaults: Mapping[str, Any]) -> Row:
+        """The row with what it does not say itself; settings of the defaults come before its own."""
+        said = {key: value for key, value in asdict(self).items() if value not in (None, ())}
+        both = (*defaults.get("overrides", ()), *self.overrides)
+        return replace(self, **{**defaults, **said, "overrides": both})
+
+
+COLUMNS = tuple(field.name for field in fields(Row) if field.name != "folder")
+
+
+def read_list(path: str | Path) -> list[Row]:
+    """The rows of a list: a CSV file with a header of `COLUMNS`, or a text with a path on each line, `#` for comments.
+
+    Names of files are relative to the folder of the list. A row without a name is called as the last part of its path,
+    with a number where others are called so too. Raises SequenceError that names file and line.
+    """
+    path = Path(path)
+    table = _cells if path.suffix.lower() == ".csv" else _lines
+    rows: list[Row] = []
+    seen: dict[Row, int] = {}
+    for number, cells in table(path):
+        row = _row(cells, f"{path}:{number}", str(path.parent.absolute()))
+        if row in seen:
+            raise SequenceError(f"{path}:{number}: the same as line {seen[row]}; give each a name of its own")
+        seen[row] = number
+        rows.append(row)
+    if not rows:
+        raise SequenceError(f"{path}: no sequences in the list")
+    return named(rows, str(path))
+
+
+def named(rows: Iterable[Row], where: str = "rows") -> list[Row]:
+    """The rows with a name for each. Raises SequenceError where two are given the same one; `where`, for messages."""
+    rows = list(rows)
+    # Folders that differ in upper and lower case alone are the same on some systems.
+    given = Counter(row.name.casefold() for row in rows if row.name)
+    twice = [name for name, count in given.items() if count > 1]
+    if twice:
+        raise SequenceError(f"{where}: {given[twice[0]]} rows are named {twice[0]}")
+    taken, found = set(given), []
+    for row in rows:
+        if not row.name:
+            row = replace(row, name=_free(short_name(row.sequence), taken))
+            taken.add(row.name.casefold())
+        found.append(row)
+    return found
+
+
+def short_name(sequence: str) -> str:
+    """What a sequence is called by its path: letters, digits, and `-` in place of anything else."""
+    text = sequence if synthetic.matches(sequence) else Path(sequence).stem
+    text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
+    return text[:LONGEST_NAME] or "sequence"
+
+
+def _free(name: str, taken: set[str]) -> str:
+    number, found = 1, name
+    while found.casefold() in taken:
+        number += 1
+        found = f"{name}-{number}"
+    return found
+
+
+def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    for number, line in numbered_lines(path, SequenceError):
+        yield number, {"sequence": line}
+
+
+def _cells(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """The cells of each row by their columns, with the number of the line that the row ends on."""
+    reader = csv.reader(io.StringIO(read_text(path, SequenceError, MAX_BYTES), newline=""), strict=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        _check_header(header, path)
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) != len(header):
+                raise SequenceError(
+                    f"{path}:{reader.line_num}: {len(cells)} cells under {len(header)} columns"
+                )
+            said = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+            yield reader.line_num, {name: cell for name, cell in said.items() if cell}
+    except csv.Error as error:
+        raise SequenceError(f"{path}:{reader.line_num}: not CSV: {error}") from None
+
+
+def _check_header(header: list[str], path: Path) -> None:
+    for name in header:
+        if name not in COLUMNS:
+            near = difflib.get_close_matches(name, COLUMNS, n=1)
+            meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(COLUMNS)}"
+            raise SequenceError(f"{path}:1: no column is called `{name[:100]}`; {meant}")
+    if len(set(header)) < len(header) or "sequence" not in header:
+        raise SequenceError(f"{path}:1: the header must have each column once, and `sequence` among them")
+
+
+def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
+    values: dict[str, Any] = dict(cells)
+    if not values.get("sequence"):
+        raise SequenceError(f"{where}: no sequence")
+    for name, cell in cells.items():
+        if len(cell) > MAX_LINE or "\0" in cell:
+            raise SequenceError(f"{where}: {name}: a NUL, or more than {MAX_LINE} characters")
+    name = values.setdefault("name", "")
+    if name and (len(name) > LONGEST_NAME or NAME.fullmatch(name) is None):
+        raise SequenceError(
+            f"{where}: name `{name[:LONGEST_NAME]}`: a folder is called so; letters, digits and _ . + = - only, "
+            f"at most {LONGEST_NAME}"
+        )
+    for key in ("stride", "limit"):
+        if key in values:
+            count = parse_count(values[key])
+            if not count:
+                raise SequenceError(f"{where}: {key} must be a whole number from 1 on, not `{values[key]}`")
+            values[key] = count
+    if "fps" in values:
+        values["fps"] = _rate(values["fps"], where)
+    settings = (setting.strip() for setting in values.get("overrides", "").split(APART))
+    values["overrides"] = tuple(setting for setting in settings if setting)
+    return Row(**values, folder=folder)
+
+
+def _rate(text: str, where: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not 0 < rate < math.inf:
+        raise SequenceError(f"{where}: fps must be a positive number, not `{text}`")
+    return rate

@@ -1,0 +1,187 @@
+"""One table of a batch, with a picture: CSV always, Parquet too where pyarrow is installed."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchslam.batch.kept import DONE, ERROR, NO_MAP, RUNS, Columns, read_kept
+from torchslam.batch.one import TIMES, Task, configuration
+from torchslam.errors import ResultsError, TorchslamError
+from torchslam.output import plots
+from torchslam.regular_file import JSON_BYTES, parse_json, read_text
+
+CSV = "table.csv"
+PARQUET = "table.parquet"
+PICTURE = "table.png"
+TIMES_CSV = "times.csv"
+
+# Columns and their types: the same table whatever is in it.
+COLUMNS: dict[str, type] = {
+    "name": str,
+    "sequence": str,
+    "status": str,
+    "error": str,
+    **dict.fromkeys(("frames", "posed", "lost", "uncertain", "skipped", "initialised_at"), int),
+    **dict.fromkeys(("keyframes", "points", "worlds"), int),
+    **dict.fromkeys(("posed_share_after_initialisation", "reprojection_px", "track_length"), float),
+    **dict.fromkeys(("ate_m", "ate_se3_m", "online_ate_m", "rpe_translation_m", "rpe_rotation_deg"), float),
+    "compared": int,
+    **dict.fromkeys(("scale", "path_length_m"), float),
+    "camera": str,
+    "configuration": str,
+}
+LARGEST = 1 << 62
+"""Of a figure: nothing that is counted or measured is larger."""
+TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "ms_median", "ms_p95"), float)}
+
+
+def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
+    """Write table and picture of all rows of the list, those of other shards included; returns the rows.
+
+    What is not yet run stands there as `open`. Of several processes that write the same table, the last one to write
+    it has looked at all results afterwards: nothing is missing in the end. Raises ResultsError, OSError.
+    """
+    configurations = [_configuration(task) for task in tasks]
+    rows: list[Columns] | None = None
+    while (found := gather(tasks, configurations, output)) != rows:
+        rows = found
+        _put(output / CSV, _csv(rows, COLUMNS).encode())
+        _put(output / TIMES_CSV, _csv(_times(rows, output), TIME_COLUMNS).encode())
+        if (content := _parquet(rows)) is not None:
+            _put(output / PARQUET, content)
+        _put(output / PICTURE, _picture(rows))
+    return found
+
+
+def counts(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How many rows have which status, in words."""
+    statuses = [row["status"] for row in rows]
+    words = {DONE: "done", NO_MAP: "without a map", ERROR: "with an error", "open": "not yet run"}
+    found = [f"{statuses.count(status)} {word}" for status, word in words.items() if status in statuses]
+    return ", ".join(found)
+
+
+def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
+    """The rows of the table as the records in the folder of a batch have them; a record of something else is an error.
+
+    configurations: of the tasks, as by `one.configuration`; empty where there is none
+    """
+    rows = []
+    for task, settings in zip(tasks, configurations, strict=True):
+        name = task.row.name
+        try:
+            record = read_kept(output, name, settings)
+        except ResultsError as error:
+            record = {"status": ERROR, "error": str(error)}
+        record |= {"name": name, "sequence": task.row.sequence}
+        rows.append({column: _typed(record.get(column), kind) for column, kind in COLUMNS.items()})
+    return rows
+
+
+def _configuration(task: Task) -> str:
+    try:
+        return configuration(task)
+    except TorchslamError:
+        return ""  # the row is an error, which says why
+
+
+def _typed(value: object, kind: type) -> Any:
+    """A value of a record; None for what is no such value, or is beyond what the table can hold."""
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) if abs(value) < LARGEST else None
+    if type(value) is not kind or (isinstance(value, int) and not 0 <= value < LARGEST):
+        return None
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
+
+
+def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
+    return [{"name": row["name"]} | read_times(output / RUNS / row["name"]) for row in rows]
+
+
+def read_times(folder: Path) -> Columns:
+    """The content of times.json; empty where there is none. Raises ResultsError."""
+    path = folder / TIMES
+    try:
+        times = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(times, dict):
+        raise ResultsError(f"{path}: not the times of a run: {json.dumps(times)[:100]}")
+    return times
+
+
+def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:
+    """As text: floats with all their digits, nothing for None."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        cells = (row.get(name) for name in columns)
+        writer.writerow(
+            ["" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells]
+        )
+    return text.getvalue()
+
+
+def _parquet(rows: Sequence[Columns]) -> bytes | None:
+    """None without pyarrow."""
+    try:
+        arrow = importlib.import_module("pyarrow")
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        return None
+    types = {str: arrow.string(), int: arrow.int64(), float: arrow.float64()}
+    schema = arrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
+    buffer = io.BytesIO()
+    parquet.write_table(arrow.Table.from_pylist(list(rows), schema=schema), buffer)
+    return buffer.getvalue()
+
+
+def _picture(rows: Sequence[Columns]) -> bytes:
+    shares = [row["posed"] / row["frames"] if row["frames"] else None for row in rows]
+    errors = [
+        row["ate_m"] / row["path_length_m"] if row["ate_m"] is not None and row["path_length_m"] else None
+        for row in rows
+    ]
+    figure = plots.plot_batch(
+        [row["name"] for row in rows],
+        [row["status"] for row in rows],
+        shares,
+        errors,
+        f"{len(rows)} sequences: {counts(rows)}",
+    )
+    return plots.png(figure)
+
+
+def _put(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or not at all, whoever else writes it at the same time."""
+    with _part(path) as part:
+        part.write_bytes(content)
+        part.replace(path)
+
+
+@contextlib.contextmanager
+def _part(path: Path) -> Iterator[Path]:
+    """A name of nobody else's, beside a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(number)
+    part = Path(name)
+    mask = os.umask(0)
+    os.umask(mask)
+    part.chmod(0o666 & ~mask)  # mkstemp lets nobody else read
+    try:
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
