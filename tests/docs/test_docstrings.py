@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-griffe = pytest.importorskip("griffe", reason="the dependency group docs is not installed: make test-docs")
+griffe = pytest.importorskip("griffe", reason="the extra docs is not installed: make test-docs")
 
 EXTENSION = Path(__file__).parents[2] / "docs" / "theme" / "docstrings.py"
 SOURCE = '''
