@@ -22,11 +22,21 @@ _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points
 
 @dataclass(frozen=True)
 class _Look:
-    """A frame to compare later ones with: what it saw, where it was, how deep the scene was."""
+    """A frame to compare later ones with.
+
+    view:     what it saw; T_wc: (4, 4) where it was
+    points_c: (d, n, 3) where the points of its n keypoints may be, by their depth
+    """
 
     view: View
-    T_cw: Tensor
-    depth: float
+    T_wc: Tensor
+    points_c: Tensor
+
+    @classmethod
+    def of(cls, view: View, T_cw: Tensor, depth: float, camera: Camera) -> _Look:
+        rays = camera.unproject(view.keypoints[view.mask])
+        depths = depth * rays.new_tensor(_DEPTHS)
+        return cls(view, se3_inverse(T_cw), rays / rays[:, 2:] * depths[:, None, None])
 
 
 class Stillness:
@@ -57,15 +67,15 @@ class Stillness:
 
         view: with all its keypoints; T_cw: (4, 4); depth: median depth of the scene
         """
-        look, last = _Look(view, T_cw, depth), self._last
+        last = self._last
         if last is None or view.session != last.view.session:
-            self._last = look
+            self._last = _Look.of(view, T_cw, depth, self.camera)
             return 0
         must_move = view.mask.new_zeros(len(last.view.mask))
         must_move[last.view.mask] = self._least_motion(last, T_cw) > self.settings.min_motion_px
         if int(must_move.sum()) < self.settings.min_moving_share * int(last.view.mask.sum()):
             return 0  # not far enough yet to tell
-        self._last = look
+        self._last = _Look.of(view, T_cw, depth, self.camera)
         stayed = self._stayed(last.view, view, must_move)
         before = int((self.evidence >= self.settings.min_evidence).sum())
         if len(stayed) < self.settings.min_keypoints:
@@ -82,10 +92,7 @@ class Stillness:
     def _least_motion(self, last: _Look, T_cw: Tensor) -> Tensor:
         """(n,) pixels by which a point of the scene seen at each keypoint moved at least, whatever its depth."""
         pixels = last.view.keypoints[last.view.mask]
-        rays = self.camera.unproject(pixels)
-        depths = last.depth * rays.new_tensor(_DEPTHS)
-        points_c = rays / rays[:, 2:] * depths[:, None, None]
-        moved, valid = self.camera.project(transform(T_cw @ se3_inverse(last.T_cw), points_c))
+        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c))
         distance = distances_to_segments(pixels, moved[:-1], moved[1:])
         return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0)
 

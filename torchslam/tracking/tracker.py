@@ -146,6 +146,7 @@ class Tracker:
             self.camera,
             threshold=settings.threshold_px,
             seed=self.seed,
+            through_distortion=False,
         )
         if not bool(pose.success[0]):
             return None
