@@ -214,21 +214,33 @@ class Tracker:
         for kernel in kernels:
             refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
             T_cw = refined.T_cw[0]
-            mask = self.agrees(slam_map, T_cw, ids, pixels, noise)
+            errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
+            mask = self.agrees(slam_map, T_cw, ids, pixels, noise, errors)
             if int(mask.sum()) < 6:
                 break
-        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
         return refined, errors, mask
 
-    def agrees(self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise) -> Tensor:
+    def agrees(
+        self,
+        slam_map: Map,
+        T_cw: Tensor,
+        ids: Tensor,
+        pixels: Tensor,
+        noise: Noise,
+        errors: Tensor | None = None,
+    ) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
+
+        errors: (n,) squared, in units of the noise, where they are known
 
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
         """
         chi_square, points = self.measurement.chi_square, slam_map.points
         points_c = transform(T_cw, points["positions_w"][ids])
         if self.measurement.gate == "chi_square":
-            return fits(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
+            if errors is None:
+                errors = noise.squared_reprojection(points_c, pixels, self.camera)
+            return fits(errors, chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
         innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.spread)
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
