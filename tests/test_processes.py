@@ -14,6 +14,7 @@ from torchslam.ahead import Ahead
 from torchslam.beside import Beside
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
+from torchslam.live_ahead import LiveAhead
 from torchslam.mapping.adjusting import solve_here
 from torchslam.processes import WORTH, WORTH_AT_ONCE, best_number, helped, processors, why_alone
 from torchslam.scouting import Scouting
@@ -29,7 +30,7 @@ def room(frames: int) -> Sequence:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is started: only who would be is looked at."""
-    for kind in (Ahead, Scouting, Beside):
+    for kind in (Ahead, LiveAhead, Scouting, Beside):
         monkeypatch.setattr(kind, "__enter__", lambda self: self)
         monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
 
@@ -71,11 +72,15 @@ def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
     simulated = SLAM(sequence.camera, load_config(None, ["features.kind=simulated"]))
     assert who(sequence, simulated, 2) == (here, True)
     assert "frames are read here: simulated features need no images" in capsys.readouterr().err
-    slam = SLAM(sequence.camera, CONFIG)
+    slam, fast = (
+        SLAM(sequence.camera, load_config(None, [*settings])) for settings in ((), ["patches.enabled=true"])
+    )
     sequence.timestamps = sequence.timestamps[:0]
-    assert "live" in why_alone(sequence, CONFIG)
     monkeypatch.setattr("torchslam.processes.best_number", lambda *arguments: 3)
-    assert who(sequence, slam, None) == (here, True)
+    assert who(sequence, slam, None) == ("LiveAhead", True)
+    assert why_alone(sequence, slam.config) == ""
+    assert who(sequence, fast, None) == (here, True)
+    assert "live source" in why_alone(sequence, fast.config)
     assert capsys.readouterr().err == ""  # nobody asked for more
 
 

@@ -15,6 +15,7 @@ from torchslam.ahead import Ahead
 from torchslam.beside import Beside
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
+from torchslam.live_ahead import LiveAhead
 from torchslam.mapping.adjusting import solve_here
 from torchslam.run import Frames
 from torchslam.scouting import Scouting
@@ -65,13 +66,17 @@ def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0
         yield frames
 
 
-def reader(sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool) -> Ahead | Scouting | None:
+def reader(
+    sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
+) -> Ahead | Scouting | LiveAhead | None:
     """What reads the frames of a sequence ahead; None where nothing can, or should."""
     alone = why_alone(sequence, slam.config)
     if processes == 1 or alone:
         if processes > 1 and is_asked_for:
             print(f"torchslam: frames are read here: {alone}", file=sys.stderr)
         return None
+    if not len(sequence.timestamps):
+        return LiveAhead(sequence, slam.camera, slam.config, slam.clock)
     if slam.config.patches.enabled:
         return Scouting(sequence, slam)
     return Ahead(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
@@ -81,8 +86,8 @@ def why_alone(sequence: Sequence, config: Config) -> str:
     """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
     if config.features.kind == "simulated":
         return "simulated features need no images"
-    if not len(sequence.timestamps):
-        return "a live source is read as it comes"
+    if not len(sequence.timestamps) and config.patches.enabled:
+        return "the next frame of a live source is not there to be followed"
     if config.matching.matcher != "descriptors":
         return "the matcher may want images"
     return ""

@@ -99,6 +99,10 @@ class LiveSequence(Sequence):
     def dropped(self) -> int:
         return self._dropped
 
+    @property
+    def waiting(self) -> int:
+        return len(self._arrived)
+
     def part(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Sequence:
         """The first `stop` frames: nothing else can be chosen of what is not there yet. Raises SequenceError."""
         if start or stride != 1:

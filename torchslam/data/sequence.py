@@ -121,6 +121,11 @@ class Sequence(ABC):
         """Frames that a live source had and nobody had time for."""
         return 0
 
+    @property
+    def waiting(self) -> int:
+        """Frames of a live source that have come and were not taken yet."""
+        return 0
+
     @abstractmethod
     def image(self, index: int) -> Tensor:
         """(1, 1, H, W) float32 in [0, 1]. Raises FrameError where it cannot be read or has another size."""
@@ -279,6 +284,10 @@ class Transformed(Sequence):
     @property
     def dropped(self) -> int:
         return self._whole.dropped
+
+    @property
+    def waiting(self) -> int:
+        return self._whole.waiting
 
     def image(self, index: int) -> Tensor:
         return self._whole.image(self._at(index))

@@ -19,6 +19,7 @@ from torchslam.data import open_sequence
 from torchslam.data.live import LiveSequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import evaluate
+from torchslam.processes import helped
 from torchslam.run import run_sequence
 from torchslam.slam import SLAM
 from torchslam.values import StepResult, Trajectory
@@ -56,6 +57,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--config", type=Path)
     parser.add_argument("--limit", type=int)
+    parser.add_argument("--processes", type=int)
     options = parser.parse_args()
     torch.set_num_threads(1)
     recording = open_sequence(DATA_DIR / options.name, limit=options.limit)
@@ -68,7 +70,8 @@ def main() -> None:
         latencies.append(1e3 * (time.time() - result.timestamp))
         times.append(result.timestamp)
 
-    finished = run_sequence(slam, live, after_frame)
+    with helped(live, slam, options.processes) as frames:
+        finished = run_sequence(slam, live, after_frame, frames=frames)
     median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
     print(
         f"{options.name} at {options.rate:g} Hz: {len(finished.results)} frames, {live.dropped} dropped "

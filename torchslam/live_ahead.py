@@ -1,0 +1,110 @@
+"""The frames of a live source with their features, found by another process where a frame already waits.
+
+While one frame is tracked the next one is looked at, if it has come by then: where this process is in time nothing is
+looked at elsewhere, and no frame comes later for it.
+"""
+
+from __future__ import annotations
+
+import pickle
+import traceback
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from types import TracebackType
+
+import torch
+
+from torchslam.config import Config
+from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.errors import FrameError, TorchslamError
+from torchslam.front_end import check_size, image_extractor
+from torchslam.geometry import Camera
+from torchslam.parcel import packed, unpacked
+from torchslam.stopwatch import Stopwatch
+from torchslam.values import Features, Frame
+from torchslam.worker import READY, Worker
+
+
+class LiveAhead:
+    """The frames of a live source; each is to be asked for once, in order.
+
+    There is a process while this is entered; what it has not done, or where it was ended, is done by who tracks.
+
+    camera: what the frames must fit; clock: is told as "features" how long the features of a frame were waited for
+    """
+
+    def __init__(self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch) -> None:
+        self._sequence, self._camera, self._clock = sequence, camera, clock
+        self._task = pickle.dumps((config, torch.get_num_threads()))
+        self._has_task = False
+        self._next: Frame | FrameError | None = None  # what was taken from the source before its turn
+        self._is_sent = False  # whether that is being looked at
+
+    def __enter__(self) -> LiveAhead:
+        self._worker = Worker(_work)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._worker.end()
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""
+        taken, self._next = self._next, None
+        if isinstance(taken, FrameError):
+            raise taken
+        frame = self._sequence[index] if taken is None else taken
+        if self._is_sent:
+            frame = self._with_features(frame)
+        self._look_ahead(index + 1)
+        return frame
+
+    def _with_features(self, frame: Frame) -> Frame:
+        self._is_sent = False
+        with self._clock("features"):
+            answer = self._worker.receive()
+        if isinstance(answer, BaseException):
+            raise answer
+        return frame if answer is None else replace(frame, features=unpacked(Features, answer))
+
+    def _look_ahead(self, index: int) -> None:
+        """Have the next frame looked at, if it has come and there is somebody to do it."""
+        if not self._sequence.waiting or not self._worker.is_there():
+            return
+        if not self._has_task:
+            self._has_task = self._worker.send(self._task)
+        try:
+            self._next = frame = self._sequence[index]
+            check_size(frame, self._camera)
+        except (EndOfSequence, IndexError):  # said again when it is asked for
+            return
+        except FrameError as error:
+            self._next = error
+            return
+        mask = None if frame.mask is None else frame.mask.numpy()
+        self._is_sent = self._worker.send(pickle.dumps((frame.image.numpy(), mask)))
+
+
+def _work(connection: Connection) -> None:
+    """A process: say that there is somebody, take the task, then answer until the one that asks has gone."""
+    try:
+        connection.send_bytes(READY)
+        config, threads = pickle.loads(connection.recv_bytes())
+        torch.set_num_threads(threads)
+        extract = image_extractor(config)
+        while True:
+            image, mask = pickle.loads(connection.recv_bytes())
+            frame = Frame(0, 0.0, torch.from_numpy(image))
+            try:
+                with torch.inference_mode():
+                    if mask is not None:
+                        frame = replace(frame, mask=torch.from_numpy(mask))
+                    answer: object = packed(extract(frame))
+            except Exception as error:  # an error is an answer too, and raised where it was asked for
+                if not isinstance(error, TorchslamError):
+                    error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
+                answer = error
+            connection.send_bytes(pickle.dumps(answer))
+    except (EOFError, OSError):
+        return
