@@ -358,7 +358,6 @@ def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
         ["run", ROOM, "-o", "x", "--checkpoint", "-1"],
         ["run", ROOM, "-o", "x", "--resume", "--overwrite"],
         ["run", ROOM],
-        ["run", ROOM, "-o", "x", "--features", "sift"],
         ["run", ROOM, "-o", "x", "--processes", "0"],
         ["export", "x"],
         ["export", "x", "--to", "obj"],

@@ -30,6 +30,7 @@ CONFIG = load_config(
         "simulated.points_per_view=150",
         "simulated.noise_px=0.3",
         "simulated.scales=true",
+        "bundle.delay=0",  # young or not, a world grows alike
     ],
 )
 WALK = Walk(arc(30)[:16])

@@ -13,6 +13,7 @@ from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, w
 from torchslam.config import load_config
 from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
+from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.spread import (
     CELLS,
     CROWD,
@@ -264,7 +265,7 @@ def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
     at = torch.nonzero(view.mask)[:, 0]
     there = ROWS[SCENE.shows(50)[at]]
     alive = here.map.points["alive"][there]
-    matches = iter([(there[alive][:30], at[alive][:30])])
+    matches = iter([Pairs(there[alive][:30], at[alive][:30])])
     tracked = follower.locate(here.map, view, matches, here.track.local_points)
     assert tracked is not None
     torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
