@@ -135,6 +135,7 @@ def _go_on(
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["adjusting"] is not None:  # of the newest keyframe, around which the map is as it was then
         slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, int(run["adjusting"]))
+        slam.memory.remove(world.map.keys[-1:])  # until it is adjusted
 
 
 def _check_track(track: Track) -> None:

@@ -305,7 +305,8 @@ class SLAM:
             why = ""
         if why:
             keyframe = self.mapper.insert(world.map, view, tracked, is_later)
-            self.memory.add(world.map, keyframe)
+            if not self.mapper.adjusting:
+                self.memory.add(world.map, keyframe)
             self.tracker.follow(world, keyframe)
         self.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
@@ -316,6 +317,7 @@ class SLAM:
         if not self.mapper.adjusting.is_due(frame):
             return world
         self.mapper.take_over(world.map)
+        self.memory.add(world.map, world.map.num_keyframes - 1)
         return self._look_back(world)
 
     def _look_back(self, world: World) -> World:
