@@ -13,6 +13,7 @@ from torchslam import load_config, open_sequence
 from torchslam.ahead import Ahead
 from torchslam.beside import Beside
 from torchslam.data.sequence import Sequence
+from torchslam.features import OpenCVORB
 from torchslam.geometry import Camera
 from torchslam.live_ahead import LiveAhead
 from torchslam.mapping.adjusting import solve_here
@@ -78,9 +79,9 @@ def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
     sequence.timestamps = sequence.timestamps[:0]
     monkeypatch.setattr("torchslam.processes.best_number", lambda *arguments: 3)
     assert who(sequence, slam, None) == ("LiveAhead", True)
-    assert why_alone(sequence, slam.config) == ""
+    assert why_alone(sequence, slam) == ""
     assert who(sequence, fast, None) == (here, True)
-    assert "live source" in why_alone(sequence, fast.config)
+    assert "live source" in why_alone(sequence, fast)
     assert capsys.readouterr().err == ""  # nobody asked for more
 
 
@@ -120,3 +121,22 @@ def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
     )
     assert done.stdout.split() == [str(sys.platform == "linux"), "False"]
     assert torch.get_num_threads() == 1
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_parts_of_ones_own_stay_here() -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
+    assert who(sequence, slam, 3) == (type(sequence).__name__, True)
+    assert "of your own" in why_alone(sequence, slam)
+
+
+def test_a_run_with_more_processes_is_the_same() -> None:
+    """In a program of one's own, too."""
+    sequence = open_sequence("synthetic:room?frames=160").part(20, 38)
+    config = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
+    alone = SLAM(sequence.camera, config).run(sequence)
+    assert alone.map.num_keyframes > 1
+    several = SLAM(sequence.camera, config).run(sequence, processes=3)
+    assert [result.reason for result in several.results] == [result.reason for result in alone.results]
+    assert torch.equal(several.trajectory.T_wc, alone.trajectory.T_wc)

@@ -10,17 +10,19 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
 
 from torchslam.ahead import Ahead
 from torchslam.beside import Beside
-from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.live_ahead import LiveAhead
 from torchslam.mapping.adjusting import solve_here
 from torchslam.run import Frames
 from torchslam.scouting import Scouting
-from torchslam.slam import SLAM
 from torchslam.worker import starts_at_once
+
+if TYPE_CHECKING:
+    from torchslam.slam import SLAM
 
 WORTH, WORTH_AT_ONCE = 100, 10
 """Frames of a run for which other processes are worth their start: one that has to import everything costs as much as
@@ -70,7 +72,7 @@ def reader(
     sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
 ) -> Ahead | Scouting | LiveAhead | None:
     """What reads the frames of a sequence ahead; None where nothing can, or should."""
-    alone = why_alone(sequence, slam.config)
+    alone = why_alone(sequence, slam)
     if processes == 1 or alone:
         if processes > 1 and is_asked_for:
             print(f"torchslam: frames are read here: {alone}", file=sys.stderr)
@@ -82,12 +84,14 @@ def reader(
     return Ahead(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
 
 
-def why_alone(sequence: Sequence, config: Config) -> str:
+def why_alone(sequence: Sequence, slam: SLAM) -> str:
     """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
-    if config.features.kind == "simulated":
+    if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
-    if not len(sequence.timestamps) and config.patches.enabled:
+    if slam.has_own_parts:
+        return "a front end or matcher of your own is here alone"
+    if not len(sequence.timestamps) and slam.config.patches.enabled:
         return "the next frame of a live source is not there to be followed"
-    if config.matching.matcher != "descriptors":
+    if slam.config.matching.matcher != "descriptors":
         return "the matcher may want images"
     return ""

@@ -18,13 +18,14 @@ from torchslam.config import Config
 from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.front_end import FrontEnd, check_order, check_size, image_extractor
+from torchslam.front_end import FrontEnd, check_order, check_size, image_extractor, source
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.loops.memory import Memory
 from torchslam.mapping.culling import drop_covered
 from torchslam.mapping.founding import Founder
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.mapping.mapper import Mapper
+from torchslam.processes import helped
 from torchslam.run import Run, run_sequence
 from torchslam.session import Session
 from torchslam.stopwatch import Stopwatch
@@ -79,6 +80,7 @@ class SLAM:
         self.extractor = None  # where frames bring their features
         if extractor is not None or self.config.features.kind != "simulated":
             self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
+        self.has_own_parts = extractor is not None or matcher is not None  # which other processes do not have
         self.clock = Stopwatch()
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
         self.matcher = matcher_of(scaled.matching, matcher)
@@ -182,9 +184,19 @@ class SLAM:
         index = 0 if self.last_frame is None else self.last_frame[0] + 1
         return self.step(Frame(index, float(timestamp), image_tensor(image, channels), f"image {index}"))
 
-    def run(self, sequence: Sequence, progress: Callable[[StepResult], None] | None = None) -> Run:
-        """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end."""
-        return run_sequence(self, sequence, progress)
+    def run(
+        self,
+        sequence: Sequence,
+        progress: Callable[[StepResult], None] | None = None,
+        processes: int | None = 1,
+    ) -> Run:
+        """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end.
+
+        processes: how many, this one included; None: what is best, as on the command line. The result is the same.
+        """
+        sequence = source(sequence, self.config, self.camera)
+        with helped(sequence, self, processes) as frames:
+            return run_sequence(self, sequence, progress, frames=frames)
 
     def trajectory(self) -> Trajectory:
         """Every posed frame of this session in its main world, by the map as it is now."""
