@@ -215,3 +215,7 @@ def test_an_index_that_grew_in_inference_mode_may_be_changed_outside() -> None:
     index.remove(torch.tensor([7]), torch.tensor([7]))
     index.clear(torch.tensor([8]))
     assert index.of(torch.tensor([6, 7, 8]))[1].tolist() == [6]
+    with torch.inference_mode():
+        assert index.of(torch.tensor([1000]))[1].tolist() == []  # a point that nobody has seen yet
+    index.add(torch.tensor([1000]), torch.tensor([9]))
+    assert index.of(torch.tensor([1000]))[1].tolist() == [9]

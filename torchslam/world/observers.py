@@ -82,9 +82,14 @@ class Observers:
     def _rows(self, point_ids: Tensor) -> Tensor:
         """(n,) where the places of points (n,) are."""
         if len(point_ids) and int(point_ids.max()) >= len(self._row_of):
-            more = self._row_of.new_zeros(max(len(self._row_of), int(point_ids.max()) + 1))
-            self._row_of = torch.cat([self._row_of, more])
+            self._reach(int(point_ids.max()))
         return self._row_of[point_ids].long()
+
+    @torch.inference_mode(False)
+    def _reach(self, point: int) -> None:
+        """Know at least all points up to this one."""
+        more = self._row_of.new_zeros(max(len(self._row_of), point + 1))
+        self._row_of = torch.cat([self._row_of, more])
 
     def _take_rows(self, point_ids: Tensor) -> None:
         """Have a row of its own for every one of distinct points (n,)."""
