@@ -14,7 +14,6 @@ import torch
 
 from tests.tracking.test_scout import frame
 from torchslam import load_config
-from torchslam import scouting as module
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
@@ -25,6 +24,7 @@ from torchslam.run import Run, run_sequence
 from torchslam.scouting import Scouting
 from torchslam.slam import SLAM
 from torchslam.values import Followed, State, StepResult
+from torchslam.worker import Worker
 
 CONFIG = load_config(
     None,
@@ -112,13 +112,13 @@ def test_the_same_with_a_process_that_comes_later(
 ) -> None:
     arrived: list[int] = []
 
-    def is_there(self: module.Worker) -> bool:
+    def is_there(self: Worker) -> bool:
         if arrived[-1:] == [15]:
             assert self._ours.poll(PATIENCE)
         return arrived[-1:] >= [15] and there(self)
 
-    there = module.Worker.is_there
-    monkeypatch.setattr(module.Worker, "is_there", is_there)
+    there = Worker.is_there
+    monkeypatch.setattr(Worker, "is_there", is_there)
     assert same(run(sequence, 2, lambda result: arrived.append(result.index))[0], alone)
     assert 15 in arrived
 

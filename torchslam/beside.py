@@ -8,7 +8,6 @@ from __future__ import annotations
 import pickle
 import traceback
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -19,31 +18,23 @@ from torchslam.mapping.adjusting import Answer
 from torchslam.mapping.local_bundle import Adjusted, solve_around
 from torchslam.solvers import BundleProblem
 from torchslam.solvers.schur import Marginals
-from torchslam.worker import READY, Worker
+from torchslam.worker import READY, WithWorker
 
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
 """What tells one problem around a keyframe from another of the same run."""
 
 
-class Beside:
+class Beside(WithWorker):
     """Solves with another process, see `mapping.adjusting.Solver`; here until it has started, or where it was ended.
 
     There is a process while this is entered.
     """
 
     def __init__(self, camera: Camera) -> None:
+        super().__init__(_work)
         self._camera = camera
         self._has_task = False
         self._number = 0  # of the last problem that was sent
-
-    def __enter__(self) -> Beside:
-        self._worker = Worker(_work)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._worker.end()
 
     def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
         number = self._send(problem, iterations, covariances)

@@ -10,7 +10,6 @@ import pickle
 import traceback
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from types import TracebackType
 
 import torch
 
@@ -22,10 +21,10 @@ from torchslam.geometry import Camera
 from torchslam.parcel import packed, unpacked
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Features, Frame
-from torchslam.worker import READY, Worker
+from torchslam.worker import READY, WithWorker
 
 
-class LiveAhead:
+class LiveAhead(WithWorker):
     """The frames of a live source; each is to be asked for once, in order.
 
     There is a process while this is entered; what it has not done, or where it was ended, is done by who tracks.
@@ -34,20 +33,12 @@ class LiveAhead:
     """
 
     def __init__(self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch) -> None:
+        super().__init__(_work)
         self._sequence, self._camera, self._clock = sequence, camera, clock
         self._task = pickle.dumps((config, torch.get_num_threads()))
         self._has_task = False
         self._next: Frame | FrameError | None = None  # what was taken from the source before its turn
         self._is_sent = False  # whether that is being looked at
-
-    def __enter__(self) -> LiveAhead:
-        self._worker = Worker(_work)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._worker.end()
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""

@@ -10,7 +10,6 @@ import pickle
 import traceback
 from collections import deque
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Protocol
 
 import torch
@@ -24,7 +23,7 @@ from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.anchors import Anchors
 from torchslam.tracking.scout import Scout
 from torchslam.values import Anchor, Followed, Frame
-from torchslam.worker import READY, Worker
+from torchslam.worker import READY, WithWorker
 
 
 class System(Protocol):
@@ -40,7 +39,7 @@ class System(Protocol):
     def will_do(self, followed: Followed) -> bool: ...
 
 
-class Scouting:
+class Scouting(WithWorker):
     """The frames of a sequence, followed or with their features; each is to be asked for once, in order.
 
     Until the process has started, the system's own scout goes before it, and then hands over what it knows; it begins
@@ -48,19 +47,11 @@ class Scouting:
     """
 
     def __init__(self, sequence: Sequence, slam: System) -> None:
+        super().__init__(_work)
         self._sequence, self._slam = sequence, slam
         self._is_away = False
         self._told = -1  # frame of the newest news that it knows
         self._frames: deque[Arrays | BaseException] = deque()  # what has arrived before its turn
-
-    def __enter__(self) -> Scouting:
-        self._worker = Worker(_work)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._worker.end()
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""

@@ -16,7 +16,8 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import torch
 
@@ -41,7 +42,8 @@ class Worker:
         # What it needs comes through the pipe: `start` would wait for ever for a process that dies before it reads.
         name = "torchslam helper"
         self._process: BaseProcess
-        if starts_at_once():
+        is_copied = starts_at_once()
+        if is_copied:
             fork = multiprocessing.get_context("fork")
             self._process = fork.Process(
                 target=_copied, args=(work, theirs, self._ours), name=name, daemon=True
@@ -50,7 +52,7 @@ class Worker:
             spawn = multiprocessing.get_context("spawn")
             self._process = spawn.Process(target=work, args=(theirs,), name=name, daemon=True)
         self._is_there = self._has_ended = False
-        with _without_interrupts():
+        with _without_interrupts(is_copied):
             self._process.start()
         theirs.close()  # so that its end is noticed
 
@@ -101,17 +103,38 @@ def _copied(work: Callable[[Connection], None], theirs: Connection, ours: Connec
     """A process that begins as a copy of the one that started it, whose ends of pipes and signals are not its own."""
     ours.close()  # so that the other's end is noticed
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what `end` sends
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
     work(theirs)
 
 
+class WithWorker:
+    """What has a process beside this one that does `work`, while it is entered."""
+
+    def __init__(self, work: Callable[[Connection], None]) -> None:
+        self._work = work
+
+    def __enter__(self) -> Self:
+        self._worker = Worker(self._work)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._worker.end()
+
+
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that are started in here are not ended by Ctrl-C, which is for this one to see to; none is lost."""
+def _without_interrupts(is_copied: bool) -> Iterator[None]:
+    """Processes that are started in here are not ended by Ctrl-C, which is for this one to see to; none is lost.
+
+    is_copied: SIGTERM has to wait as well, until a copy no longer has this process's handler for it
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     resource_tracker.ensure_running()  # it would let signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    held = [signal.SIGINT, signal.SIGTERM] if is_copied else [signal.SIGINT]
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, held)
     try:
         yield
     finally:
