@@ -96,7 +96,8 @@ def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
     slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
     told = Config().for_size((1280, 960))
     assert slam.config == Config()
-    assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, slam.initializer))
+    initializer = slam._following.beginning.initializer
+    assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, initializer))
     assert slam.tracker.settings == told.tracking
     assert slam.foreign.stillness.evidence.shape == (121, 161)
 

@@ -19,7 +19,8 @@ from torchslam.features import SimulatedFeatures
 from torchslam.front_end import Simulated
 from torchslam.geometry import Noise, se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
-from torchslam.slam import FOUND_AGAIN, STARTED_ANEW
+from torchslam.stages.finding import FOUND_AGAIN
+from torchslam.stages.following import STARTED_ANEW
 from torchslam.tracking.tracker import Tracker
 from torchslam.values import Start, View
 from torchslam.world.map import Map

@@ -20,10 +20,11 @@ from torchslam.errors import TorchslamError
 from torchslam.front_end import check_order, check_size, image_extractor
 from torchslam.parcel import Arrays, as_arrays, from_arrays, packed, unpacked
 from torchslam.stopwatch import Stopwatch
-from torchslam.tracking.anchors import Anchors
+from torchslam.tracking.patch_tracking import PatchTracking
 from torchslam.tracking.scout import Scout
-from torchslam.values import Anchor, Followed, Frame
+from torchslam.values import Anchor, Frame
 from torchslam.worker import READY, WithWorker
+from torchslam.world.world import World
 
 
 class System(Protocol):
@@ -31,12 +32,11 @@ class System(Protocol):
 
     config: Config
     clock: Stopwatch
-    scout: Scout
-    anchors: Anchors
-    news: tuple[int, Anchor | None]
+    patches: PatchTracking
     last_frame: tuple[int, float] | None
 
-    def will_do(self, followed: Followed) -> bool: ...
+    @property
+    def world(self) -> World | None: ...
 
 
 class Scouting(WithWorker):
@@ -58,24 +58,31 @@ class Scouting(WithWorker):
         slam = self._slam
         if not self._is_away and self._worker.is_there():
             # Not by multiprocessing's own pickling, which would move tensors to shared memory.
-            task = self._sequence, slam.config, slam.scout, slam.last_frame, torch.get_num_threads(), index
+            task = (
+                self._sequence,
+                slam.config,
+                slam.patches.scout,
+                slam.last_frame,
+                torch.get_num_threads(),
+                index,
+            )
             self._is_away = self._worker.send(pickle.dumps(task))
-            self._told = slam.news[0]
+            self._told = slam.patches.news[0]
         if self._is_away:
             with slam.clock("features"):
                 frame = self._ask(index)
             if frame is not None:
                 return frame
             self._is_away = False
-            slam.scout.forget()
-            slam.anchors.clear()
+            slam.patches.forget()
         return self._sequence[index]
 
     def _ask(self, index: int) -> Frame | None:
         """A frame of which the system can make something; None where there is nobody to answer."""
         slam, news = self._slam, None
-        if slam.news[0] != self._told:
-            self._told, news = slam.news[0], (slam.news[0], packed(slam.news[1]))
+        newest, anchor = slam.patches.news
+        if newest != self._told:
+            self._told, news = newest, (newest, packed(anchor))
         if not self._worker.send(pickle.dumps((index, news, False))):
             return None
         answer = self._frames.popleft() if self._frames else self._worker.receive()
@@ -84,7 +91,7 @@ class Scouting(WithWorker):
         if answer is None:
             return None
         frame = from_arrays(answer)
-        if frame.features is not None or (frame.followed is not None and slam.will_do(frame.followed)):
+        if frame.features is not None or slam.patches.will_do(slam.world, frame.followed):
             return frame
         if not self._worker.send(pickle.dumps((index, None, True))):
             return None

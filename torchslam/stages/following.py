@@ -1,0 +1,121 @@
+"""Following a world: frames are tracked and judged; what is believed is built on, what is doubtful held back."""
+
+from __future__ import annotations
+
+from torchslam.geometry import se3_inverse
+from torchslam.mapping.culling import drop_covered
+from torchslam.stages.beginning import Beginning
+from torchslam.stages.finding import Finding
+from torchslam.stages.local_mapping import LocalMapping
+from torchslam.stages.loop_closing import LoopClosing
+from torchslam.stages.parts import Outcome, Parts
+from torchslam.stages.tracking_back import TrackingBack
+from torchslam.tracking.independent_motion import NOTHING
+from torchslam.tracking.judge import why_doubt
+from torchslam.values import Followed, Frame, State, Tracked, View
+from torchslam.world.world import World
+
+STARTED_ANEW = "later frames contradict the start: started the map anew"
+STAYS = "some of the image does not move with the scene and is left out"
+
+
+class Following:
+    """Follows the camera through a world, frame by frame."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.mapping = LocalMapping(parts)
+        self.back = TrackingBack(parts, self.mapping)
+        self.beginning = Beginning(parts, self.back)
+        self.loop_closing = LoopClosing(parts, self.mapping, self.beginning)
+        self.finding = Finding(parts, self.beginning, self.back)
+
+    def go_along(self, world: World, frame: Frame, followed: Followed) -> tuple[View, Outcome]:
+        """Take over where patches were followed to; nothing is mapped."""
+        parts = self.parts
+        with parts.clock("patches"):
+            view, tracked = parts.patches.place(world, frame, parts.session.number, followed)
+            parts.tracker.see(world.map, tracked)
+            world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        return view, Outcome("", self.loop_closing.catch_up(world, frame.index), tracked)
+
+    def follow(self, world: World, view: View, followed: Followed | None = None) -> Outcome:
+        """Track the frame; what is doubtful is held back until later frames confirm it.
+
+        followed: what its patches said, which is where it is looked for
+        """
+        parts = self.parts
+        with parts.clock("tracking"):
+            T_cw = parts.patches.pose(world, followed)
+            if T_cw is not None:
+                world.track.velocity = T_cw @ se3_inverse(world.T_cw)
+            expected = None if world.track.velocity is None else parts.tracker.predict(world)
+            tracked = parts.tracker.track(world, view)
+        if tracked is None:
+            return self._lose(world, view)
+        doubt = why_doubt(tracked, expected, world.track, parts.config.judge)
+        moves = parts.foreign.moves(tracked) if not doubt else NOTHING
+        if doubt or moves.is_doubt or parts.probation:
+            return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
+        return self._build(world, view, tracked, moves.words)
+
+    def conclude(self, frame: int | None) -> None:
+        """The last frame has come: what is held back keeps its pose, uncertain as it is, and nothing is built on it."""
+        here = self.parts.here
+        self.beginning.settle()
+        for held in self.parts.probation.hand_over():
+            assert here.world is not None  # nothing is held back without one
+            here.world.history.add(*held)
+        if here.world is not None and frame is not None:
+            self.loop_closing.catch_up(here.world, frame, now=True)
+
+    def _build(self, world: World, view: View, tracked: Tracked, moves: str) -> Outcome:
+        """A frame that is believed: map it, look back, let a young world grow, follow the next ones from here.
+
+        moves: what was said of what moves against the scene
+        """
+        parts, mapping, closing = self.parts, self.mapping, self.loop_closing
+        parts.here.state, recalls = State.TRACKING, closing.count
+        is_young = self.beginning.youth is not None
+        is_later = not is_young and parts.mapper.may_wait(world.map)
+        why = mapping.take(world, view, tracked, is_later)
+        is_keyframe = bool(why)
+        if is_keyframe and not mapping.adjusting:
+            world = closing.look_back(world)
+        stays = parts.session.mapping and parts.foreign.stays(world.T_cw, tracked.depth)
+        if stays:
+            world = closing.catch_up(world, view.index, now=True)
+            drop_covered(world, parts.foreign.stillness.covers)
+        if self.beginning.grow(view):
+            return Outcome(STARTED_ANEW, parts.here.world, is_keyframe=True)
+        is_settled = self.beginning.youth is None and closing.count == recalls
+        if parts.patches.is_enabled and is_settled and not stays:
+            parts.patches.add(world, view, tracked)
+        world = closing.catch_up(world, view.index)
+        why = "; ".join(filter(None, [why, STAYS * stays, moves]))
+        return Outcome(why, world, tracked, is_keyframe)
+
+    def _hold(self, world: World, view: View, tracked: Tracked, doubt: str) -> Outcome:
+        """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""
+        parts, probation = self.parts, self.parts.probation
+        probation.hold(view, tracked, world.track, doubt)
+        if probation:
+            parts.here.state = State.UNCERTAIN
+            return Outcome(doubt or probation.reason, world, tracked)
+        came_back, held = probation.came_back, probation.release()
+        for earlier in held:
+            parts.tracker.vouch(world.map, earlier[1])
+            world.history.add(*earlier)
+        if came_back:
+            first, located, _, _ = held[0]
+            self.back.from_frame(world, first, located)
+        parts.here.state = State.TRACKING
+        return Outcome("", world, tracked)
+
+    def _lose(self, world: World, view: View) -> Outcome:
+        """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
+        self.loop_closing.catch_up(world, view.index, now=True)
+        self.back.waiting.add(*self.parts.probation.views(), view)
+        taken_back = self.beginning.lose()
+        self.finding.seek()
+        return Outcome("lost right after the start: starting anew" if taken_back else "lost")

@@ -1,0 +1,59 @@
+"""What the newest keyframe has to do with those before it: loops closed, worlds joined, rows let go of."""
+
+from __future__ import annotations
+
+from torchslam.stages.beginning import Beginning
+from torchslam.stages.local_mapping import LocalMapping
+from torchslam.stages.parts import Parts
+from torchslam.world.world import World
+
+
+class LoopClosing:
+    """Looks back from keyframes. To be called while nobody holds rows of the map but anchors."""
+
+    def __init__(self, parts: Parts, mapping: LocalMapping, beginning: Beginning) -> None:
+        self.parts, self.mapping, self.beginning = parts, mapping, beginning
+
+    @property
+    def count(self) -> int:
+        """How many places were recognised so far."""
+        return len(self.parts.memory.recalls)
+
+    def catch_up(self, world: World, frame: int, now: bool = False) -> World:
+        """Take over the adjustment around the newest keyframe when it is due, or `now`, and look back from there."""
+        return self.look_back(world) if self.mapping.take_over(world, frame, now) else world
+
+    def look_back(self, world: World) -> World:
+        """Recognise the newest keyframe's place, and let go of what the map can do without.
+
+        Returns the world that is followed from now on: another one where two were joined.
+        """
+        recalls = self.count
+        world = self._recall(world)
+        self._tidy(world)
+        if self.count > recalls:
+            self.parts.patches.leave()
+        return world
+
+    def _recall(self, world: World) -> World:
+        """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
+        parts = self.parts
+        with parts.clock("loops"):
+            found = parts.memory.recognize(world, world.map.num_keyframes - 1)
+            if found is None:
+                return world
+            if not found.is_loop:
+                self.beginning.settle()
+            world, keyframe = parts.memory.take_up(found)
+            parts.here.world = world
+            parts.tracker.follow(world, keyframe)
+            parts.foreign.forget_last()  # its pose was one of the map before
+        return world
+
+    def _tidy(self, world: World) -> None:
+        """Let go of what the map can do without."""
+        keys = world.map.keys
+        renumbering = self.parts.mapper.tidy(world)
+        if renumbering is not None:
+            self.parts.memory.remove(keys[renumbering.keyframes < 0])
+            self.parts.patches.renumber(renumbering)

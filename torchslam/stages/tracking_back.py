@@ -1,0 +1,40 @@
+"""The way back: frames from before a world was known, or from while it was lost, get their poses."""
+
+from __future__ import annotations
+
+from torchslam.stages.local_mapping import LocalMapping
+from torchslam.stages.parts import Parts
+from torchslam.tracking.backwards import track_back
+from torchslam.tracking.waiting import Waiting
+from torchslam.values import Tracked, View
+from torchslam.world.world import World
+
+
+class TrackingBack:
+    """Keeps the frames that wait for a pose, and follows the camera back through them."""
+
+    def __init__(self, parts: Parts, mapping: LocalMapping) -> None:
+        self.parts, self.mapping = parts, mapping
+        self.waiting = Waiting(parts.config.initialization.max_waiting)
+
+    def from_start(self, world: World) -> None:
+        """Pose the frames from before the first keyframe of a world."""
+        behind = world.aside()
+        self.parts.tracker.follow(behind, 0)
+        self._pose(behind, before=int(world.map.keyframes["frame_index"][0]))
+
+    def from_frame(self, world: World, view: View, tracked: Tracked) -> None:
+        """Pose the frames that were lost before a frame that was found again."""
+        behind = world.aside()
+        self.parts.tracker.start_at(behind, view, tracked)
+        self._pose(behind, before=view.index)
+
+    def _pose(self, behind: World, before: int) -> None:
+        """Follow the camera back through the frames that wait from before a frame."""
+        parts = self.parts
+        with parts.clock("backwards"):
+            earlier = [view for view in self.waiting if view.index < before]
+            posed = track_back(
+                parts.tracker, behind, reversed(earlier), parts.config.judge, self.mapping.take
+            )
+        self.waiting.remove(posed)
