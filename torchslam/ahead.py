@@ -7,21 +7,17 @@ while this one tracks and maps.
 from __future__ import annotations
 
 import pickle
-import traceback
 from multiprocessing.connection import Connection
 from types import TracebackType
 
-import torch
-
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import TorchslamError
 from torchslam.front_end import check_size, image_extractor
 from torchslam.geometry import Camera
-from torchslam.parcel import as_arrays, from_arrays
+from torchslam.parcel import Arrays, as_arrays, from_arrays
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Frame
-from torchslam.worker import READY, Worker
+from torchslam.worker import Worker, attempt, outcome, questions, reply, task
 
 AHEAD = 4
 """Frames that a process is asked for before their turn: about as many as it reads while a keyframe is mapped."""
@@ -42,8 +38,7 @@ class Ahead:
         self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch, processes: int = 1
     ) -> None:
         self._sequence, self._clock, self._count = sequence, clock, processes
-        # Not by multiprocessing's own pickling, which would move tensors to shared memory.
-        self._task = pickle.dumps((sequence, camera, config, torch.get_num_threads()))
+        self._task = task(sequence, camera, config)
         self._workers: list[Worker] = []
         self._busy: set[Worker] = set()  # those that have the task
         self._asked: dict[int, Worker] = {}
@@ -65,9 +60,7 @@ class Ahead:
         worker = self._asked.pop(index, None)
         if worker is not None:
             with self._clock("features"):
-                answer = worker.receive()
-            if isinstance(answer, BaseException):
-                raise answer
+                answer = outcome(worker.receive())
             if answer is not None:
                 return from_arrays(answer)
         return self._sequence[index]
@@ -84,24 +77,14 @@ class Ahead:
         self._next = until
 
 
-def _work(connection: Connection) -> None:
-    """A process: say that there is somebody, take the task, then answer until the one that asks has gone."""
-    try:
-        connection.send_bytes(READY)
-        sequence, camera, config, threads = pickle.loads(connection.recv_bytes())
-        torch.set_num_threads(threads)
-        extract = image_extractor(config)
-        while True:
-            index = pickle.loads(connection.recv_bytes())
-            try:
-                with torch.inference_mode():
-                    frame = sequence[index]
-                    check_size(frame, camera)
-                    answer: object = as_arrays(frame, None, extract(frame))
-            except Exception as error:  # an error is an answer too, and raised where it was asked for
-                if not isinstance(error, TorchslamError):
-                    error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
-                answer = error
-            connection.send_bytes(pickle.dumps(answer))
-    except (EOFError, OSError):
-        return
+def _work(connection: Connection, sequence: Sequence, camera: Camera, config: Config) -> None:
+    """Read the frames that are asked for, by their index, and find their features."""
+    extract = image_extractor(config)
+
+    def read(index: int) -> Arrays:
+        frame = sequence[index]
+        check_size(frame, camera)
+        return as_arrays(frame, None, extract(frame))
+
+    for index in questions(connection):
+        reply(connection, attempt("reads ahead", read, index))

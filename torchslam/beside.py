@@ -6,7 +6,6 @@ What is adjusted and when its outcome counts is `mapping.adjusting`'s to say; he
 from __future__ import annotations
 
 import pickle
-import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,7 +17,7 @@ from torchslam.mapping.adjusting import Answer
 from torchslam.mapping.local_bundle import Adjusted, solve_around
 from torchslam.solvers import BundleProblem
 from torchslam.solvers.schur import Marginals
-from torchslam.worker import READY, WithWorker
+from torchslam.worker import WithWorker, attempt, outcome, questions, reply, task
 
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
 """What tells one problem around a keyframe from another of the same run."""
@@ -50,8 +49,7 @@ class Beside(WithWorker):
         if not self._worker.is_there():
             return None
         if not self._has_task:
-            # Not by multiprocessing's own pickling, which would move tensors to shared memory.
-            self._has_task = self._worker.send(pickle.dumps((self._camera, torch.get_num_threads())))
+            self._has_task = self._worker.send(task(self._camera))
         self._number += 1
         arrays = {name: getattr(problem, name).numpy() for name in SENT}
         message = pickle.dumps((self._number, arrays, iterations, covariances))
@@ -60,17 +58,15 @@ class Beside(WithWorker):
     def _receive(self, number: int) -> Adjusted | None:
         """The answer of a number; those before it were not wanted in the end. None where there is nobody to answer."""
         while (answer := self._worker.receive()) is not None:
-            answered, outcome = answer
+            answered, found = answer
             if answered == number:
-                return _adjusted(outcome)
+                return _adjusted(outcome(found))
         return None
 
 
-def _adjusted(outcome: list[np.ndarray] | BaseException) -> Adjusted:
-    """What `_arrays` packed. Raises what was raised on the other side."""
-    if isinstance(outcome, BaseException):
-        raise outcome
-    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in outcome)
+def _adjusted(arrays: list[np.ndarray]) -> Adjusted:
+    """What `_arrays` packed."""
+    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
     return Adjusted(T_cw, points_w, Marginals(*covariances) if covariances else None)
 
 
@@ -79,22 +75,12 @@ def _arrays(adjusted: Adjusted) -> list[np.ndarray]:
     return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
 
 
-def _work(connection: Connection) -> None:
-    """A process: say that there is somebody, take the task, then solve until the one that asks has gone."""
-    try:
-        connection.send_bytes(READY)
-        camera, threads = pickle.loads(connection.recv_bytes())
-        torch.set_num_threads(threads)
-        while True:
-            number, arrays, iterations, covariances = pickle.loads(connection.recv_bytes())
-            try:
-                with torch.inference_mode():
-                    columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
-                    problem = BundleProblem(camera=camera, **columns)
-                    outcome: object = _arrays(solve_around(problem, iterations, covariances))
-            except Exception as error:  # raised where the outcome is wanted
-                error.add_note(f"in the process that adjusts:\n{traceback.format_exc()}")
-                outcome = error
-            connection.send_bytes(pickle.dumps((number, outcome)))
-    except (EOFError, OSError):
-        return
+def _work(connection: Connection, camera: Camera) -> None:
+    """Solve the problems that come, each with its number."""
+
+    def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
+        columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
+        return _arrays(solve_around(BundleProblem(camera=camera, **columns), iterations, covariances))
+
+    for number, *problem in questions(connection):
+        reply(connection, (number, attempt("adjusts", solve, *problem)))

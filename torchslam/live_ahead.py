@@ -7,21 +7,21 @@ looked at elsewhere, and no frame comes later for it.
 from __future__ import annotations
 
 import pickle
-import traceback
 from dataclasses import replace
 from multiprocessing.connection import Connection
 
+import numpy as np
 import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
-from torchslam.errors import FrameError, TorchslamError
+from torchslam.errors import FrameError
 from torchslam.front_end import check_size, image_extractor
 from torchslam.geometry import Camera
-from torchslam.parcel import packed, unpacked
+from torchslam.parcel import Arrays, packed, unpacked
 from torchslam.stopwatch import Stopwatch
 from torchslam.values import Features, Frame
-from torchslam.worker import READY, WithWorker
+from torchslam.worker import WithWorker, attempt, outcome, questions, reply, task
 
 
 class LiveAhead(WithWorker):
@@ -35,7 +35,7 @@ class LiveAhead(WithWorker):
     def __init__(self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch) -> None:
         super().__init__(_work)
         self._sequence, self._camera, self._clock = sequence, camera, clock
-        self._task = pickle.dumps((config, torch.get_num_threads()))
+        self._task = task(config)
         self._has_task = False
         self._next: Frame | FrameError | None = None  # what was taken from the source before its turn
         self._is_sent = False  # whether that is being looked at
@@ -54,9 +54,7 @@ class LiveAhead(WithWorker):
     def _with_features(self, frame: Frame) -> Frame:
         self._is_sent = False
         with self._clock("features"):
-            answer = self._worker.receive()
-        if isinstance(answer, BaseException):
-            raise answer
+            answer = outcome(self._worker.receive())
         return frame if answer is None else replace(frame, features=unpacked(Features, answer))
 
     def _look_ahead(self, index: int) -> None:
@@ -77,25 +75,15 @@ class LiveAhead(WithWorker):
         self._is_sent = self._worker.send(pickle.dumps((frame.image.numpy(), mask)))
 
 
-def _work(connection: Connection) -> None:
-    """A process: say that there is somebody, take the task, then answer until the one that asks has gone."""
-    try:
-        connection.send_bytes(READY)
-        config, threads = pickle.loads(connection.recv_bytes())
-        torch.set_num_threads(threads)
-        extract = image_extractor(config)
-        while True:
-            image, mask = pickle.loads(connection.recv_bytes())
-            frame = Frame(0, 0.0, torch.from_numpy(image))
-            try:
-                with torch.inference_mode():
-                    if mask is not None:
-                        frame = replace(frame, mask=torch.from_numpy(mask))
-                    answer: object = packed(extract(frame))
-            except Exception as error:  # an error is an answer too, and raised where it was asked for
-                if not isinstance(error, TorchslamError):
-                    error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
-                answer = error
-            connection.send_bytes(pickle.dumps(answer))
-    except (EOFError, OSError):
-        return
+def _work(connection: Connection, config: Config) -> None:
+    """Find the features of the images that come, each with its mask or None."""
+    extract = image_extractor(config)
+
+    def look(image: np.ndarray, mask: np.ndarray | None) -> Arrays | None:
+        frame = Frame(0, 0.0, torch.from_numpy(image))
+        if mask is not None:
+            frame = replace(frame, mask=torch.from_numpy(mask))
+        return packed(extract(frame))
+
+    for question in questions(connection):
+        reply(connection, attempt("reads ahead", look, *question))

@@ -7,7 +7,6 @@ bytes are the same.
 from __future__ import annotations
 
 import pickle
-import traceback
 from collections import deque
 from multiprocessing.connection import Connection
 from typing import Protocol
@@ -16,15 +15,16 @@ import torch
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import TorchslamError
 from torchslam.front_end import check_order, check_size, image_extractor
 from torchslam.parcel import Arrays, as_arrays, from_arrays, packed, unpacked
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.patch_tracking import PatchTracking
 from torchslam.tracking.scout import Scout
 from torchslam.values import Anchor, Frame
-from torchslam.worker import READY, WithWorker
+from torchslam.worker import WithWorker, attempt, outcome, reply, task
 from torchslam.world.world import World
+
+READS = "reads ahead"  # what the process does
 
 
 class System(Protocol):
@@ -51,22 +51,14 @@ class Scouting(WithWorker):
         self._sequence, self._slam = sequence, slam
         self._is_away = False
         self._told = -1  # frame of the newest news that it knows
-        self._frames: deque[Arrays | BaseException] = deque()  # what has arrived before its turn
+        self._frames: deque[Arrays | Exception] = deque()  # what has arrived before its turn
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""
         slam = self._slam
         if not self._is_away and self._worker.is_there():
-            # Not by multiprocessing's own pickling, which would move tensors to shared memory.
-            task = (
-                self._sequence,
-                slam.config,
-                slam.patches.scout,
-                slam.last_frame,
-                torch.get_num_threads(),
-                index,
-            )
-            self._is_away = self._worker.send(pickle.dumps(task))
+            message = task(self._sequence, slam.config, slam.patches.scout, slam.last_frame, index)
+            self._is_away = self._worker.send(message)
             self._told = slam.patches.news[0]
         if self._is_away:
             with slam.clock("features"):
@@ -85,9 +77,7 @@ class Scouting(WithWorker):
             self._told, news = newest, (newest, packed(anchor))
         if not self._worker.send(pickle.dumps((index, news, False))):
             return None
-        answer = self._frames.popleft() if self._frames else self._worker.receive()
-        if isinstance(answer, BaseException):
-            raise answer
+        answer = outcome(self._frames.popleft() if self._frames else self._worker.receive())
         if answer is None:
             return None
         frame = from_arrays(answer)
@@ -102,16 +92,17 @@ class Scouting(WithWorker):
         return None
 
 
-def _work(connection: Connection) -> None:
-    """A process: say that there is somebody, take the task, then go ahead until nobody asks any more."""
-    try:
-        connection.send_bytes(READY)
-        sequence, config, scout, last_frame, threads, start = pickle.loads(connection.recv_bytes())
-        torch.set_num_threads(threads)
-        with torch.inference_mode():
-            _Away(connection, sequence, config, scout, last_frame, start).go()
-    except (EOFError, OSError):
-        return
+def _work(
+    connection: Connection,
+    sequence: Sequence,
+    config: Config,
+    scout: Scout,
+    last_frame: tuple[int, float] | None,
+    start: int,
+) -> None:
+    """Go ahead from frame `start` on."""
+    with torch.inference_mode():
+        _Away(connection, sequence, config, scout, last_frame, start).go()
 
 
 class _Away:
@@ -145,13 +136,13 @@ class _Away:
             elif is_far or self.connection.poll():
                 self.hear(*pickle.loads(self.connection.recv_bytes()))
             else:
-                self.send(self.look(self.next))
+                reply(self.connection, self.look(self.next))
                 self.next += 1
 
     def hear(self, index: int, news: tuple[int, Arrays | None] | None, wants_features: bool) -> None:
         """A frame is wanted, or its features after all; news of a frame before it."""
         if wants_features:
-            self.send(as_arrays(self.images[index], None, self.extract(self.images[index])))
+            reply(self.connection, as_arrays(self.images[index], None, self.extract(self.images[index])))
             return
         self.wanted = index
         self.images = {i: frame for i, frame in self.images.items() if i >= index}
@@ -160,28 +151,27 @@ class _Away:
 
     def ahead(self, index: int) -> Frame | Exception:
         """A frame, and all that can be done before it is its turn."""
-        try:
+
+        def prepared() -> Frame:
             frame = self.sequence[index]
             check_size(frame, self.scout.camera)
             self.scout.prepare(frame)
             return frame
-        except Exception as error:
-            return error
 
-    def look(self, index: int) -> Arrays | BaseException:
-        """What there is to say of a frame; an error is an answer too, and raised where it was asked for."""
+        found: Frame | Exception = attempt(READS, prepared)
+        return found
+
+    def look(self, index: int) -> Arrays | Exception:
+        """What there is to say of a frame."""
         frame, self.read = self.read or self.ahead(index), None
-        try:
-            if isinstance(frame, Exception):
-                raise frame
-            check_order(frame, self.last_frame)
-            followed = self.scout.follow(frame)
-            self.last_frame, self.images[index] = (frame.index, frame.timestamp), frame
-            return as_arrays(frame, followed, self.extract(frame) if followed.why_not else None)
-        except Exception as error:
-            if not isinstance(error, TorchslamError):
-                error.add_note(f"in the process that reads ahead:\n{traceback.format_exc()}")
-            return error
+        if isinstance(frame, Exception):
+            return frame
+        found: Arrays | Exception = attempt(READS, self.follow, index, frame)
+        return found
 
-    def send(self, answer: Arrays | BaseException) -> None:
-        self.connection.send_bytes(pickle.dumps(answer))
+    def follow(self, index: int, frame: Frame) -> Arrays:
+        """Where the next frame is, with its features where that will not do."""
+        check_order(frame, self.last_frame)
+        followed = self.scout.follow(frame)
+        self.last_frame, self.images[index] = (frame.index, frame.timestamp), frame
+        return as_arrays(frame, followed, self.extract(frame) if followed.why_not else None)

@@ -1,4 +1,4 @@
-"""A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended.
+"""A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended; and what it does there.
 
 It is a copy of this one where that is safe, and then there at once; elsewhere a new interpreter has to import all.
 """
@@ -9,6 +9,7 @@ import multiprocessing
 import pickle
 import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from types import TracebackType
 from typing import Any, Self
 
 import torch
+
+from torchslam.errors import TorchslamError
 
 READY = b""  # what a process says when it is there
 THREADS = Path("/proc/self/task")  # one entry each, on Linux
@@ -35,9 +38,12 @@ def starts_at_once() -> bool:
 
 
 class Worker:
-    """A process that does `work` at the other end of a pipe, after it has said READY."""
+    """A process that does `work` at the other end of a pipe, once it has said READY and was sent its `task`.
 
-    def __init__(self, work: Callable[[Connection], None]) -> None:
+    work: (connection, *task) -> None, until the pipe is closed
+    """
+
+    def __init__(self, work: Callable[..., None]) -> None:
         self._ours, theirs = multiprocessing.Pipe()
         # What it needs comes through the pipe: `start` would wait for ever for a process that dies before it reads.
         name = "torchslam helper"
@@ -50,7 +56,7 @@ class Worker:
             )
         else:
             spawn = multiprocessing.get_context("spawn")
-            self._process = spawn.Process(target=work, args=(theirs,), name=name, daemon=True)
+            self._process = spawn.Process(target=serve, args=(work, theirs), name=name, daemon=True)
         self._is_there = self._has_ended = False
         with _without_interrupts(is_copied):
             self._process.start()
@@ -99,18 +105,18 @@ class Worker:
         self._is_there, self._has_ended = False, True
 
 
-def _copied(work: Callable[[Connection], None], theirs: Connection, ours: Connection) -> None:
+def _copied(work: Callable[..., None], theirs: Connection, ours: Connection) -> None:
     """A process that begins as a copy of the one that started it, whose ends of pipes and signals are not its own."""
     ours.close()  # so that the other's end is noticed
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what `end` sends
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
-    work(theirs)
+    serve(work, theirs)
 
 
 class WithWorker:
     """What has a process beside this one that does `work`, while it is entered."""
 
-    def __init__(self, work: Callable[[Connection], None]) -> None:
+    def __init__(self, work: Callable[..., None]) -> None:
         self._work = work
 
     def __enter__(self) -> Self:
@@ -121,6 +127,60 @@ class WithWorker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._worker.end()
+
+
+# --- the other end ---------------------------------------------------------------------------------------------
+
+
+def task(*parts: object) -> bytes:
+    """What a process is to be sent first: `work` is called with the parts, and torch has as many threads as here.
+
+    Not by multiprocessing's own pickling, which would move tensors to shared memory.
+    """
+    return pickle.dumps((torch.get_num_threads(), *parts))
+
+
+def serve(work: Callable[..., None], connection: Connection) -> None:
+    """A process: say that there is somebody, take the task, then work until the one that asks has gone."""
+    try:
+        connection.send_bytes(READY)
+        threads, *parts = pickle.loads(connection.recv_bytes())
+        torch.set_num_threads(threads)
+        work(connection, *parts)
+    except (EOFError, OSError):
+        return
+
+
+def questions(connection: Connection) -> Iterator[Any]:
+    """What is asked, one after the other. Raises EOFError, or OSError, when nobody asks any more."""
+    while True:
+        yield pickle.loads(connection.recv_bytes())
+
+
+def reply(connection: Connection, answer: object) -> None:
+    """Send an answer; raises OSError where nobody waits for it."""
+    connection.send_bytes(pickle.dumps(answer))
+
+
+def attempt(what: str, answer: Callable[..., object], *question: object) -> Any:
+    """The answer to a question, found in inference mode; an error is an answer too, for `outcome` to raise.
+
+    what: the process does, to be said of errors that are not torchslam's own, which say all by themselves
+    """
+    try:
+        with torch.inference_mode():
+            return answer(*question)
+    except Exception as error:
+        if not isinstance(error, TorchslamError):
+            error.add_note(f"in the process that {what}:\n{traceback.format_exc()}")
+        return error
+
+
+def outcome(answer: Any) -> Any:
+    """An answer where it is wanted. Raises what was raised on the other side."""
+    if isinstance(answer, BaseException):
+        raise answer
+    return answer
 
 
 @contextmanager
