@@ -8,6 +8,7 @@ from torchslam.features.pyramid import plan_atlas
 from torchslam.features.selection import (
     _falling,
     best_of_cells,
+    contend,
     plan_grid,
     ranks_within,
     spread,
@@ -94,3 +95,33 @@ def test_spread_gives_unused_budget_to_other_levels() -> None:
     image = torch.zeros(9, dtype=torch.int64)
     rows, _ = spread(scores, scores >= 0, cells, image, grid, 1, 10)
     assert len(rows) == 9
+
+
+@given(st.integers(0, 2**31), st.integers(1, 90), st.integers(1, 400), st.integers(1, 2), st.integers(1, 40))
+def test_whoever_contends_not_is_not_chosen(
+    seed: int, count: int, corners: int, batch: int, most: int
+) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    grid = plan_grid(plan_atlas(120, 160, 1.2, 4), count, 8, 19, 7, CPU)
+    num_cells = grid.levels.shape[0]
+    cells, images = (torch.randint(0, n, (corners,), generator=draw) for n in (num_cells, batch))
+    fast = torch.randint(8, 8 + most, (corners,), generator=draw).to(torch.uint8)
+    strengths = fast + torch.randint(0, 4, (corners,), generator=draw) / 8
+    strong = fast > 20
+    best = best_of_cells(images * num_cells + cells, fast, batch * num_cells)
+
+    offered = strong | best
+    fewer = best | (strong & contend(fast, offered, cells, images, grid, batch, count))
+    results = []
+    for rows in (offered.nonzero().squeeze(1), fewer.nonzero().squeeze(1)):
+        chosen, places = spread(*(x[rows] for x in (strengths, strong, cells, images)), grid, batch, count)
+        results.append((rows[chosen].tolist(), places.tolist()))
+    assert results[0] == results[1]
+
+
+def test_few_contend_where_many_are_equal() -> None:
+    grid = plan_grid(plan_atlas(480, 640, 1.2, 8), 500, 8, 19, 7, CPU)
+    cells = torch.randint(0, grid.levels.shape[0], (20_000,), generator=torch.Generator().manual_seed(0))
+    fast = (torch.arange(20_000) % 200 + 30).to(torch.uint8)
+    offered, images = fast > 0, torch.zeros(20_000, dtype=torch.int64)
+    assert 500 <= int(contend(fast, offered, cells, images, grid, 1, 500).sum()) < 1500

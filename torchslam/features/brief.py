@@ -14,7 +14,7 @@ from torchslam.features.pattern import PATTERN
 
 RADIUS = 15
 BLUR_RADIUS = 3
-PIECE = 1 << 17  # pixels blurred at once: their sums stay in the cache
+PIECE = 1 << 18  # pixels blurred at once: their sums stay in the cache
 ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 
 

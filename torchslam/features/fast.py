@@ -14,7 +14,7 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
-PIECE = 1 << 17  # pixels worked on at once: their intermediate results stay in the cache
+PIECE = 1 << 18  # pixels worked on at once: few calls, and the intermediate results stay in the cache
 
 Extremum = Callable[..., Tensor]
 Opposites = Callable[[Extremum, int, int], tuple[Tensor, Tensor]]

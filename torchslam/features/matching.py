@@ -24,6 +24,7 @@ _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in f
 _LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
+_PIECE = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
 _BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
 
 
@@ -136,8 +137,7 @@ def match_projected(
         turn = _take(features.angles.detach().flatten(), column) - _take(angles.detach().flatten(), row)
         row, column = _where(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
 
-    rows_1, rows_2 = _take(descriptors.flatten(0, 1), row), _take(features.descriptors.flatten(0, 1), column)
-    distances = _pair_distances(rows_1, rows_2)
+    distances = _pair_distances(descriptors.flatten(0, 1), row, features.descriptors.flatten(0, 1), column)
     best, accepted, distance = _best_of_pairs(row, column, distances, keypoint_scales, batch * rows, ratio)
     if max_distance is not None:
         accepted = accepted & (distance <= max_distance)
@@ -158,7 +158,7 @@ def match_pairs(
     Raises ValueError if the descriptors do not go together.
     """
     _check_descriptors(descriptors_1[None], descriptors_2[None])
-    distances = _pair_distances(_take(descriptors_1, rows), _take(descriptors_2, columns))
+    distances = _pair_distances(descriptors_1, rows, descriptors_2, columns)
     near = torch.nonzero(distances <= max_distance).squeeze(1)
     rows, columns, distances = _take(rows, near), _take(columns, near), _take(distances, near)
     column, found, _ = _best_of_pairs(rows, columns, distances, None, len(descriptors_1), None)
@@ -289,11 +289,13 @@ def _where(mask: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]
     return _take(first, rows), _take(second, rows)
 
 
-def _pair_distances(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """Distance row by row, float32 for bits, with gradients for floats."""
-    if descriptors_1.dtype == torch.uint8:
-        return hamming_pairs(descriptors_1, descriptors_2).float()
-    return 1 - (descriptors_1 * descriptors_2).sum(-1)
+def _pair_distances(descriptors_1: Tensor, rows: Tensor, descriptors_2: Tensor, columns: Tensor) -> Tensor:
+    """Distances of pairs (P,), (P,) of rows of (N1, D) and (N2, D): float32 for bits, with gradients for floats."""
+    if descriptors_1.dtype != torch.uint8:
+        return 1 - (_take(descriptors_1, rows) * _take(descriptors_2, columns)).sum(-1)
+    pieces = zip(rows.split(_PIECE), columns.split(_PIECE), strict=True)
+    distances = [hamming_pairs(_take(descriptors_1, r), _take(descriptors_2, c)).float() for r, c in pieces]
+    return distances[0] if len(distances) == 1 else torch.cat(distances)
 
 
 def _best_of_pairs(

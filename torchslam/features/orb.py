@@ -15,7 +15,7 @@ from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
 from torchslam.features.fast import fast_scores, find_peaks, patch_scores
 from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
-from torchslam.features.selection import Grid, best_of_cells, plan_grid, spread, true_indices
+from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread, true_indices
 from torchslam.values import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
@@ -158,9 +158,14 @@ class ORB(nn.Module):
         cell = grid.table.index_select(0, positions - image * area).to(torch.int64)
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
-        kept = (
-            (strong | best_of_cells(image * num_cells + cell, fast, batch * num_cells)).nonzero().squeeze(1)
-        )
+        best = best_of_cells(image * num_cells + cell, fast, batch * num_cells)
+        if self.ranking == "fast":  # the whole part of what they compete by
+            needed = best | (
+                strong & contend(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
+            )
+        else:
+            needed = best | strong
+        kept = needed.nonzero().squeeze(1)
         positions, image, cell, strong = (x.index_select(0, kept) for x in (positions, image, cell, strong))
         if self.ranking == "harris":
             patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)

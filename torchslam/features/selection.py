@@ -8,6 +8,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchslam.features.pyramid import Atlas
@@ -97,6 +98,28 @@ def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
     """Whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
     best = scores.new_zeros(num_cells).scatter_reduce(0, cells, scores, "amax")
     return scores == best.index_select(0, cells)
+
+
+def contend(
+    scores: Tensor, offered: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
+) -> Tensor:
+    """Which corners `spread` may choose beside the best of the cells: far fewer than there are, at no sort.
+
+    scores: (N,) uint8, whole parts of the scores to be; offered: (N,) bool, what is to be spread; others as there.
+    A level takes its budget and at most all that is left of others': who has as many stronger ones cannot be chosen.
+    Returns (N,) bool.
+    """
+    num_levels = grid.budgets.shape[0]
+    group = images * num_levels + grid.levels.index_select(0, cells)
+    values = group * 256 + scores
+    weights = offered.to(torch.float32)
+    histogram = torch.bincount(values, weights, minlength=num_images * num_levels * 256).view(
+        -1, num_levels, 256
+    )
+    from_top = histogram.flip(-1).cumsum(-1).flip(-1)  # how many have this score or a higher one
+    left = (count - torch.minimum(from_top[:, :, 0], grid.budgets).sum(1, keepdim=True)).clamp_min(0)
+    stronger = F.pad(from_top[:, :, 1:], (0, 1))
+    return (stronger < (grid.budgets + left)[:, :, None]).view(-1).index_select(0, values)
 
 
 def spread(

@@ -74,7 +74,8 @@ def merge(slam_map: Map, found: Tensor, there: Tensor) -> None:
             point = heir[point]
         return point
 
-    for pair in pairs.tolist():
+    often = zip(found.tolist(), there.tolist(), strict=True)  # a pair may be found in several keyframes
+    for pair in dict.fromkeys(often):
         one, other = (last_heir(point) for point in pair)
         if one != other:
             old, kept = (one, other) if observed[one] <= observed[other] else (other, one)

@@ -73,7 +73,7 @@ def match_along_epipolar_lines(
     row, column = match_pairs(
         descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
         there.features.descriptors.flatten(0, 1),
-        order[place] // 3,
+        (order // 3)[place],
         column,
         0.8 * max_distance,
     )
