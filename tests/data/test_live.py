@@ -147,6 +147,29 @@ def test_what_comes_after_the_last_frame_is_not_counted(clip: Path) -> None:
     assert sequence.dropped == dropped
 
 
+def test_nobody_watches_before_a_frame_is_asked_for(clip: Path) -> None:
+    capture = Played(clip)
+    others = threading.active_count()
+    sequence = LiveSequence("clip", capture, None)
+    assert threading.active_count() == others  # processes can be copies of this one
+    assert capture._frame == 1
+    time.sleep(live.STALE + 0.1)
+    late = sequence[0]  # not the frame that was seen when it was opened
+    assert numbers_of([late]) != [0]
+    assert sequence.dropped == 0
+    sequence.close()
+    assert capture.released.wait(1.0)
+
+
+def test_what_was_never_watched_is_let_go(clip: Path) -> None:
+    capture = Played(clip)
+    sequence = LiveSequence("clip", capture, None)
+    assert not capture.released.is_set()
+    sequence.close()
+    assert capture.released.is_set()
+    sequence.close()  # twice does no harm
+
+
 def test_capture_clock() -> None:
     clock = CaptureClock()
     assert clock.at(5.0, 1000.0) == 1000.0

@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -28,6 +29,8 @@ BACKLOG = 10
 """Frames that wait while one takes long, as one that is mapped does; the oldest goes when there are more."""
 STEADY = 1.0
 """Seconds by which a source's own clock may run off from ours before it is not believed."""
+STALE = 0.5
+"""Seconds after which the frame that was looked at when the source was opened is no beginning of a run."""
 
 
 class Capture(Protocol):
@@ -44,6 +47,9 @@ class Capture(Protocol):
 
 class LiveSequence(Sequence):
     """Frames as they come, by a thread that keeps the newest few; `image` waits for one that is newer than the last.
+
+    It watches from the first frame that is asked for: until then nothing is missed, and there is no thread, beside
+    which other processes could not be copies of this one.
 
     Frames are numbered as they are given, without gaps, whatever was dropped between them. Nobody knows how many there
     will be, so that there is no `len`; behind the last frame comes `EndOfSequence`. Timestamps are seconds since 1970
@@ -68,14 +74,13 @@ class LiveSequence(Sequence):
         self._dropped = self._replaced = 0
         self._limit: int | None = None
         self._given, self._time = 0, 0.0
-        self._thread = threading.Thread(target=self._watch, name=f"torchslam {name}", daemon=True)
-        self._thread.start()
-        with self._fresh:
-            self._fresh.wait_for(lambda: self._arrived or self._ended, patience)
-            first = self._arrived[0][1] if self._arrived else None
-        if first is None:
+        self._is_watched = False
+        self._thread = self._watch_until(lambda: bool(self._arrived))
+        self._thread.join(patience)
+        if not self._arrived:
             self.close()
             raise SequenceError(f"{name}: no frame came within {patience:g} s: is it there, and free?")
+        first = self._arrived[0][1]
         size = (first.shape[1], first.shape[0])
         super().__init__(
             name,
@@ -116,6 +121,8 @@ class LiveSequence(Sequence):
             raise FrameError(
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
             )
+        if not self._is_watched and not self._ended:
+            self._begin()
         with self._fresh:
             self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
             if not self._arrived:
@@ -147,24 +154,53 @@ class LiveSequence(Sequence):
     def close(self) -> None:
         """Stop watching and let the source go."""
         self._closing = True
+        if not self._thread.is_alive():
+            self._end()
 
-    def _watch(self) -> None:
-        """Keep the newest frames, until the source ends or is closed."""
-        try:
-            while not self._closing and self._capture.grab():
-                captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
-                decoded, frame = self._capture.retrieve()
-                if not decoded:
-                    continue
-                with self._fresh:
-                    self._replaced += len(self._arrived) == self._arrived.maxlen
-                    self._arrived.append((captured, frame))
-                    self._fresh.notify_all()
-        finally:
-            self._capture.release()
+    def _begin(self) -> None:
+        """Watch from now on, without what was seen long ago."""
+        self._is_watched = True
+        if time.time() - self._arrived[0][0] > STALE:
+            self._arrived.clear()
+        self._thread = self._watch_until(lambda: False)
+
+    def _watch_until(self, is_enough: Callable[[], bool]) -> threading.Thread:
+        """A thread that keeps the newest frames until that is enough, the source ends or it is closed."""
+
+        def watch() -> None:
+            ends = True
+            try:
+                while not self._closing and self._keep_next():
+                    if is_enough():
+                        ends = False
+                        return
+            finally:
+                if ends:
+                    self._end()
+
+        thread = threading.Thread(target=watch, name="torchslam live source", daemon=True)
+        thread.start()
+        return thread
+
+    def _keep_next(self) -> bool:
+        """Whether there was one more frame, or one that could not be decoded."""
+        if not self._capture.grab():
+            return False
+        captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
+        decoded, frame = self._capture.retrieve()
+        if decoded:
             with self._fresh:
-                self._ended = True
+                self._replaced += len(self._arrived) == self._arrived.maxlen
+                self._arrived.append((captured, frame))
                 self._fresh.notify_all()
+        return True
+
+    def _end(self) -> None:
+        with self._fresh:
+            if not self._ended:
+                self._capture.release()
+            self._ended = True
+            self._fresh.notify_all()
 
 
 class CaptureClock:

@@ -32,12 +32,14 @@ class Player:
         self.paths = [sequence.image_name(index) for index in range(len(sequence))]
         self.rate = rate
         self.start: float | None = None
+        self.began = 0.0  # seconds since 1970 of the first frame
         self.frame = -1
 
     def grab(self) -> bool:
         self.start = time.monotonic() if self.start is None else self.start
         self.frame += 1
         time.sleep(max(0.0, self.start + self.frame / self.rate - time.monotonic()))
+        self.began = self.began or time.time()
         return self.frame < len(self.paths)
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
@@ -62,13 +64,12 @@ def main() -> None:
     torch.set_num_threads(1)
     recording = open_sequence(DATA_DIR / options.name, limit=options.limit)
     slam = SLAM(recording.camera, load_config(options.config))
-    live = LiveSequence(options.name, Player(recording, options.rate), recording.camera)
+    player = Player(recording, options.rate)
+    live = LiveSequence(options.name, player, recording.camera)
     latencies: list[float] = []
-    times: list[float] = []
 
     def after_frame(result: StepResult) -> None:
         latencies.append(1e3 * (time.time() - result.timestamp))
-        times.append(result.timestamp)
 
     with helped(live, slam, options.processes) as frames:
         finished = run_sequence(slam, live, after_frame, frames=frames)
@@ -76,7 +77,7 @@ def main() -> None:
     print(
         f"{options.name} at {options.rate:g} Hz: {len(finished.results)} frames, {live.dropped} dropped "
         f"({live.dropped / len(recording):.1%}), latency {median:.0f} ms in the median, {p95:.0f} ms at 95 %, "
-        f"posed {len(finished.trajectory)}, ATE {ate(finished.trajectory, recording, times[0], options.rate):.4f} m"
+        f"posed {len(finished.trajectory)}, ATE {ate(finished.trajectory, recording, player.began, options.rate):.4f} m"
     )
 
 
