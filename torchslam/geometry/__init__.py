@@ -60,6 +60,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
+from torchslam.geometry.undistorted import Undistorted
 
 register()
 
@@ -72,6 +73,7 @@ __all__ = [
     "RelativePose",
     "Similarity",
     "Triangulation",
+    "Undistorted",
     "correct_matches",
     "decompose_essential",
     "decompose_homography",

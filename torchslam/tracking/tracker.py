@@ -12,6 +12,7 @@ from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     Noise,
+    Undistorted,
     estimate_absolute_pose,
     fits,
     innovation_covariances,
@@ -22,6 +23,7 @@ from torchslam.geometry import (
 from torchslam.geometry.robust import Kernel
 from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose, refine_pose
+from torchslam.solvers.frame_pose import FramePose, FrameProblem, RobustKernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, matcher_of
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
@@ -140,6 +142,7 @@ class Tracker:
             return None
         chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
         chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
+        undistorted = Undistorted.of(view.keypoints, self.camera)
         pose = estimate_absolute_pose(
             slam_map.positions_w[point_ids[chosen]][None],
             view.keypoints[keypoints[chosen]][None],
@@ -159,17 +162,19 @@ class Tracker:
             return None
         weights = weights_of(pairs, guided, len(view.mask))
         noise = noise if weights is None else noise.stated().weighed(weights)
-        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], noise)
+        refined, errors, inliers = self._refine(
+            slam_map, T_cw, ids, view.keypoints[at], undistorted[at], noise
+        )
         if int(inliers.sum()) < settings.min_inliers:
             return None
-        T_cw, seen = refined.T_cw[0], ids[inliers]
+        T_cw, seen = refined.T_cw, ids[inliers]
         tracked = Tracked(
             T_cw,
             seen,
             at[inliers],
             matches=len(ids),
-            covariance=refined.covariance[0],
-            depth=float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()),
+            covariance=refined.covariance(),
+            depth=float(refined.sighting.depths[inliers].median()),
             error=float(errors.median()),
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
@@ -196,26 +201,32 @@ class Tracker:
         return torch.cat([near.new_tensor([keyframe]), near])
 
     def _refine(
-        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise
-    ) -> tuple[RefinedPose, Tensor, Tensor]:
+        self,
+        slam_map: Map,
+        T_cw: Tensor,
+        ids: Tensor,
+        pixels: Tensor,
+        undistorted: Undistorted,
+        noise: Noise,
+    ) -> tuple[FramePose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
         By least squares on what is not far from agreeing with T_cw, old points alone if there are enough of them, then
         on all that agrees with that.
         """
-        points_w = slam_map.positions_w[ids]
-        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
-        mask = fits(errors, FAR * self.measurement.chi_square)
+        problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
+        sighting = problem.see(T_cw)
+        mask = fits(sighting.squared / noise.margin**2, FAR * self.measurement.chi_square)
         old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = times(noise.weights, voices(pixels, self.camera.size))
-        kernels: tuple[Kernel, ...] = ("cauchy", "huber")
+        weights = voices(pixels, self.camera.size)
+        kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
-            refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
-            T_cw = refined.T_cw[0]
-            errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
-            mask = self.agrees(slam_map, T_cw, ids, pixels, noise, errors)
+            refined = problem.minimize(sighting, weights * mask, kernel)
+            sighting = refined.sighting
+            errors = sighting.squared / noise.margin**2
+            mask = self.agrees(slam_map, refined.T_cw, ids, pixels, noise, errors)
             if int(mask.sum()) < 6:
                 break
         return refined, errors, mask
