@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchslam.geometry import Camera, Noise, Undistorted
+from torchslam.geometry import Camera, Noise, Undistorted, Undistortion
 
 CAMERAS = (
     Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480)),
@@ -47,3 +47,25 @@ def test_whitened_slopes_give_errors_in_units_of_the_noise(kind):
     white = (undistorted.whitened(noise) * error[:, None, None]).sum(0)
     off_px = (undistorted.slope * error[:, None, None]).sum(0).mT
     torch.testing.assert_close(white.square().sum(0), noise.squared(off_px) * noise.margin**2)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
+def test_the_table_is_right_to_a_hundredth_of_a_pixel_or_two(camera):
+    inside = torch.cat((pixels(2000), torch.tensor([[-0.5, -0.5], [639.5, 479.5], [0.0, 479.5]]).double()))
+    exact, quick = Undistorted.of(inside, camera), Undistortion(camera)(inside)
+    ones = torch.ones(len(inside), 1, dtype=torch.float64)
+    back = camera.project(torch.cat((quick.xy.mT, ones), 1))[0]
+    assert (back - inside).norm(dim=1).max() < (0.02 if camera.model == "fisheye" else 0.01)
+    torch.testing.assert_close(
+        quick.slope, exact.slope, rtol=0.01, atol=0.01 * float(exact.slope.abs().max())
+    )
+
+
+def test_beyond_the_distortion_the_table_has_its_edge():
+    camera = Camera.radial_tangential(300.0, 300.0, 320.0, 240.0, -0.4, 0.0, 0.0, 0.0, size=(640, 480))
+    corner = torch.tensor([[1.0, 1.0], [320.0, 240.0]]).double()
+    exact, quick = Undistorted.of(corner, camera), Undistortion(camera)(corner)
+    assert float(exact.xy[:, 0].norm()) == pytest.approx(
+        0.999 * float(camera.limit)
+    )  # it does not reach there
+    torch.testing.assert_close(quick.xy, exact.xy, atol=0.01, rtol=0)

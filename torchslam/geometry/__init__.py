@@ -52,6 +52,7 @@ from torchslam.geometry.lie import (
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
 from torchslam.geometry.similarity import Similarity, estimate_similarity
+from torchslam.geometry.start_pose import start_pose
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -60,7 +61,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
-from torchslam.geometry.undistorted import Undistorted
+from torchslam.geometry.undistorted import Undistorted, Undistortion
 
 register()
 
@@ -74,6 +75,7 @@ __all__ = [
     "Similarity",
     "Triangulation",
     "Undistorted",
+    "Undistortion",
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
@@ -109,6 +111,7 @@ __all__ = [
     "so3_exp",
     "so3_left_jacobian",
     "so3_log",
+    "start_pose",
     "squared_reprojection_errors",
     "transfer_errors",
     "transform",

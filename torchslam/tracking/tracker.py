@@ -13,11 +13,12 @@ from torchslam.geometry import (
     Camera,
     Noise,
     Undistorted,
-    estimate_absolute_pose,
+    Undistortion,
     fits,
     innovation_covariances,
     mahalanobis_squared,
     se3_inverse,
+    start_pose,
     transform,
 )
 from torchslam.geometry.robust import Kernel
@@ -49,6 +50,7 @@ class Tracker:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
+        self.undistorted = Undistortion(camera)
         self.matcher = matcher_of(config.matching, matcher)
         self.own = DescriptorMatcher(config.matching)  # for what is guided to a few pixels
         self.settings = config.tracking
@@ -142,18 +144,16 @@ class Tracker:
             return None
         chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
         chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
-        undistorted = Undistorted.of(view.keypoints, self.camera)
-        pose = estimate_absolute_pose(
-            slam_map.positions_w[point_ids[chosen]][None],
-            view.keypoints[keypoints[chosen]][None],
-            self.camera,
+        undistorted = self.undistorted(view.keypoints)
+        T_cw = start_pose(
+            slam_map.positions_w[point_ids[chosen]],
+            undistorted[keypoints[chosen]],
+            self.camera.size,
             threshold=settings.threshold_px,
             seed=self.seed,
-            through_distortion=False,
         )
-        if not bool(pose.success[0]):
+        if T_cw is None:
             return None
-        T_cw = pose.T_cw[0]
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self._project(slam_map, candidates, T_cw, view)
         guided = match_near(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
