@@ -1,4 +1,4 @@
-"""A pose to start a refinement from, for every frame of a run: `estimate_absolute_pose` in less than half of the calls."""
+"""A pose to start a refinement from, for every frame of a run: `estimate_absolute_pose` in half of the calls."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def start_pose(
 
 @dataclass(frozen=True)
 class _Search:
-    """What hypotheses are made of and asked for; points are relative to their mean, so that float32 is enough for scores.
+    """What hypotheses are made of and asked for; points are relative to their mean: float32 is enough for scores.
 
     points: (N, 3); rays: (N, 3) of unit length; homogeneous: (1, 4, N); xy: (1, N, 2); scale: (1, N, 1) thresholds per
     unit of xy

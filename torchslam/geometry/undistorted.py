@@ -58,8 +58,11 @@ class Undistorted:
 
 
 class Undistortion:
-    """Undistorts the keypoints of one camera, frame by frame, without iterations: from the nearest node of a table, made
-    when first asked for, and the slope there: to a hundredth of a pixel, two towards the edge of a fisheye."""
+    """Undistorts the keypoints of one camera, frame by frame, without iterations: from the nearest node of a table and
+    the slope there, to a hundredth of a pixel, two towards the edge of a fisheye.
+
+    The table is made when first asked for.
+    """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera

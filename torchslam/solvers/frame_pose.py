@@ -1,9 +1,9 @@
 """The pose of one frame against known points, for every frame of a run: `refine_pose` in a tenth of the operations.
 
 In undistorted coordinates a pose moves points alike whatever the camera is, and an error in them times the slope of the
-distortion at the keypoint is one in pixels, to first order: the distortion itself is left out of the iterations. What is
-six by six is computed on the host, where a number costs less than a call. There are no gradients: a run's graph is
-solved anew (`solvers.graph`).
+distortion at the keypoint is one in pixels, to first order: the iterations pass no distortion. What is far off is to be
+left out before. What is six by six is computed on the host, where a number costs less than a call. There are no
+gradients: a run's graph is solved anew (`solvers.graph`).
 """
 
 from __future__ import annotations

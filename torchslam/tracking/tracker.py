@@ -22,7 +22,6 @@ from torchslam.geometry import (
     transform,
 )
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.solvers.frame_pose import FramePose, FrameProblem, RobustKernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
