@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
-from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
+from torchslam.geometry import Noise, Undistorted, se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
 from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.spread import (
@@ -335,9 +335,10 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     coarse = torch.arange(len(seen)) % 2 == 1
     scales = torch.where(coarse, 4.0, 1.0).double()
     shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, Noise.of(scales, None))
+    noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
     assert agrees.all()
-    fitted = CAMERA.project(transform(refined.T_cw[0], here.map.positions_w[seen]))[0]
+    fitted = CAMERA.project(transform(refined.T_cw, here.map.positions_w[seen]))[0]
     assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
     wanted = ((fitted - shifted) ** 2).sum(-1) / scales**2
     torch.testing.assert_close(errors, wanted)
@@ -352,9 +353,10 @@ def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
     wrong = torch.arange(len(seen)) < len(seen) // 4
     for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
         shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, Noise.of(scales, None))
+        noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
         assert torch.equal(agrees, ~wrong)
-        torch.testing.assert_close(refined.T_cw[0], T_cw, atol=exact, rtol=0)
+        torch.testing.assert_close(refined.T_cw, T_cw, atol=exact, rtol=0)
 
 
 # --- the parts --------------------------------------------------------------------------------------------------

@@ -52,6 +52,7 @@ from torchslam.geometry.lie import (
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
 from torchslam.geometry.similarity import Similarity, estimate_similarity
+from torchslam.geometry.start_pose import start_pose
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -60,6 +61,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
+from torchslam.geometry.undistorted import Undistorted, Undistortion
 
 register()
 
@@ -72,6 +74,8 @@ __all__ = [
     "RelativePose",
     "Similarity",
     "Triangulation",
+    "Undistorted",
+    "Undistortion",
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
@@ -108,6 +112,7 @@ __all__ = [
     "so3_left_jacobian",
     "so3_log",
     "squared_reprojection_errors",
+    "start_pose",
     "transfer_errors",
     "transform",
     "triangulate",

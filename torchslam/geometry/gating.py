@@ -88,6 +88,11 @@ class Noise:
         )
 
     @property
+    def margin(self) -> float:
+        """Times `sigmas`: what tests take for granted, MARGIN where the noise is stated."""
+        return 1.0 if self.information.shape[-1] == 0 else MARGIN
+
+    @property
     def tolerance(self) -> Tensor:
         """(...) px, the standard deviation that tests take for granted: `sigmas`, with MARGIN where they are stated."""
         return self.sigmas if self.information.shape[-1] == 0 else MARGIN * self.sigmas

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchslam.config import MatchingConfig
 from torchslam.features import match
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, transform
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, Prior, matched, max_distance
 from torchslam.values import View
 from torchslam.world.map import Map
@@ -65,7 +65,7 @@ def look_at(
     points = slam_map.points
     positions_w = points["positions_w"][ids]
     pixels, valid = camera.project(transform(T_cw, positions_w))
-    rays_w = positions_w - se3_inverse(T_cw)[..., None, :3, 3]
+    rays_w = positions_w + (T_cw[..., :3, :3].mT @ T_cw[..., :3, 3:]).mT
     distance = torch.linalg.vector_norm(rays_w, dim=-1).clamp(min=1e-12)
     cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance
     least = math.cos(math.radians(max_view_angle_deg))

@@ -15,6 +15,7 @@ from torchslam.features import match, match_projected
 from torchslam.geometry import Camera
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
+from torchslam.tracking.near import match_within
 from torchslam.values import Frame, Matches, View
 
 
@@ -71,6 +72,9 @@ class DescriptorMatcher:
                 mutual=True,
                 max_distance=limit,
             )
+        if prior.radius_px is not None and view_2.descriptors.dtype == torch.uint8:
+            rows, columns = match_within(view_1, view_2, prior.radius_px, prior.ratio, limit)
+            return Matches(rows[None], columns[None], *_all_alike(rows))
         if prior.radius_px is not None:
             return match_projected(
                 view_1.descriptors[None],
@@ -85,7 +89,12 @@ class DescriptorMatcher:
         if prior.T_21 is None or prior.camera is None:
             raise ValueError("a prior needs radius_px, or T_21 and camera")
         rows, columns = match_free(view_1, view_2, prior.T_21, prior.camera, prior.epipolar_px, limit)
-        return Matches(rows[None], columns[None], torch.zeros_like(rows)[None].float(), rows[None] >= 0)
+        return Matches(rows[None], columns[None], *_all_alike(rows))
+
+
+def _all_alike(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances and mask of pairs (n,) that all match: nobody asks how well."""
+    return rows.new_zeros(1, len(rows), dtype=torch.float32), torch.ones_like(rows, dtype=torch.bool)[None]
 
 
 def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:

@@ -12,16 +12,18 @@ from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     Noise,
-    estimate_absolute_pose,
+    Undistorted,
+    Undistortion,
     fits,
     innovation_covariances,
     mahalanobis_squared,
     se3_inverse,
+    start_pose,
     transform,
 )
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.whitening import times
 from torchslam.solvers import RefinedPose, refine_pose
+from torchslam.solvers.frame_pose import FramePose, FrameProblem, RobustKernel
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, matcher_of
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
@@ -47,6 +49,7 @@ class Tracker:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
+        self.undistorted = Undistortion(camera)
         self.matcher = matcher_of(config.matching, matcher)
         self.own = DescriptorMatcher(config.matching)  # for what is guided to a few pixels
         self.settings = config.tracking
@@ -140,17 +143,16 @@ class Tracker:
             return None
         chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
         chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
-        pose = estimate_absolute_pose(
-            slam_map.positions_w[point_ids[chosen]][None],
-            view.keypoints[keypoints[chosen]][None],
-            self.camera,
+        undistorted = self.undistorted(view.keypoints)
+        T_cw = start_pose(
+            slam_map.positions_w[point_ids[chosen]],
+            undistorted[keypoints[chosen]],
+            self.camera.size,
             threshold=settings.threshold_px,
             seed=self.seed,
-            through_distortion=False,
         )
-        if not bool(pose.success[0]):
+        if T_cw is None:
             return None
-        T_cw = pose.T_cw[0]
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self._project(slam_map, candidates, T_cw, view)
         guided = match_near(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
@@ -159,17 +161,19 @@ class Tracker:
             return None
         weights = weights_of(pairs, guided, len(view.mask))
         noise = noise if weights is None else noise.stated().weighed(weights)
-        refined, errors, inliers = self._refine(slam_map, T_cw, ids, view.keypoints[at], noise)
+        refined, errors, inliers = self._refine(
+            slam_map, T_cw, ids, view.keypoints[at], undistorted[at], noise
+        )
         if int(inliers.sum()) < settings.min_inliers:
             return None
-        T_cw, seen = refined.T_cw[0], ids[inliers]
+        T_cw, seen = refined.T_cw, ids[inliers]
         tracked = Tracked(
             T_cw,
             seen,
             at[inliers],
             matches=len(ids),
-            covariance=refined.covariance[0],
-            depth=float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()),
+            covariance=refined.covariance(),
+            depth=float(refined.sighting.depths[inliers].median()),
             error=float(errors.median()),
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
@@ -196,26 +200,32 @@ class Tracker:
         return torch.cat([near.new_tensor([keyframe]), near])
 
     def _refine(
-        self, slam_map: Map, T_cw: Tensor, ids: Tensor, pixels: Tensor, noise: Noise
-    ) -> tuple[RefinedPose, Tensor, Tensor]:
+        self,
+        slam_map: Map,
+        T_cw: Tensor,
+        ids: Tensor,
+        pixels: Tensor,
+        undistorted: Undistorted,
+        noise: Noise,
+    ) -> tuple[FramePose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
         By least squares on what is not far from agreeing with T_cw, old points alone if there are enough of them, then
         on all that agrees with that.
         """
-        points_w = slam_map.positions_w[ids]
-        errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
-        mask = fits(errors, FAR * self.measurement.chi_square)
+        problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
+        sighting = problem.see(T_cw)
+        mask = fits(sighting.squared / noise.margin**2, FAR * self.measurement.chi_square)
         old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = times(noise.weights, voices(pixels, self.camera.size))
-        kernels: tuple[Kernel, ...] = ("cauchy", "huber")
+        weights = voices(pixels, self.camera.size)
+        kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
-            refined = refine_one(T_cw, points_w, pixels, self.camera, weights, mask, kernel)
-            T_cw = refined.T_cw[0]
-            errors = noise.squared_reprojection(transform(T_cw, points_w), pixels, self.camera)
-            mask = self.agrees(slam_map, T_cw, ids, pixels, noise, errors)
+            refined = problem.minimize(sighting, weights * mask, kernel)
+            sighting = refined.sighting
+            errors = sighting.squared / noise.margin**2
+            mask = self.agrees(slam_map, refined.T_cw, ids, pixels, noise, errors)
             if int(mask.sum()) < 6:
                 break
         return refined, errors, mask

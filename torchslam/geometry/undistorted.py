@@ -1,0 +1,105 @@
+"""Keypoints of one image in undistorted coordinates: what a pose is found from without passing the distortion again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.gating import Noise
+from torchslam.geometry.whitening import whitening
+
+_NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
+_LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some thousandths of one
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """Keypoints (N,) of a camera, undistorted once; coordinates come first in memory.
+
+    xy:    (2, N) undistorted image coordinates, x/z and y/z
+    slope: (2, 2, N) d pixel / d xy there: slope[j, i] is that of pixel coordinate i in xy[j]
+    """
+
+    xy: Tensor
+    slope: Tensor
+
+    @classmethod
+    def of(cls, pixels: Tensor, camera: Camera) -> Undistorted:
+        """Of pixels (N, 2) of one camera, exactly."""
+        xy = camera.normalize(pixels)
+        if camera.model == "pinhole":
+            slope = torch.diag(camera.params[:2])[..., None].expand(2, 2, len(pixels))
+        else:
+            _, _, J = camera.project_with_point_jacobians(torch.cat((xy, torch.ones_like(xy[:, :1])), dim=1))
+            slope = J[..., :2].permute(2, 1, 0)
+        return cls(xy.mT.contiguous(), slope.contiguous())
+
+    def __getitem__(self, rows: Tensor) -> Undistorted:
+        """Some of the keypoints, by index (n,)."""
+        return Undistorted(self.xy.index_select(1, rows), self.slope.index_select(2, rows))
+
+    @property
+    def pixel_scale(self) -> Tensor:
+        """(N,) pixels per unit of xy, the mean over all directions."""
+        (a, b), (c, d) = self.slope[0].unbind(0), self.slope[1].unbind(0)
+        return torch.addcmul(a * d, b, c, value=-1).abs_().sqrt_()
+
+    def whitened(self, noise: Noise) -> Tensor:
+        """(2, 2, N) slopes in units of the noise (N,) of the keypoints: times an error in xy, to first order, they are
+        an error of covariance one. Noise whose inverse covariance is not definite gives zero."""
+        if noise.information.shape[-1] < 3:
+            return self.slope / noise.sigmas
+        return torch.einsum("nki,jin->jkn", whitening(noise.weights), self.slope)
+
+
+class Undistortion:
+    """Undistorts the keypoints of one camera, frame by frame, without iterations: from the nearest node of a table and
+    the slope there, to a hundredth of a pixel, two towards the edge of a fisheye.
+
+    The table is made when first asked for.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+
+    def __call__(self, pixels: Tensor) -> Undistorted:
+        """Of pixels (N, 2)."""
+        if self.camera.model == "pinhole":
+            return Undistorted.of(pixels, self.camera)
+        last = self._size - 1
+        at = (pixels.mT / self._step).round_().clamp_(torch.zeros_like(last), last)
+        node = (at[1] * self._size[0] + at[0]).long()
+        xy, slope, inverse = (column.index_select(-1, node) for column in self._table)
+        off = torch.addcmul(pixels.mT, at, self._step, value=-1)
+        return Undistorted(xy + (inverse * off[:, None]).sum(0), slope)
+
+    @cached_property
+    def _step(self) -> Tensor:
+        """() pixels from node to node, along x and y."""
+        width, height = self.camera.size
+        return self.camera.params.new_tensor(max(_LEAST_STEP, math.sqrt(width * height / _NODES)))
+
+    @cached_property
+    def _size(self) -> Tensor:
+        """(2, 1) columns and rows of nodes."""
+        return (self.camera.params.new_tensor(self.camera.size)[:, None] / self._step).ceil() + 1
+
+    @cached_property
+    def _table(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the nodes, row by row: xy (2, n), slope (2, 2, n) and its inverse, d xy / d pixel, (2, 2, n)."""
+        columns, rows = (torch.arange(int(count), device=self._step.device) for count in self._size)
+        nodes = torch.cartesian_prod(rows, columns).flip(1) * self._step
+        exact = Undistorted.of(nodes, self.camera)
+        # slope[j, i] to inverse[i, j]
+        inverse, failed = torch.linalg.inv_ex(exact.slope.permute(2, 1, 0))
+        # Beyond the monotone part of the distortion all pixels get its edge.
+        ray = torch.cat((exact.xy, torch.ones_like(exact.xy[:1]))).mT
+        projected, valid = self.camera.project(ray)
+        is_within = valid & (failed == 0) & ((projected - nodes).abs().amax(1) < 0.1)
+        inverse = torch.where(is_within[:, None, None], inverse, 0.0)
+        return exact.xy, exact.slope, inverse.permute(2, 1, 0).contiguous()
