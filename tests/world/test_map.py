@@ -69,6 +69,12 @@ def test_covisibility(small_map: Map) -> None:
     assert small_map.points["times_observed"].tolist() == [2] * 6
 
 
+def test_who_sees_what(small_map: Map) -> None:
+    sees = small_map.sees(torch.tensor([2, 0]), torch.tensor([5, 0, 4, 3]))
+    assert sees.tolist() == [[True, False, True, False], [False, True, False, True]]
+    assert small_map.sees(torch.tensor([1]), torch.tensor([], dtype=torch.int64)).shape == (1, 0)
+
+
 def test_killed_points_are_observed_by_nobody_and_keep_their_ids(small_map: Map) -> None:
     small_map.kill(torch.tensor([0, 4]))
     assert small_map.num_points == 4

@@ -37,8 +37,10 @@ def find_in(
     features = slam_map.features(keyframes)
     T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
     pixels, scales, visible = look_at(slam_map, point_ids, T_cw, camera, angle, sizes)
-    observers, _ = slam_map.scales_of(point_ids)
-    visible &= (observers != keyframes[:, None, None]).all(-1)
+    visible &= ~slam_map.sees(keyframes, point_ids)
+    somewhere = torch.nonzero(visible.any(0))[:, 0]
+    point_ids = point_ids[somewhere]
+    pixels, scales, visible = (x.index_select(1, somewhere) for x in (pixels, scales, visible))
     matches = match_projected(
         points["descriptors"][point_ids].expand(len(keyframes), -1, -1),
         pixels,

@@ -261,6 +261,16 @@ class Map:
         near = [most(shared, count, MIN_SHARED) for shared in self.shared(keyframes)]
         return torch.unique(torch.cat([keyframes, *near]))
 
+    def sees(self, keyframes: Tensor, point_ids: Tensor) -> Tensor:
+        """(k, n) whether keyframes (k,) observe distinct points (n,)."""
+        column = torch.zeros(len(self.points) + 1, dtype=torch.int64, device=point_ids.device)
+        column[point_ids] = torch.arange(1, len(point_ids) + 1, device=point_ids.device)
+        seen = column[
+            self.keyframes["point_ids"][keyframes]
+        ]  # NO_POINT finds the last entry, which stays zero
+        found = torch.zeros(len(keyframes), len(point_ids) + 1, dtype=torch.bool, device=point_ids.device)
+        return found.scatter_(1, seen, True)[:, 1:]
+
     def points_seen_by(self, keyframes: Tensor) -> Tensor:
         """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""
         table = self.keyframes["point_ids"][keyframes].flatten()
