@@ -246,11 +246,12 @@ class Tracker:
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
         """
         chi_square, points = self.measurement.chi_square, slam_map.points
-        points_c = transform(T_cw, points["positions_w"][ids])
-        if self.measurement.gate == "chi_square":
-            if errors is None:
-                errors = noise.squared_reprojection(points_c, pixels, self.camera)
+        by_noise = self.measurement.gate == "chi_square"
+        if by_noise and errors is not None:
             return fits(errors, chi_square)
+        points_c = transform(T_cw, points["positions_w"][ids])
+        if by_noise:
+            return fits(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
         innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.spread)
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
