@@ -60,7 +60,7 @@ def test_commands_that_are_shown_could_be_run(page: Path) -> None:
 
 
 def test_wrong_ones_are_found() -> None:
-    text = "```sh\nPYTHONPATH=. torchslam run a.mp4 \\\n  --outptu b  # why\n```\n\n    torchslam eval a b > c\n"
+    text = "```sh\nPYTHONPATH=. torchslam run a.mp4 \\\n  --outptu b  # why\n```\n    torchslam eval a b > c"
     first, second = shown(text)
     assert "--outptu" in why_not(first)
     assert why_not(second) == ""

@@ -134,6 +134,7 @@ class Camera:
 
     def with_params(self, params: Tensor) -> Camera:
         """The same model and size with other parameters."""
+        # Not `replace`: compiled graphs of torch 2.5 do not take it.
         return Camera(self.model, params, self.size)
 
     def __getitem__(self, index: Any) -> Camera:

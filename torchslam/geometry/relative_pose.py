@@ -42,7 +42,8 @@ from torchslam.geometry.two_view import (
 )
 
 Model = Literal["auto", "essential"]
-_MODELS, _KERNELS = get_args(Model), get_args(Kernel)  # here: compiled graphs of older torch cannot look them up
+# Here, as compiled graphs of older torch cannot look them up.
+_MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 
 _KERNEL_WIDTH = (
     1.5  # deviations of the noise, which for keypoints has a long tail, at which the kernel begins
