@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -11,12 +12,21 @@ from torch import Tensor
 
 from tests.geometry.geometry_scenes import points_and_pixels, two_views
 from tests.solvers.conftest import camera_of
-from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, se3_exp
+from torchslam.geometry import Camera, RelativePose, estimate_absolute_pose, estimate_relative_pose, se3_exp
 from torchslam.geometry.essential import five_point
 from torchslam.geometry.p3p import p3p
 from torchslam.solvers import PosePrior, refine_pose
+from torchslam.solvers.levenberg import Convergence
 
 Case = tuple[Callable[..., tuple[Tensor, ...]], list[Tensor]]
+
+
+# Looked up here: a graph of the oldest torch cannot.
+CONVERGENCE, RELATIVE = ([each.name for each in fields(kind)] for kind in (Convergence, RelativePose))
+
+
+def columns(found: object, names: list[str]) -> tuple[Tensor, ...]:
+    return tuple([getattr(found, name) for name in names])
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -37,7 +47,7 @@ def refinement(camera_model: str = "pinhole", **options: Any) -> Case:
         prior = PosePrior(start.to(points), (information[:, :, None] * information[:, None]).sum(-1))
         given = start.to(points), points, pixels, camera.with_params(params), weights, mask
         refined = refine_pose(*given, scale=2.0, prior=prior, **options)
-        return refined.T_cw, refined.success, refined.cost, *vars(refined.convergence).values()
+        return refined.T_cw, refined.success, refined.cost, *columns(refined.convergence, CONVERGENCE)
 
     return refine, [points_w, pixels, camera.params, 0.5 + normal(1, 40).square(), normal(1, 6, 6)]
 
@@ -61,7 +71,7 @@ def relative(weighted: bool, **options: Any) -> Case:
         cameras = camera.with_params(params), camera.with_params(1.0 * params)
         given = {"weights": weights[0]} if weights else {}
         found = estimate_relative_pose(pixels_1, pixels_2, *cameras, **given, **options)
-        return tuple(value for value in vars(found).values())
+        return columns(found, RELATIVE)
 
     weights = [0.5 + normal(*views.pixels_1.shape[:2]).square()] if weighted else []
     return estimate, [views.pixels_1, views.pixels_2, camera.params.to(views.pixels_1), *weights]
@@ -117,7 +127,7 @@ def test_autocast_changes_no_bit_of_a_graph() -> None:
 
 def test_what_no_graph_can_do_is_said() -> None:
     function, inputs = refinement(backward="unroll")
-    with pytest.raises(Exception, match="can not be compiled"):
+    with pytest.raises(Exception, match=r"can not be compiled|Observed exception"):
         compiled(function)(*inputs)
     function, inputs = refinement()
     leaves = [x.clone().requires_grad_() for x in inputs]

@@ -90,7 +90,8 @@ def _commands() -> str:
     parts = [
         "# Command line",
         "Exit status: 0 done, 2 an error (one line on stderr says which), 3 no map could be initialised or no frame be "
-        "localised, 130 and 143 ended by Ctrl-C and by SIGTERM.",
+        "localised, 4 some sequences of a batch ended with an error, 130 and 143 ended by Ctrl-C and by SIGTERM. "
+        "`python -m torchslam` is the same command.",
     ]
     for name, (_, summary) in COMMANDS.items():
         command = build_parser(name)._subparsers._group_actions[0].choices[name]  # type: ignore[union-attr,index]

@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in missing(record, history):
         print(f"{name}: in the last report, not in this one")
     for name, is_same in same_bytes(record, history).items():
-        print(f"{name}: {'the same bytes' if is_same else 'another trajectory'} as last")
+        print(f"{name}: {'the same bytes as' if is_same else 'another trajectory than'} last")
     for words in worse:
         print(f"WORSE: {words}")
     return GOT_WORSE if worse and not options.accept else 0

@@ -189,19 +189,26 @@ def two_worlds():
     return (truth_1, truth_2), (one, two), join([one, two])
 
 
+def close(found, expected):
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+
+
 def test_worlds_are_solved_each_on_its_own():
     _, (one, two), both = two_worlds()
     assert both.worlds == [1, 4]
     solution, first, second = solve(both), solve(one), solve(two)
-    assert torch.equal(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
+    # Frames in between are refined in one batch: on some processors that moves their last digits.
+    close(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
+    keyframes = both.is_keyframe
+    assert torch.equal(solution.T_cw[keyframes], torch.cat([first.T_cw, second.T_cw])[keyframes])
     assert torch.equal(solution.points_w, torch.cat([first.points_w, second.points_w]))
     assert torch.equal(solution.success, torch.cat([first.success, second.success]))
     assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
     assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
     assert torch.equal(solution.world, both.world)
     for world, alone in ((4, first), (1, second)):
-        assert torch.equal(solution.trajectory_in(world).T_wc, alone.trajectory.T_wc)
-    assert torch.equal(solution.trajectory.T_wc, first.trajectory.T_wc)  # ten frames against seven
+        close(solution.trajectory_in(world).T_wc, alone.trajectory.T_wc)
+    close(solution.trajectory.T_wc, first.trajectory.T_wc)  # ten frames against seven
     assert torch.equal(solution.T_cw[0], both.T_cw[0])
     assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either
     assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)

@@ -6,7 +6,7 @@ Camera frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -134,7 +134,8 @@ class Camera:
 
     def with_params(self, params: Tensor) -> Camera:
         """The same model and size with other parameters."""
-        return replace(self, params=params)
+        # Not `replace`: compiled graphs of torch 2.5 do not take it.
+        return Camera(self.model, params, self.size)
 
     def __getitem__(self, index: Any) -> Camera:
         """Of many cameras (..., P) some, as indexing a tensor of their leading dimensions does."""
@@ -156,7 +157,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """The same camera on another device or in another dtype; arguments as of `Tensor.to`."""
-        return replace(self, params=self.params.to(*args, **kwargs))
+        return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
     def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of points in the camera frame.

@@ -42,6 +42,8 @@ from torchslam.geometry.two_view import (
 )
 
 Model = Literal["auto", "essential"]
+# Here, as compiled graphs of older torch cannot look them up.
+_MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 
 _KERNEL_WIDTH = (
     1.5  # deviations of the noise, which for keypoints has a long tail, at which the kernel begins
@@ -163,9 +165,9 @@ def _check(pixels_1: Tensor, pixels_2: Tensor, weights: Tensor | None, model: st
         raise ValueError(f"pixels_1 and pixels_2 must both be (B, N, 2), not {shapes}")
     if weights is not None and weights.shape != pixels_1.shape[:2]:
         raise ValueError(f"weights must be {tuple(pixels_1.shape[:2])}, not {tuple(weights.shape)}")
-    for name, value, known in (("model", model, Model), ("kernel", kernel, Kernel)):
-        if value not in get_args(known):
-            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(get_args(known))}")
+    for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
+        if value not in known:
+            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
 
 
 class _Effort(NamedTuple):

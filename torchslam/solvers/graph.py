@@ -79,7 +79,7 @@ class ObservationGraph:
     @property
     def worlds(self) -> list[int]:
         """The worlds that there are, ascending."""
-        return torch.unique(self.world).tolist()
+        return [int(world) for world in torch.unique(self.world)]  # `tolist` fails in transforms of torch 2.5
 
     def part(self, world: int) -> tuple[Tensor, Tensor, Tensor]:
         """Rows of the frames, the observations and the points of one world; points without observations have none."""

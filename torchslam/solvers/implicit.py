@@ -30,14 +30,15 @@ Backward = Literal["implicit", "unroll", "truncated", "detached"]
 "truncated": through one last Gauss-Newton step from the detached minimum; biased with a robust kernel
 "detached":  none
 """
+_BACKWARDS = get_args(Backward)  # looked up here: compiled graphs of older torch cannot
 
 Ndims = tuple[int, ...]
 
 
 def check_backward(backward: str) -> None:
     """Raises ValueError unless `backward` is one of the modes."""
-    if backward not in get_args(Backward):
-        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
+    if backward not in _BACKWARDS:
+        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(_BACKWARDS)}")
 
 
 class Minimization(Protocol):

@@ -130,9 +130,11 @@ function draw() {
 function resetView(pitch = 0.55) {
   const [low, high] = shown.world.box;
   const isWide = high[0] - low[0] > high[1] - low[1];
-  const narrow = Math.min(1, $("scene").clientWidth / $("scene").clientHeight);
-  const distance = (0.85 * shown.world.radius) / Math.tan(FIELD_OF_VIEW / 2) / narrow;
+  const { clientWidth: width, clientHeight: height } = $("scene");
+  const free = $("time").offsetTop || height; // what the strip of frames leaves
+  const distance = (0.85 * shown.world.radius * height) / Math.tan(FIELD_OF_VIEW / 2) / Math.min(free, width);
   eye.look({ yaw: isWide ? -1.2 : -0.4, pitch, distance, target: low.map((value, i) => (value + high[i]) / 2) });
+  eye.shift(0, (height - free) / 2);
 }
 
 function toggle(layer) {

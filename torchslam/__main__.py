@@ -1,0 +1,7 @@
+"""`python -m torchslam` is the command `torchslam`, also where the scripts of an environment are not on the path."""
+
+import sys
+
+from torchslam.cli import main
+
+sys.exit(main())
