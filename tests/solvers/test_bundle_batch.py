@@ -107,6 +107,7 @@ def test_an_open_gauge_keeps_what_it_keeps_alone(bundle_scene, fixed_frames):
         bundle_scene(frames=5, points=30, seed=seed, fixed_frames=fixed_frames).problem for seed in (0, 1)
     ]
     problems.append(bundle_scene(frames=5, points=30, seed=2, fixed_frames=(0, 1)).problem)
+    problems.append(bundle_scene(frames=7, points=30, seed=3, fixed_frames=fixed_frames).problem)
     assert_as_alone(batch_of(problems), problems)
 
 
