@@ -87,6 +87,11 @@ class Convergence:
     initial_cost: Tensor
     cost: Tensor
 
+    def of(self, row: int) -> Convergence:
+        """Of one element."""
+        one = slice(row, row + 1)
+        return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
+
 
 def minimize(
     problem: LeastSquares[X, M],
