@@ -271,7 +271,9 @@ class GridBundle:
     ) -> FactorizedGrid:
         layout = self.data.layout
         more = equations.reduced.shape[-1] - 6 * layout.free.shape[1]
-        return factorized_grid(equations, layout.free, layout.free_points, more, damping, self._gauge(estimate))
+        return factorized_grid(
+            equations, layout.free, layout.free_points, more, damping, self._gauge(estimate)
+        )
 
     def _gauge(self, estimate: GridEstimate) -> Tensor | None:
         """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None

@@ -159,7 +159,8 @@ def factorized_grid(
 ) -> FactorizedGrid:
     """Eliminate the points and factorise what is left, as `NormalEquations.factorized` does.
 
-    free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,); gauge: (B, 6 F, g)
+    free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,)
+    gauge: (B, 6 F, g)
     """
     root = _inverse_root(equations.points, free_points, damping)
     c0, c1, c2 = equations.coupling.unbind(2)
