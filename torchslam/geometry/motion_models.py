@@ -10,6 +10,7 @@ from torch import Tensor
 from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant
 from torchslam.geometry.two_view import (
+    TRANSFER_WIDTH,
     TwoViews,
     ahead_and_parallax,
     best_of,
@@ -33,6 +34,11 @@ _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
+_FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
+# How much larger the variance of the noise has to be under the simpler model: by so many deviations of Fisher's z
+# (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
+_CERTAIN, _NOTABLE = 2.33, 1.5
+_PARAMETERS = (5, 8, 3)  # of the three models
 
 
 @dataclass(frozen=True)
@@ -76,12 +82,16 @@ def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
     return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
 
 
-def choose(fits: Fits, mask: Tensor, chance: Tensor) -> Tensor:
-    """The index of the simplest model that no significant number of matches contradicts. (B,)"""
+def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> Tensor:
+    """The index of the simplest model that no significant number of matches contradicts. (B,)
+
+    by_noise: nor the noise that it leaves of all matches together
+    """
     essential, homography, rotation = fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
     # does not touch, show how large it is.
-    noise = noise_variance(essential, mask).clamp_min(1.0)[:, None]
+    variance = noise_variance(essential, mask)
+    noise = variance.clamp_min(1.0)[:, None]
     explained = (torch.minimum(essential, homography) < noise) & mask
 
     def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
@@ -90,9 +100,36 @@ def choose(fits: Fits, mask: Tensor, chance: Tensor) -> Tensor:
         accident = ~is_significant(against, off.sum(-1), 2, chance * noise[:, 0].sqrt(), 1)
         return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
 
-    plane = ~contradicted(homography, essential)
-    still = ~contradicted(rotation, essential)
+    off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
+    if by_noise:
+        off = off | _noisier(fits.squared, mask, variance)
+    plane, still = ~off
     return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL))
+
+
+def _noisier(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
+    """(2, B) whether homography and rotation need significantly more noise than the essential matrix does.
+
+    Little parallax is spread over all matches, none of which is clearly off: what counts is the ratio of the variances
+    per degree of freedom, over the matches on their epipolar lines. Its logarithm is close to a Gaussian (Fisher, "On a
+    distribution yielding the error functions of several well known statistics", 1924).
+
+    squared: (3, B, N) as of `Fits`; variance: (B,) of the noise by the essential matrix
+    """
+    near = mask & (squared[ESSENTIAL] < (2.0**2 * variance)[:, None])
+    count = near.sum(-1).to(variance.dtype)
+    k_E, k_H, k_R = _PARAMETERS
+    freedom = count - k_E
+    freedoms = 2 * count - variance.new_tensor((k_H, k_R))[:, None]
+    enough = freedom > 0
+    unit = (variance * count / freedom.where(enough, 1.0)).clamp_min(torch.finfo(variance.dtype).tiny)
+    # Transfer errors have two dimensions, and thresholds of their own.
+    far = (squared[1:] * (TRANSFER_WIDTH**2 / unit)[:, None]).clamp_max(_FARTHEST**2)
+    freedom, freedoms = freedom.clamp_min(1.0), freedoms.clamp_min(1.0)
+    ratio = torch.where(near, far, 0.0).sum(-1) / freedoms
+    z = 0.5 * ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
+    mean, deviation = 0.5 * (1 / freedom - 1 / freedoms), (0.5 * (1 / freedom + 1 / freedoms)).sqrt()
+    return enough & (ratio > _NOTABLE) & (z > mean + _CERTAIN * deviation)
 
 
 def pose_of(views: TwoViews, fits: Fits, model: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

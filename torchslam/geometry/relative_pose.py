@@ -239,7 +239,8 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     generator = torch.Generator().manual_seed(effort.seed)
     R, t, noise, near = _fit_motion(views, kernel, effort, generator)
     views = views.in_units(noise[:, None])
-    width = FINAL_WIDTH if kernel == "truncated" else NOISE_WIDTH
+    by_noise = kernel != "truncated"
+    width = NOISE_WIDTH if by_noise else FINAL_WIDTH
     if wanted == "essential":
         squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
         model, ambiguous = torch.zeros_like(mask[:, 0], dtype=torch.int64), torch.zeros_like(mask[:, 0])
@@ -247,17 +248,22 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         normal = torch.zeros_like(t)
     else:
         fits = fit_models(views, R, t, generator)
-        model = choose(fits, mask, chance * noise)
+        model = choose(fits, mask, chance * noise, by_noise)
         if bool((model != ESSENTIAL).any()):
             fits = fits.finished(views, width)
+            if by_noise:
+                # One that explains no more than accident does is the simplest of all, and hides what can be used.
+                of_model = fits.squared[model, torch.arange(B, device=mask.device)]
+                model = torch.where(
+                    _is_significant(views, of_model, noise, chance, by_noise), model, ESSENTIAL
+                )
         squared = fits.squared
         R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         R, t, normal, ambiguous = pose_of(views, fits, model)
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
-    significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, chance, 10)
-    significant = significant & is_spread(views.in_units(1 / noise[:, None]), inliers)
+    significant = _is_significant(views, chosen, noise, chance, by_noise)
     used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
     found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
@@ -273,6 +279,24 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
         torch.where(found, rigid(R_E, t_E), eye),
     )
+
+
+def _is_significant(
+    views: TwoViews, squared: Tensor, noise: Tensor, chance: Tensor, by_noise: bool
+) -> Tensor:
+    """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
+    what the noise explains, which often is much less. That both are tried, the test allows for.
+
+    views, squared: in units of the noise (B,), thresholds; squared (B, N) of one model
+    """
+    in_thresholds = views.in_units(1 / noise[:, None])
+    found = torch.zeros_like(noise, dtype=torch.bool)
+    for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
+        inliers = (squared < width.square()[:, None]) & views.mask
+        count, chances = inliers.sum(-1), chance * width * noise
+        counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
+        found = found | (counted & is_spread(in_thresholds, inliers))
+    return found
 
 
 def _fit_motion(
