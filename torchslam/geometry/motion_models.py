@@ -34,6 +34,9 @@ _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
+# A best sample of which so many matches are clearly off: no fit brings these below the share above. Among few matches
+# an essential matrix finds many by accident.
+_HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
 # How much larger the variance of the noise has to be under the simpler model: by so many deviations of Fisher's z
 # (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
@@ -63,17 +66,38 @@ class Fits:
         return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
 
 
-def fit_models(views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator) -> Fits:
-    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain."""
-    essential = sampson_squared(views, R[:, None], t[:, None])
+def fit_models(
+    views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator, by_noise: bool = False
+) -> Fits:
+    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain.
+
+    by_noise: samples that most matches contradict, as those of a scene with depth, are not worth a fit
+    """
+    essential = sampson_squared(views, R[:, None], t[:, None])[:, 0]
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
-    near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
+    near = replace(views, mask=views.mask & (essential < SUPPORT_WIDTH**2))
     R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
-    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
     H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
+    hopeless = torch.zeros_like(views.mask[:, 0])
+    rough = Fits(R, t, H[:, 0], R_only[:, 0], essential.expand(3, -1, -1))
+    if by_noise:
+        rough = rough.with_mappings(views)
+        noise = noise_variance(essential, views.mask).clamp_min(1.0)[:, None]
+        off = ((rough.squared[1:] > _CLEARLY_OFF**2 * noise) & near.mask).sum(-1)
+        count = near.mask.sum(-1)
+        hopeless = (off > _HOPELESS * count).all(0) & (count >= _MANY)
+        if bool(hopeless.all()):
+            return rough
+    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
     H = torch.cat((H, (R_only / R_only[:, 2:, 2:])[:, None]), dim=1)
     (H,), _ = best_of(*fit_homography(views, H, _TRIAL_ITERATIONS, FINAL_WIDTH))
-    return Fits(R, t, H, R_only, essential[:, 0].expand(3, -1, -1)).with_mappings(views)
+    fits = replace(rough, H=H, R_only=R_only).with_mappings(views)
+    if not bool(hopeless.any()):
+        return fits
+    # As alone, whoever else is in the batch.
+    row = hopeless[:, None, None]
+    H, R_only = torch.where(row, rough.H, fits.H), torch.where(row, rough.R_only, fits.R_only)
+    return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
 
 
 def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:

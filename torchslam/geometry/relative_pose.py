@@ -247,7 +247,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         R, t = R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         normal = torch.zeros_like(t)
     else:
-        fits = fit_models(views, R, t, generator)
+        fits = fit_models(views, R, t, generator, by_noise)
         model = choose(fits, mask, chance * noise, by_noise)
         if bool((model != ESSENTIAL).any()):
             fits = fits.finished(views, width)
@@ -259,7 +259,13 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
                 )
         squared = fits.squared
         R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
-        R, t, normal, ambiguous = pose_of(views, fits, model)
+        if by_noise and not bool((model != ESSENTIAL).any()):
+            R, t, normal, ambiguous = R_E, t_E, torch.zeros_like(t), torch.zeros_like(mask[:, 0])
+        else:
+            R, t, normal, ambiguous = pose_of(views, fits, model)
+            if by_noise:  # as alone, whoever else is in the batch
+                is_essential = (model == ESSENTIAL)[:, None]
+                R, t = torch.where(is_essential[..., None], R_E, R), torch.where(is_essential, t_E, t)
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
@@ -296,6 +302,8 @@ def _is_significant(
         count, chances = inliers.sum(-1), chance * width * noise
         counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
         found = found | (counted & is_spread(in_thresholds, inliers))
+        if bool(found.all()):
+            break
     return found
 
 
