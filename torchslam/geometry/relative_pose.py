@@ -250,13 +250,15 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         fits = fit_models(views, R, t, generator, by_noise)
         model = choose(fits, mask, chance * noise, by_noise)
         if bool((model != ESSENTIAL).any()):
-            fits = fits.finished(views, width)
+            rough, fits = fits.squared, fits.finished(views, width)
             if by_noise:
+                # As alone, whoever else is in the batch.
+                simple = (model != ESSENTIAL)[:, None]
+                fits = replace(fits, squared=torch.where(simple, fits.squared, rough))
                 # One that explains no more than accident does is the simplest of all, and hides what can be used.
                 of_model = fits.squared[model, torch.arange(B, device=mask.device)]
-                model = torch.where(
-                    _is_significant(views, of_model, noise, chance, by_noise), model, ESSENTIAL
-                )
+                certain = _is_significant(views, of_model, noise, chance, by_noise)
+                model = torch.where(certain, model, ESSENTIAL)
         squared = fits.squared
         R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         if by_noise and not bool((model != ESSENTIAL).any()):

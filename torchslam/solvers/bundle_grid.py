@@ -32,6 +32,7 @@ from torchslam.solvers.residuals import (
     flat_along,
     gauss_newton_expansion,
     linearize,
+    rounding_cost,
     variance_factor,
     weigh,
 )
@@ -77,6 +78,9 @@ class GridBundle:
     def start(self) -> GridEstimate:
         inputs = self.data.inputs
         return GridEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
+
+    def rounding(self) -> Tensor:
+        return rounding_cost(self.data.inputs.weights, self.data.inputs.params)
 
     def part(self, rows: Tensor) -> GridBundle:
         """The problems of some elements of the batch."""
