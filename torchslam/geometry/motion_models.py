@@ -42,6 +42,9 @@ _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so fa
 # (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
 _CERTAIN, _NOTABLE = 2.33, 1.5
 _PARAMETERS = (5, 8, 3)  # of the three models
+_EXACT = (
+    1 / 16
+)  # units of the noise, which only exact matches are far below: what is left of them is rounding
 
 
 @dataclass(frozen=True)
@@ -140,13 +143,14 @@ def _noisier(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
 
     squared: (3, B, N) as of `Fits`; variance: (B,) of the noise by the essential matrix
     """
-    near = mask & (squared[ESSENTIAL] < (2.0**2 * variance)[:, None])
+    variance = variance.clamp_min(_EXACT**2)
+    near = mask & (squared[ESSENTIAL] < (FINAL_WIDTH**2 * variance)[:, None])
     count = near.sum(-1).to(variance.dtype)
     k_E, k_H, k_R = _PARAMETERS
     freedom = count - k_E
     freedoms = 2 * count - variance.new_tensor((k_H, k_R))[:, None]
     enough = freedom > 0
-    unit = (variance * count / freedom.where(enough, 1.0)).clamp_min(torch.finfo(variance.dtype).tiny)
+    unit = variance * count.clamp_min(1.0) / freedom.where(enough, 1.0)
     # Transfer errors have two dimensions, and thresholds of their own.
     far = (squared[1:] * (TRANSFER_WIDTH**2 / unit)[:, None]).clamp_max(_FARTHEST**2)
     freedom, freedoms = freedom.clamp_min(1.0), freedoms.clamp_min(1.0)
@@ -195,6 +199,25 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
         smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy).square() + xy.square()).sqrt()
         spread = spread & (smaller > _LEAST_SPREAD**2)
     return spread
+
+
+def is_no_accident(views: TwoViews, squared: Tensor, noise: Tensor, chance: Tensor, by_noise: bool) -> Tensor:
+    """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
+    what the noise explains, which often is much less. That both are tried, the test allows for.
+
+    views, squared: in units of the noise (B,), thresholds; squared (B, N) of one model; chance: (B,) that a wrong match
+    is within the threshold
+    """
+    in_thresholds = views.in_units(1 / noise[:, None])
+    found = torch.zeros_like(noise, dtype=torch.bool)
+    for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
+        inliers = (squared < width.square()[:, None]) & views.mask
+        count, chances = inliers.sum(-1), chance * width * noise
+        counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
+        found = found | (counted & is_spread(in_thresholds, inliers))
+        if bool(found.all()):
+            break
+    return found
 
 
 def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,12 +26,12 @@ from torchslam.geometry.motion_models import (
     choose,
     fit_models,
     in_front,
-    is_spread,
+    is_no_accident,
     noise_variance,
     pose_of,
 )
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.ransac import is_significant, search
+from torchslam.geometry.ransac import search
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.geometry.two_view import (
     TwoViews,
@@ -105,8 +105,9 @@ def estimate_relative_pose(
     threshold: pixels, about the noise of one coordinate, or somewhat more, for matches of weight one
     mask:      (B, N), rows outside it, or with NaN, are ignored
     model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
-               that it explains contradict the simpler one, more of them than accident would bring; a pure rotation
-               or a plane with two valid motions give `success` False. "essential" asks no such thing
+               that it explains contradict the simpler one, more of them than accident would bring; or, but with the
+               kernel "truncated", all together by the noise that it leaves, or because what it explains is an accident.
+               A pure rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
                what contradicts a model, then go by the noise that the matches show, so that the threshold only has to
                tell wrong ones from right ones; in the search, matches behind a camera count as wrong. "truncated":
@@ -257,7 +258,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
                 fits = replace(fits, squared=torch.where(simple, fits.squared, rough))
                 # One that explains no more than accident does is the simplest of all, and hides what can be used.
                 of_model = fits.squared[model, torch.arange(B, device=mask.device)]
-                certain = _is_significant(views, of_model, noise, chance, by_noise)
+                certain = is_no_accident(views, of_model, noise, chance, by_noise)
                 model = torch.where(certain, model, ESSENTIAL)
         squared = fits.squared
         R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
@@ -271,7 +272,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
-    significant = _is_significant(views, chosen, noise, chance, by_noise)
+    significant = is_no_accident(views, chosen, noise, chance, by_noise)
     used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
     found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
@@ -287,26 +288,6 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
         torch.where(found, rigid(R_E, t_E), eye),
     )
-
-
-def _is_significant(
-    views: TwoViews, squared: Tensor, noise: Tensor, chance: Tensor, by_noise: bool
-) -> Tensor:
-    """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
-    what the noise explains, which often is much less. That both are tried, the test allows for.
-
-    views, squared: in units of the noise (B,), thresholds; squared (B, N) of one model
-    """
-    in_thresholds = views.in_units(1 / noise[:, None])
-    found = torch.zeros_like(noise, dtype=torch.bool)
-    for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
-        inliers = (squared < width.square()[:, None]) & views.mask
-        count, chances = inliers.sum(-1), chance * width * noise
-        counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
-        found = found | (counted & is_spread(in_thresholds, inliers))
-        if bool(found.all()):
-            break
-    return found
 
 
 def _fit_motion(

@@ -217,8 +217,8 @@ class ClipSLAM(nn.Module):
         seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
         worth = [torch.ones_like(each.scores) if self.weigh is None else self.weigh(each) for each in seen]
         graphs = tuple(
-            None if run is None else _as_seen(run, *one)
-            for run, *one in zip(graph.runs, seen, worth, cameras, strict=True)
+            None if run is None else _as_seen(run, each, worth_of, own)
+            for run, each, worth_of, own in zip(graph.runs, seen, worth, cameras, strict=True)
         )
         found = iter(solve_each([each for each in graphs if each is not None]))
         solutions = tuple(None if each is None else next(found) for each in graphs)

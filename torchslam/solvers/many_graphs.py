@@ -55,6 +55,7 @@ def solve_each(
         kind = (graph.camera.model, graph.camera.params.dtype, graph.camera.params.device, graph.weights.ndim)
         alike.setdefault(kind, []).append(row)
     solved: dict[int, GraphSolution] = {}
+    found: Sequence[GraphSolution]
     for rows in alike.values():
         if len(rows) == 1:
             found = (solve(graphs[rows[0]], kernel, scale, False, backward, iterations, tolerance),)
