@@ -116,6 +116,15 @@ rows = torch.ones(1, 20)
             {"descriptors": torch.zeros(1, 20, 32).int()},
             "descriptors must be uint8, bits, or floats, not torch.int32",
         ),
+        (
+            {"descriptors": torch.zeros(1, 20, 64, dtype=torch.uint8)},
+            r"descriptors of bits must be \(1, 20, 32\), 256 bits, not \(1, 20, 64\)",
+        ),
+        (
+            {"descriptors": torch.full((1, 20, 64), 0.5)},
+            r"descriptors of floats .* must have length one, .* not 4 to 4; .*normalize\(descriptors, dim=-1\)",
+        ),
+        ({"descriptors": torch.full((1, 20, 64), torch.nan)}, "descriptors .* must have length one"),
         ({"scales": 0 * rows}, "scales must be positive"),
         ({"scales": torch.nan * rows}, "scales must be finite"),
         (

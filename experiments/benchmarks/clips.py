@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -31,39 +31,60 @@ MOVE_PX = 0.5
 T = TypeVar("T")
 
 
-def measure(clip: Clip) -> Tensor:
-    """(4,) CPU milliseconds of the front end, of looking, and of a step forward and backward, medians; and (2,) how
-    many keyframes and observations there are."""
-    clip_slam = ClipSLAM(ORB(1000), weigh=lambda features: features.scores.clamp_min(1e-6).sqrt())
+class Looked(NamedTuple):
+    """A clip that was looked at, and what that and the front end cost in CPU milliseconds."""
+
+    clip: Clip
+    features: Features
+    graph: ClipGraph
+    extract_ms: float
+    look_ms: float
+
+
+def look(clip_slam: ClipSLAM, clip: Clip) -> Looked:
     with torch.no_grad():
-        features, extract = timed(lambda: clip_slam.extract(clip.images))
+        features, extract_ms = timed(lambda: clip_slam.extract(clip.images))
     assert isinstance(features, Features)
-    graph, look = timed(lambda: clip_slam.look(clip.images, clip.camera, features))
-    (run,) = graph.runs
-    if run is None:
-        return torch.full((6,), torch.nan)
-    generator = torch.Generator().manual_seed(0)
-    steps = torch.tensor([step(clip_slam, clip, graph, features, generator) for _ in range(STEPS)])
-    counts = [float(run.is_keyframe.sum()), float(len(run.pixels))]
-    return torch.tensor([extract, look, *steps.median(0).values.tolist(), *counts])
+    graph, look_ms = timed(lambda: clip_slam.look(clip.images, clip.camera, features))
+    return Looked(clip, features, graph, extract_ms, look_ms)
 
 
 def step(
-    clip_slam: ClipSLAM, clip: Clip, graph: ClipGraph, features: Features, generator: torch.Generator
+    clip_slam: ClipSLAM, looked: Sequence[Looked], together: bool, generator: torch.Generator
 ) -> tuple[float, float]:
-    """CPU milliseconds forward and backward, with gradients to keypoints, scores and camera."""
-    noise = MOVE_PX * torch.randn(features.keypoints.shape, generator=generator)
-    keypoints = (features.keypoints + noise).requires_grad_()
-    scores = features.scores.clone().requires_grad_()
-    camera = clip.camera.with_params(clip.camera.params.clone().requires_grad_())
-    moved = replace(features, keypoints=keypoints, scores=scores)
+    """CPU milliseconds per clip forward and backward, with gradients to keypoints, scores and cameras.
+
+    together: all in one call, or in one after the other
+    """
+    cameras = torch.stack([each.clip.camera.params for each in looked]).requires_grad_()
+    moved = []
+    for each in looked:
+        features, noise = each.features, torch.randn(each.features.keypoints.shape, generator=generator)
+        keypoints = (features.keypoints + MOVE_PX * noise).requires_grad_()
+        moved.append(replace(features, keypoints=keypoints, scores=features.scores.clone().requires_grad_()))
+    camera = looked[0].clip.camera.with_params(cameras)
+    truths = torch.stack([each.clip.T_cw for each in looked])
 
     def forward() -> Tensor:
-        return clip_loss(clip_slam.pose(graph, moved, camera), clip.T_cw, relative_ate, on_failure=1.0).loss
+        if together:
+            poses = clip_slam.pose(ClipGraph.stack([each.graph for each in looked]), moved, camera)
+            return clip_loss(poses, truths, relative_ate, on_failure=1.0).loss
+        losses = []
+        for row, each in enumerate(looked):
+            poses = clip_slam.pose(each.graph, moved[row], camera[row])
+            losses.append(clip_loss(poses, truths[row], relative_ate, on_failure=1.0).loss)
+        return torch.stack(losses).mean()
 
     loss, ahead = timed(forward)
     _, back = timed(loss.backward)
-    return ahead, back
+    return ahead / len(looked), back / len(looked)
+
+
+def medians(clip_slam: ClipSLAM, looked: Sequence[Looked], together: bool) -> list[float]:
+    """CPU milliseconds per clip forward and backward."""
+    generator = torch.Generator().manual_seed(0)
+    steps = [step(clip_slam, looked, together, generator) for _ in range(STEPS)]
+    return torch.tensor(steps).median(0).values.tolist()
 
 
 def timed(call: Callable[[], T]) -> tuple[T, float]:
@@ -80,29 +101,39 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
+    clip_slam = ClipSLAM(ORB(1000), weigh=lambda features: features.scores.clamp_min(1e-6).sqrt())
     for sequence in sequences(NAMES):
         clips = Clips([sequence], per_sequence=CLIPS)
-        found = torch.stack([measure(clips[number]) for number in range(len(clips))])
-        found = found[~found[:, 0].isnan()]
-        extract, look, ahead, back, keyframes, observations = found.median(0).values.tolist()
-        worst = float((found[:, 2] + found[:, 3]).max())
+        looked = [look(clip_slam, clips[number]) for number in range(len(clips))]
+        found = [each for each in looked if each.graph.runs[0] is not None]
+        runs = [each.graph.runs[0] for each in found]
+        counts = [[float(run.is_keyframe.sum()), float(len(run.pixels))] for run in runs if run is not None]
+        keyframes, observations = torch.tensor(counts).median(0).values.tolist()
+        before = [[each.extract_ms, each.look_ms] for each in found]
+        single = torch.tensor([medians(clip_slam, [each], together=False) for each in found])
+        ahead, back = single.median(0).values.tolist()
+        in_turn, at_once = (sum(medians(clip_slam, found, together)) for together in (False, True))
         size = "x".join(map(str, sequence.size))
         rows.append(
             [
                 f"{sequence.name}, {size}",
                 f"{len(found)} of {len(clips)}",
                 f"{keyframes:.0f}, {observations:.0f}",
-                *(f"{each:.0f}" for each in (extract, look, ahead, back, ahead + back, worst)),
+                *(f"{each:.0f}" for each in torch.tensor(before).median(0).values.tolist()),
+                *(f"{each:.0f}" for each in (ahead, back, ahead + back, float(single.sum(1).max()))),
+                f"{at_once:.0f}",
+                f"{in_turn / at_once:.1f}",
             ]
         )
         print(rows[-1], flush=True)
     header = ["sequence", "clips with a map", "keyframes, observations", "front end, ms", "look", "pose"]
-    header += ["backward", "step", "slowest step"]
+    header += ["backward", "step", "slowest step", "step, all clips in one call", "times faster"]
     text = (
         "# Training through clips\n\nClips of 8 frames, 1000 ORB keypoints each, moved by half a pixel before every "
         "step; gradients of the ATE to keypoints, weights and camera. Medians of the CPU time of one thread, in "
-        "milliseconds; a step is pose and backward, and needs neither the front end nor another look.\n\n"
-        f"    python -m experiments.benchmarks.clips\n\n{table(header, rows)}"
+        "milliseconds per clip; a step is pose and backward, and needs neither the front end nor another look. The "
+        "last columns pose all clips of a row in one call, each with a camera of its own, and compare with one after "
+        f"the other.\n\n    python -m experiments.benchmarks.clips\n\n{table(header, rows)}"
     )
     print(text)
     arguments.output.write_text(text, encoding="utf-8")

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torchslam.calibration import FoundCamera, refine
-from torchslam.calibration.keyframes import frames_of
-from torchslam.calibration.words import in_words
+from torchslam.calibration.keyframes import FOCAL, K1, adjust, frames_of, problem_of
+from torchslam.calibration.words import contradiction, in_words
 from torchslam.geometry import Camera
 from torchslam.solvers.graph import ObservationGraph
 
@@ -32,6 +32,22 @@ def test_exact_pixels_give_the_camera(simulated: Make, truth: Camera, factor: fl
     assert refined.num_radial == 2
     torch.testing.assert_close(refined.camera.params, truth.params, rtol=1e-3, atol=1e-5)
     assert refined.cost < 1e-3 * refined.cost_before
+
+
+def test_exact_pixels_leave_nothing_to_be_done(simulated: Make, truth: Camera) -> None:
+    """Started at the answer, where all that is left of the cost is rounding."""
+    problem = problem_of(simulated())
+    for which in ([], [FOCAL], [FOCAL, K1]):
+        fit = adjust(problem, which)
+        assert int(fit.convergence.iterations) <= 2
+        assert fit.convergence.converged
+        assert fit.success
+        torch.testing.assert_close(fit.camera.params, truth.params, rtol=1e-9, atol=1e-9)
+    noisy = adjust(problem_of(simulated(noise=1e-6)), [FOCAL])  # far below a pixel, far above rounding
+    assert int(noisy.convergence.iterations) > 2
+    assert float(noisy.cost) < 0.9 * float(noisy.convergence.initial_cost)
+    refined = refine(simulated())
+    assert contradiction(truth, refined) == ""
 
 
 def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make, truth: Camera) -> None:

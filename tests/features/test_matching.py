@@ -352,13 +352,32 @@ def test_numpy_reference_of_the_windows() -> None:
     )
 
 
-def test_descriptors_of_another_length_are_an_error():
+@pytest.mark.parametrize("wrong", [1.1, 0.5, torch.nan, torch.inf])
+def test_descriptors_of_another_length_are_an_error(wrong: float) -> None:
     generator = torch.Generator().manual_seed(0)
     descriptors = torch.nn.functional.normalize(torch.randn(1, 5, 8, generator=generator), dim=-1)
     ones = torch.ones(1, 5)
     features = Features(torch.zeros(1, 5, 2), ones, ones, 0 * ones, descriptors, ones > 0)
-    with pytest.raises(ValueError, match="unit length"):
-        match(features, replace(features, descriptors=1.1 * descriptors))
+    spoilt = descriptors.clone()
+    spoilt[0, 3] *= wrong
+    words = r"unit length.*normalize\(descriptors, dim=-1\)"
+    with pytest.raises(ValueError, match=words):
+        match(features, replace(features, descriptors=spoilt))
+    with pytest.raises(ValueError, match=words):
+        match_projected(spoilt, torch.zeros(1, 5, 2), 5.0, features)
+    with pytest.raises(ValueError, match=words):
+        match_pairs(descriptors[0], spoilt[0], torch.arange(5), torch.arange(5), 0.5)
+
+
+def test_descriptors_of_half_precision_and_of_no_keypoint_are_none() -> None:
+    generator = torch.Generator().manual_seed(0)
+    descriptors = torch.nn.functional.normalize(torch.randn(1, 5, 8, generator=generator), dim=-1)
+    descriptors = descriptors.bfloat16().float()
+    ones = torch.ones(1, 5)
+    mask = torch.tensor([[True, True, True, True, False]])
+    described = torch.where(mask[..., None], descriptors, 0.0)
+    features = Features(torch.zeros(1, 5, 2), ones, ones, 0 * ones, described, mask)
+    assert match(features, features, ratio=None, max_distance=0.5).mask.tolist() == mask.tolist()
 
 
 @pytest.mark.parametrize("floats", [None, 16])

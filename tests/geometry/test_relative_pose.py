@@ -122,11 +122,12 @@ def test_a_batch_holds_independent_problems() -> None:
     assert direction_error(result.T_21[:3, :3, 3], scene.T_21[:, :3, 3]) < 4
 
 
-def test_pure_noise_is_never_a_success() -> None:
+@pytest.mark.parametrize(("count", "threshold"), [(100, 1.0), (20, 4.0), (60, 4.0)])
+def test_pure_noise_is_never_a_success(count: int, threshold: float) -> None:
     generator = torch.Generator().manual_seed(0)
     size = torch.tensor((640.0, 480.0), dtype=torch.float64)
-    pixels = torch.rand(2, 8, 100, 2, generator=generator, dtype=torch.float64) * size
-    assert not estimate_relative_pose(*pixels, CAMERA, CAMERA, max_samples=500).success.any()
+    pixels = torch.rand(2, 8, count, 2, generator=generator, dtype=torch.float64) * size
+    assert not estimate_relative_pose(*pixels, CAMERA, CAMERA, threshold, max_samples=500).success.any()
 
 
 def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:

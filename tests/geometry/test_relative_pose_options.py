@@ -62,6 +62,55 @@ def test_planes_and_rotations_are_known_under_any_threshold(threshold: float) ->
         assert not rotation.success.any()
 
 
+def test_few_matches_do_not_hide_a_plane_or_a_rotation() -> None:
+    """Of few, an essential matrix fits many by accident: what it gains has to be more than that."""
+    for threshold in (0.5, 4.0):
+        for seed in range(3):
+            assert estimate(two_views(seed, plane=True, count=30), threshold).model == ("homography",)
+            rotation = estimate(two_views(seed, baseline=0.0, count=30), threshold)
+            assert rotation.model == ("rotation",)
+            assert not rotation.success.any()
+
+
+@pytest.mark.parametrize("threshold", [0.5, 2.0, 4.0])
+def test_parallax_that_no_match_shows_alone_counts(threshold: float) -> None:
+    """A pixel of noise, and one to two of parallax: hardly a match is clearly off, but all of them together are."""
+    off = []
+    for seed in range(4):
+        scene = two_views(seed, noise=1.0, baseline=0.06)
+        result = estimate(scene, threshold)
+        assert result.model == ("essential",)
+        assert result.success.all()
+        off.append(errors(result, scene)[1])
+    assert sorted(off)[2] < 12
+
+
+def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:
+    """A dozen matches of twenty within four pixels may be chance; within the hundredth that they show, they are not."""
+    for seed in range(3):
+        scene = two_views(seed, count=20, outliers=0.4, noise=0.02)
+        assert not estimate(scene, 4.0, kernel="truncated").success.any()
+        result = estimate(scene, 4.0)
+        assert result.success.all()
+        assert result.model == ("essential",)
+        assert max(errors(result, scene)) < 2
+
+
+def test_who_else_is_in_the_batch_does_not_matter() -> None:
+    """Beside a plane, whose homography is fitted, a scene with depth keeps its pose and its scores."""
+
+    def beside(other: Scene) -> RelativePose:
+        sides = [(two_views(0).pixels_1, other.pixels_1), (two_views(0).pixels_2, other.pixels_2)]
+        pixels = [torch.cat(side) for side in sides]
+        return estimate_relative_pose(*pixels, CAMERA, CAMERA, min_samples=512, max_samples=512)
+
+    plane, depth = beside(two_views(1, plane=True)), beside(two_views(3))
+    assert plane.model == ("essential", "homography")
+    assert depth.model == ("essential", "essential")
+    for name in ("T_21", "score_essential", "score_homography", "score_rotation"):
+        torch.testing.assert_close(getattr(plane, name)[0], getattr(depth, name)[0], rtol=1e-9, atol=1e-9)
+
+
 def test_the_essential_matrix_of_a_plane_has_its_pose() -> None:
     """Where the matches in front of the cameras leave one of the two motions that explain a plane."""
     off = []

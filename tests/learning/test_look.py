@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.learning.test_clip import CONFIG, FRAMES, BentEyes, clip_of, derivative
 from tests.walks import Walk, arc, still
-from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features
+from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
 from torchslam.evaluation import ate
 
 
@@ -93,7 +93,7 @@ def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
     params = torch.stack([camera_with(focal).params for focal in (400.0, 410.0)]).requires_grad_()
     poses = clip_slam(torch.stack([images, images]), walk.camera.with_params(params))
     alone = [clip_slam(images, camera_with(focal)) for focal in (400.0, 410.0)]
-    assert torch.equal(poses.T_cw, torch.stack([each.T_cw for each in alone]))
+    torch.testing.assert_close(poses.T_cw, torch.stack([each.T_cw for each in alone]), atol=1e-9, rtol=0)
     assert not torch.equal(poses.T_cw[0], poses.T_cw[1])
     ate(poses.T_cw, truth.expand(2, -1, -1, -1), poses.posed)[1].backward()
     assert params.grad is not None
@@ -110,7 +110,7 @@ def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
     features = clip_slam.extract(torch.stack([images, images]))
     poses = clip_slam.pose(ClipGraph.stack(graphs), features)
     one = clip_slam.pose(graphs[1], clip_slam.extract(images))
-    assert torch.equal(poses.T_cw[1], one.T_cw)
+    torch.testing.assert_close(poses.T_cw[1], one.T_cw, atol=1e-9, rtol=0)
     assert clip_slam.pose(ClipGraph.stack(graphs[:1]), features[:1]).T_cw.shape == (1, FRAMES, 4, 4)
     with pytest.raises(ValueError, match="one clip each"):
         ClipGraph.stack([ClipGraph.stack(graphs), graphs[0]])
@@ -146,3 +146,36 @@ def test_what_started_no_map_has_no_pose_later() -> None:
     poses = clip_slam.pose(graph, clip_slam.extract(images))
     assert (poses.reason, poses.T_cw.shape) == (("no map started",), (4, 4, 4))
     assert poses.T_cw.requires_grad
+
+
+def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
+    """Together they are what each is alone: cameras of two models, one clip without a map, one that is blind now."""
+    images, truth = clip_of(walk)
+    eyes, idle = BentEyes(walk, bend=0.0), BentEyes(Walk(still(FRAMES)), bend=0.0)
+    bent = Camera.radial_tangential(401.0, 402.0, 159.5, 119.5, 1e-3, 0.0, 0.0, 0.0, size=(320, 240))
+    looked = [
+        ClipSLAM(front_end).look(images, camera)
+        for front_end, camera in ((eyes, walk.camera), (idle, walk.camera), (eyes, bent), (eyes, walk.camera))
+    ]
+    clip_slam = ClipSLAM(eyes, weigh=lambda features: features.scores)
+    seen = eyes(images)
+    keypoints, scores = seen.keypoints.clone().requires_grad_(), torch.ones_like(seen.scores).requires_grad_()
+    good = replace(seen, keypoints=keypoints, scores=scores)
+    blind = replace(good, mask=torch.zeros_like(good.mask))
+    features = [good, good, good, blind]
+    together = clip_slam.pose(ClipGraph.stack(looked), features)
+    alone = [clip_slam.pose(*one) for one in zip(looked, features, strict=True)]
+    assert together.success.tolist() == [True, False, True, False]
+    assert together.reason == tuple(each.reason[0] for each in alone)
+    assert together.reason[1] == "no map started"
+    assert "not determined" in together.reason[3]
+    assert [graph is None for graph in together.graphs] == [False, True, False, False]
+    assert [solution is None for solution in together.solutions] == [False, True, False, False]
+    assert torch.equal(together.posed, torch.stack([each.posed for each in alone]))
+    T_cw = torch.stack([each.T_cw for each in alone])
+    torch.testing.assert_close(together.T_cw, T_cw, atol=1e-9, rtol=0)
+    losses = [clip_loss(together, truth.expand(4, -1, -1, -1), on_failure=2.0).loss]
+    losses.append(sum(clip_loss(each, truth, on_failure=2.0).loss for each in alone) / 4)
+    found, expected = (torch.autograd.grad(loss, (keypoints, scores), retain_graph=True) for loss in losses)
+    for gradient, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-7, atol=1e-9 * float(other.abs().max()))

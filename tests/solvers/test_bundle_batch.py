@@ -101,12 +101,26 @@ def test_a_batch_is_the_loop(bundle_scene, model, grids, monkeypatch):
     assert_as_alone(batch_of(problems), problems, "cauchy", 2.0)
 
 
+def test_exact_data_end_where_rounding_begins(bundle_scene, model):
+    """Alone and in a batch; steps after that would only shuffle it."""
+    problems = [bundle_scene(noise=0.0, frames=f, seed=f, model=model).problem for f in (4, 5)]
+    together = bundle_adjust(batch_of(problems), iterations=100, tolerance=0.0)
+    for row, problem in enumerate(problems):
+        alone = bundle_adjust(problem, iterations=100, tolerance=0.0)
+        assert alone.convergence.converged
+        assert together.convergence.converged[row]
+        assert max(int(alone.convergence.iterations), int(together.convergence.iterations[row])) < 20
+        assert float(alone.cost) < 1e-18
+        torch.testing.assert_close(together.T_cw[row, : len(problem.T_cw)], alone.T_cw, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("fixed_frames", [(0,), ()])
 def test_an_open_gauge_keeps_what_it_keeps_alone(bundle_scene, fixed_frames):
     problems = [
         bundle_scene(frames=5, points=30, seed=seed, fixed_frames=fixed_frames).problem for seed in (0, 1)
     ]
     problems.append(bundle_scene(frames=5, points=30, seed=2, fixed_frames=(0, 1)).problem)
+    problems.append(bundle_scene(frames=7, points=30, seed=3, fixed_frames=fixed_frames).problem)
     assert_as_alone(batch_of(problems), problems)
 
 

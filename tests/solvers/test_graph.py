@@ -128,6 +128,17 @@ def test_a_frame_that_sees_nothing_stays_and_is_flagged():
     assert pixels.grad.isfinite().all()
 
 
+def test_a_graph_without_observations_fails_without_an_error():
+    _, graph = simulated()
+    names = ("frame_index", "point_index", "pixels", "weights")
+    solution = solve(replace(graph, **{name: getattr(graph, name)[:0] for name in names}))
+    assert not solution.success.any()
+    assert torch.equal(solution.T_cw, graph.T_cw)
+    assert torch.equal(solution.points_w, graph.points_w)
+    (bundle,) = solution.keyframes
+    assert bundle.covariance().points.shape == (0, 3, 3)
+
+
 def test_keyframes_only_and_no_keyframe():
     _, graph = simulated()
     everyone = replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))
@@ -207,8 +218,9 @@ def test_worlds_are_solved_each_on_its_own():
     assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
     assert torch.equal(solution.world, both.world)
     for world, alone in ((4, first), (1, second)):
-        close(solution.trajectory_in(world).T_wc, alone.trajectory.T_wc)
-    close(solution.trajectory.T_wc, first.trajectory.T_wc)  # ten frames against seven
+        found = solution.trajectory_in(world).T_wc
+        torch.testing.assert_close(found, alone.trajectory.T_wc, atol=1e-12, rtol=0)
+    assert torch.equal(solution.trajectory.T_wc, solution.trajectory_in(4).T_wc)  # ten frames against seven
     assert torch.equal(solution.T_cw[0], both.T_cw[0])
     assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either
     assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import traceback
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +15,7 @@ from tests.walks import Walk, arc
 from torchslam import SLAM, Matches, Run, load_config
 from torchslam.errors import ConfigError
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, nearest_keypoints
-from torchslam.values import View
+from torchslam.values import State, View
 
 CONFIG = load_config(
     None,
@@ -57,6 +60,39 @@ def test_its_own_matcher_in_the_hook_gives_the_same_bytes() -> None:
     for table in ("points", "keyframes"):
         columns = getattr(one.map, table).columns()
         assert all(torch.equal(rows, getattr(other.map, table)[name]) for name, rows in columns.items())
+
+
+class Counting(Wrapped):
+    """Counts who asks, by the modules that a call comes through."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked_by: Counter[str] = Counter()
+
+    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+        modules = {Path(frame.filename).stem for frame in traceback.extract_stack()}
+        # Relocalisation asks through the tracker, which then is not tracking.
+        stages = ("initialization", "new_points", "relocalization", "tracker")
+        self.asked_by[next(stage for stage in stages if stage in modules)] += 1
+        return super().__call__(view_1, view_2, prior)
+
+
+def test_it_is_asked_in_all_four_stages() -> None:
+    """A walk, a look backwards that loses it, and the walk again."""
+    poses = arc(36)
+    behind = poses[18:20].clone()
+    behind[:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y
+    walk = Walk(torch.cat([poses[:18], behind, poses[12:22]]))
+    matcher, initialization = Counting(), replace(CONFIG.initialization, min_frames=8)
+    run = SLAM(walk.camera, replace(CONFIG, initialization=initialization), matcher=matcher).run(walk)
+    states = [result.state for result in run.results]
+    assert states[18:20] == [State.LOST, State.LOST]
+    assert states[-1] is State.TRACKING
+    assert len(run.worlds) == 1
+    asked = matcher.asked_by
+    assert set(asked) == {"initialization", "tracker", "new_points", "relocalization"}
+    assert asked["tracker"] >= 20  # near the prediction, in every frame that is followed
+    assert asked["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
 
 
 def test_a_matcher_that_wants_images_gets_those_of_keyframes_too() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -17,6 +19,18 @@ COLUMNS: dict[str, tuple[int, ...]] = {
     "mask": (),
 }
 """The shape of one keypoint's row."""
+BYTES = 32
+"""Of a descriptor of bits: matching and the memory of places count 256 of them."""
+
+LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
+NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"
+
+
+def are_comparable(descriptors: Tensor) -> Tensor:
+    """(..., N) bool, which rows of floats (..., N, D) the cosine compares: finite, of unit length, or zero as those of
+    no keypoint."""
+    lengths = torch.linalg.vector_norm(descriptors.detach().float(), dim=-1)
+    return ((lengths - 1).abs() <= LENGTH_TOLERANCE) | (lengths == 0)
 
 
 def check_features(found: object, images: Tensor, name: str) -> None:
@@ -42,6 +56,10 @@ def check_features(found: object, images: Tensor, name: str) -> None:
         refuse(f"descriptors must be {rows} + (D,), not {_described(described)}")
     if described.dtype != torch.uint8 and not described.is_floating_point():
         refuse(f"descriptors must be uint8, bits, or floats, not {described.dtype}")
+    if described.dtype == torch.uint8 and described.shape[-1] != BYTES:
+        refuse(f"descriptors of bits must be {(*rows, BYTES)}, {8 * BYTES} bits, not {_described(described)}")
+    if described.is_floating_point():
+        _check_lengths(described, refuse)
     for column in ("keypoints", "scales"):
         if not bool(getattr(found, column).isfinite().all()):
             refuse(f"{column} must be finite, also where mask is False")
@@ -51,8 +69,19 @@ def check_features(found: object, images: Tensor, name: str) -> None:
         _check_information(found.information, found.mask, rows, refuse)
 
 
-def _check_information(information: object, mask: Tensor, rows: tuple[int, int], refuse: object) -> None:
-    assert callable(refuse)
+def _check_lengths(descriptors: Tensor, refuse: Callable[[str], None]) -> None:
+    wrong = ~are_comparable(descriptors)
+    if bool(wrong.any()):
+        lengths = descriptors.detach().float().norm(dim=-1)[wrong]
+        refuse(
+            "descriptors of floats are compared by their cosine and must have length one, or zero where there is no "
+            f"keypoint, not {float(lengths.min()):.3g} to {float(lengths.max()):.3g}; {NORMALIZE}"
+        )
+
+
+def _check_information(
+    information: object, mask: Tensor, rows: tuple[int, int], refuse: Callable[[str], None]
+) -> None:
     shapes = (rows, (*rows, 2, 2))
     if not isinstance(information, Tensor) or tuple(information.shape) not in shapes:
         refuse(f"information must be {shapes[0]} or {shapes[1]}, not {_described(information)}")

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.features.contract import NORMALIZE, are_comparable
 from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
 
@@ -20,8 +21,6 @@ from torchslam.values import Features, Matches
 _AMPLITUDE = 64
 _INDEX_BITS = 13
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
-
-_LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _PIECE = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
@@ -377,6 +376,7 @@ def _check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
             f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"
         )
     for descriptors in (descriptors_1, descriptors_2) if descriptors_1.is_floating_point() else ():
-        lengths = torch.linalg.vector_norm(descriptors.detach(), dim=-1)
-        if bool(((lengths - 1).abs() > _LENGTH_TOLERANCE)[lengths > 0].any()):
-            raise ValueError("descriptors must have unit length, or be zero where there is no keypoint")
+        if not bool(are_comparable(descriptors).all()):
+            raise ValueError(
+                f"descriptors must be finite and have unit length, or be zero where there is no keypoint; {NORMALIZE}"
+            )

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant
 from torchslam.geometry.two_view import (
+    TRANSFER_WIDTH,
     TwoViews,
     ahead_and_parallax,
     best_of,
@@ -33,6 +34,17 @@ _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
+# A best sample of which so many matches are clearly off: no fit brings these below the share above. Among few matches
+# an essential matrix finds many by accident.
+_HOPELESS, _MANY = 0.25, 50
+_FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
+# How much larger the variance of the noise has to be under the simpler model: by so many deviations of Fisher's z
+# (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
+_CERTAIN, _NOTABLE = 2.33, 1.5
+_PARAMETERS = (5, 8, 3)  # of the three models
+_EXACT = (
+    1 / 16
+)  # units of the noise, which only exact matches are far below: what is left of them is rounding
 
 
 @dataclass(frozen=True)
@@ -57,17 +69,38 @@ class Fits:
         return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
 
 
-def fit_models(views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator) -> Fits:
-    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain."""
-    essential = sampson_squared(views, R[:, None], t[:, None])
+def fit_models(
+    views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator, by_noise: bool = False
+) -> Fits:
+    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain.
+
+    by_noise: samples that most matches contradict, as those of a scene with depth, are not worth a fit
+    """
+    essential = sampson_squared(views, R[:, None], t[:, None])[:, 0]
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
-    near = replace(views, mask=views.mask & (essential[:, 0] < SUPPORT_WIDTH**2))
+    near = replace(views, mask=views.mask & (essential < SUPPORT_WIDTH**2))
     R_only = propose_rotation(near, _ROTATION_SAMPLES, generator)
-    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
     H = propose_homography(near, _HOMOGRAPHY_SAMPLES, generator)
+    hopeless = torch.zeros_like(views.mask[:, 0])
+    rough = Fits(R, t, H[:, 0], R_only[:, 0], essential.expand(3, -1, -1))
+    if by_noise:
+        rough = rough.with_mappings(views)
+        noise = noise_variance(essential, views.mask).clamp_min(1.0)[:, None]
+        off = ((rough.squared[1:] > _CLEARLY_OFF**2 * noise) & near.mask).sum(-1)
+        count = near.mask.sum(-1)
+        hopeless = (off > _HOPELESS * count).all(0) & (count >= _MANY)
+        if bool(hopeless.all()):
+            return rough
+    (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
     H = torch.cat((H, (R_only / R_only[:, 2:, 2:])[:, None]), dim=1)
     (H,), _ = best_of(*fit_homography(views, H, _TRIAL_ITERATIONS, FINAL_WIDTH))
-    return Fits(R, t, H, R_only, essential[:, 0].expand(3, -1, -1)).with_mappings(views)
+    fits = replace(rough, H=H, R_only=R_only).with_mappings(views)
+    if not bool(hopeless.any()):
+        return fits
+    # As alone, whoever else is in the batch.
+    row = hopeless[:, None, None]
+    H, R_only = torch.where(row, rough.H, fits.H), torch.where(row, rough.R_only, fits.R_only)
+    return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
 
 
 def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
@@ -76,12 +109,16 @@ def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
     return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
 
 
-def choose(fits: Fits, mask: Tensor, chance: Tensor) -> Tensor:
-    """The index of the simplest model that no significant number of matches contradicts. (B,)"""
+def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> Tensor:
+    """The index of the simplest model that no significant number of matches contradicts. (B,)
+
+    by_noise: nor the noise that it leaves of all matches together
+    """
     essential, homography, rotation = fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
     # does not touch, show how large it is.
-    noise = noise_variance(essential, mask).clamp_min(1.0)[:, None]
+    variance = noise_variance(essential, mask)
+    noise = variance.clamp_min(1.0)[:, None]
     explained = (torch.minimum(essential, homography) < noise) & mask
 
     def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
@@ -90,9 +127,37 @@ def choose(fits: Fits, mask: Tensor, chance: Tensor) -> Tensor:
         accident = ~is_significant(against, off.sum(-1), 2, chance * noise[:, 0].sqrt(), 1)
         return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
 
-    plane = ~contradicted(homography, essential)
-    still = ~contradicted(rotation, essential)
+    off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
+    if by_noise:
+        off = off | _noisier(fits.squared, mask, variance)
+    plane, still = ~off
     return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL))
+
+
+def _noisier(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
+    """(2, B) whether homography and rotation need significantly more noise than the essential matrix does.
+
+    Little parallax is spread over all matches, none of which is clearly off: what counts is the ratio of the variances
+    per degree of freedom, over the matches on their epipolar lines. Its logarithm is close to a Gaussian (Fisher, "On a
+    distribution yielding the error functions of several well known statistics", 1924).
+
+    squared: (3, B, N) as of `Fits`; variance: (B,) of the noise by the essential matrix
+    """
+    variance = variance.clamp_min(_EXACT**2)
+    near = mask & (squared[ESSENTIAL] < (FINAL_WIDTH**2 * variance)[:, None])
+    count = near.sum(-1).to(variance.dtype)
+    k_E, k_H, k_R = _PARAMETERS
+    freedom = count - k_E
+    freedoms = 2 * count - variance.new_tensor((k_H, k_R))[:, None]
+    enough = freedom > 0
+    unit = variance * count.clamp_min(1.0) / freedom.where(enough, 1.0)
+    # Transfer errors have two dimensions, and thresholds of their own.
+    far = (squared[1:] * (TRANSFER_WIDTH**2 / unit)[:, None]).clamp_max(_FARTHEST**2)
+    freedom, freedoms = freedom.clamp_min(1.0), freedoms.clamp_min(1.0)
+    ratio = torch.where(near, far, 0.0).sum(-1) / freedoms
+    z = 0.5 * ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
+    mean, deviation = 0.5 * (1 / freedom - 1 / freedoms), (0.5 * (1 / freedom + 1 / freedoms)).sqrt()
+    return enough & (ratio > _NOTABLE) & (z > mean + _CERTAIN * deviation)
 
 
 def pose_of(views: TwoViews, fits: Fits, model: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -134,6 +199,25 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
         smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy).square() + xy.square()).sqrt()
         spread = spread & (smaller > _LEAST_SPREAD**2)
     return spread
+
+
+def is_no_accident(views: TwoViews, squared: Tensor, noise: Tensor, chance: Tensor, by_noise: bool) -> Tensor:
+    """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
+    what the noise explains, which often is much less. That both are tried, the test allows for.
+
+    views, squared: in units of the noise (B,), thresholds; squared (B, N) of one model; chance: (B,) that a wrong match
+    is within the threshold
+    """
+    in_thresholds = views.in_units(1 / noise[:, None])
+    found = torch.zeros_like(noise, dtype=torch.bool)
+    for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
+        inliers = (squared < width.square()[:, None]) & views.mask
+        count, chances = inliers.sum(-1), chance * width * noise
+        counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
+        found = found | (counted & is_spread(in_thresholds, inliers))
+        if bool(found.all()):
+            break
+    return found
 
 
 def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,12 +26,12 @@ from torchslam.geometry.motion_models import (
     choose,
     fit_models,
     in_front,
-    is_spread,
+    is_no_accident,
     noise_variance,
     pose_of,
 )
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.ransac import is_significant, search
+from torchslam.geometry.ransac import search
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.geometry.two_view import (
     TwoViews,
@@ -107,8 +107,9 @@ def estimate_relative_pose(
     threshold: pixels, about the noise of one coordinate, or somewhat more, for matches of weight one
     mask:      (B, N), rows outside it, or with NaN, are ignored
     model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
-               that it explains contradict the simpler one, more of them than accident would bring; a pure rotation
-               or a plane with two valid motions give `success` False. "essential" asks no such thing
+               that it explains contradict the simpler one, more of them than accident would bring; or, but with the
+               kernel "truncated", all together by the noise that it leaves, or because what it explains is an accident.
+               A pure rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
                what contradicts a model, then go by the noise that the matches show, so that the threshold only has to
                tell wrong ones from right ones; in the search, matches behind a camera count as wrong. "truncated":
@@ -241,25 +242,39 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     generator = torch.Generator().manual_seed(effort.seed)
     R, t, noise, near = _fit_motion(views, kernel, effort, generator)
     views = views.in_units(noise[:, None])
-    width = FINAL_WIDTH if kernel == "truncated" else NOISE_WIDTH
+    by_noise = kernel != "truncated"
+    width = NOISE_WIDTH if by_noise else FINAL_WIDTH
     if wanted == "essential":
         squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
         model, ambiguous = torch.zeros_like(mask[:, 0], dtype=torch.int64), torch.zeros_like(mask[:, 0])
         R, t = R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
         normal = torch.zeros_like(t)
     else:
-        fits = fit_models(views, R, t, generator)
-        model = choose(fits, mask, chance * noise)
+        fits = fit_models(views, R, t, generator, by_noise)
+        model = choose(fits, mask, chance * noise, by_noise)
         if bool((model != ESSENTIAL).any()):
-            fits = fits.finished(views, width)
+            rough, fits = fits.squared, fits.finished(views, width)
+            if by_noise:
+                # As alone, whoever else is in the batch.
+                simple = (model != ESSENTIAL)[:, None]
+                fits = replace(fits, squared=torch.where(simple, fits.squared, rough))
+                # One that explains no more than accident does is the simplest of all, and hides what can be used.
+                of_model = fits.squared[model, torch.arange(B, device=mask.device)]
+                certain = is_no_accident(views, of_model, noise, chance, by_noise)
+                model = torch.where(certain, model, ESSENTIAL)
         squared = fits.squared
         R_E, t_E = in_front(views, R, t, mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
-        R, t, normal, ambiguous = pose_of(views, fits, model)
+        if by_noise and not bool((model != ESSENTIAL).any()):
+            R, t, normal, ambiguous = R_E, t_E, torch.zeros_like(t), torch.zeros_like(mask[:, 0])
+        else:
+            R, t, normal, ambiguous = pose_of(views, fits, model)
+            if by_noise:  # as alone, whoever else is in the batch
+                is_essential = (model == ESSENTIAL)[:, None]
+                R, t = torch.where(is_essential[..., None], R_E, R), torch.where(is_essential, t_E, t)
     chosen = squared[model, torch.arange(B, device=mask.device)]
     in_thresholds = squared * noise[:, None].square()
     inliers = (chosen * noise[:, None].square() < 1) & mask
-    significant = is_significant(inliers.sum(-1), mask.sum(-1), 5, chance, 10)
-    significant = significant & is_spread(views.in_units(1 / noise[:, None]), inliers)
+    significant = is_no_accident(views, chosen, noise, chance, by_noise)
     used = torch.where((model == ESSENTIAL)[:, None], near, (chosen < width**2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
     found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)

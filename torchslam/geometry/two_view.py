@@ -37,6 +37,9 @@ _CANDIDATES = 4  # essential matrices of each round that are optimised
 _MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras
 _FEW_CANDIDATES = 2  # homographies and rotations
 _ITERATIONS = 4  # of their local optimisation
+TRANSFER_WIDTH = (
+    1.5  # thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one
+)
 
 
 @dataclass(frozen=True)
@@ -120,9 +123,11 @@ class TwoViews:
     def transfer_scale(self) -> Tensor:
         """(B, N) thresholds per unit of a difference H(x_1) - x_2, which has the noise of both images.
 
-        Two-dimensional errors get a threshold 1.5 times that of one-dimensional ones, which then is as probable.
+        Two-dimensional errors get a threshold of their own, see `TRANSFER_WIDTH`.
         """
-        return (self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()).rsqrt() / 1.5
+        return (
+            self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()
+        ).rsqrt() / TRANSFER_WIDTH
 
 
 def best_of(state: State, cost: Tensor) -> tuple[State, Tensor]:

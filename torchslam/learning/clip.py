@@ -17,11 +17,13 @@ from torch import Tensor, nn
 from torchslam.config import Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
+from torchslam.features.contract import check_features
 from torchslam.geometry import Camera, Noise
 from torchslam.geometry.whitening import times
 from torchslam.run import finish
 from torchslam.slam import SLAM
-from torchslam.solvers.graph import GraphSolution, solve
+from torchslam.solvers.graph import GraphSolution
+from torchslam.solvers.many_graphs import solve_each
 from torchslam.values import Features, Frame
 from torchslam.world.history import RunGraph
 
@@ -184,6 +186,8 @@ class ClipSLAM(nn.Module):
         """What the system makes of a clip or of several, without gradient: matches, keyframes, correspondences.
 
         images, camera: as in `forward`; features: what `extract` finds in them, if it was asked before
+
+        Raises ConfigError where these are not what a front end must return, see `features.contract`.
         """
         seen = _per_clip(self.extract(images) if features is None else features)
         clips, batched = (images, True) if images.ndim == 5 else (images[None], False)
@@ -209,47 +213,28 @@ class ClipSLAM(nn.Module):
             raise ValueError(
                 f"features of shapes {shapes} for {len(graph.runs)} clips of {graph.frames} frames"
             )
-        clips = [self._pose(*one) for one in zip(graph.runs, seen, cameras, strict=True)]
-        if not graph.batched:
-            return clips[0]
-        return ClipPoses(
-            torch.stack([clip.T_cw for clip in clips]),
-            torch.stack([clip.posed for clip in clips]),
-            torch.stack([clip.success for clip in clips]),
-            tuple(reason for clip in clips for reason in clip.reason),
-            tuple(graph for clip in clips for graph in clip.graphs),
-            tuple(solution for clip in clips for solution in clip.solutions),
+        cameras = tuple(camera.to(torch.float64) for camera in cameras)
+        seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
+        worth = [torch.ones_like(each.scores) if self.weigh is None else self.weigh(each) for each in seen]
+        graphs = tuple(
+            None if run is None else _as_seen(run, each, worth_of, own)
+            for run, each, worth_of, own in zip(graph.runs, seen, worth, cameras, strict=True)
         )
-
-    def _pose(self, seen: RunGraph | None, features: Features, camera: Camera) -> ClipPoses:
-        """The poses of one clip."""
-        camera = camera.to(torch.float64)
-        features = features.to(camera.params.device)
-        worth = torch.ones_like(features.scores) if self.weigh is None else self.weigh(features)
-        # Zero times all that poses depend on: where there is no pose, there is a gradient all the same.
-        nothing = features.keypoints.sum() + worth.sum() + camera.params.sum()
-        nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
-        frames = len(features.mask)
-        T_cw = torch.eye(4, dtype=torch.float64, device=nothing.device) + nothing.expand(frames, 1, 1)
-        posed = torch.zeros(frames, dtype=torch.bool, device=nothing.device)
-        if seen is None:
-            return ClipPoses(T_cw, posed, posed.any(), ("no map started",), (None,), (None,))
-        seen = _still_seen(seen, features.mask)
-        rows = (seen.frame_ids[seen.frame_index], seen.keypoint_index)
-        pixels, weights = features.keypoints[rows].double(), seen.weights
-        if features.information is not None:
-            weights = Noise.of(features.scales[rows], features.information[rows]).weights.double()
-        weights = times(weights, worth[rows])
-        graph = replace(seen, pixels=pixels, weights=weights, camera=camera)
-        solution = solve(graph)
-        T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
-        posed = posed.index_copy(0, graph.frame_ids, solution.success)
-        success = posed.sum() >= MIN_POSES
-        reason = "" if success else _reason(solution, posed)
-        return ClipPoses(T_cw, posed, success, (reason,), (graph,), (solution,))
+        found = iter(solve_each([each for each in graphs if each is not None]))
+        solutions = tuple(None if each is None else next(found) for each in graphs)
+        clips = [_posed(*one) for one in zip(graphs, solutions, seen, worth, cameras, strict=True)]
+        T_cw, posed = (torch.stack(each) for each in zip(*clips, strict=True))
+        success = posed.sum(-1) >= MIN_POSES
+        reasons = (
+            "" if good else _reason(*one)
+            for good, *one in zip(success.tolist(), solutions, posed, strict=True)
+        )
+        row = slice(None) if graph.batched else 0
+        return ClipPoses(T_cw[row], posed[row], success[row], tuple(reasons), graphs, solutions)
 
     def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
         """What the system makes of the features of one clip; None where no map starts."""
+        check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
         slam = SLAM(camera, self.config, self.extractor)
         frames = [
@@ -275,6 +260,37 @@ def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
     return tuple(camera[row] for row in range(clips))
 
 
+def _as_seen(run: RunGraph, features: Features, worth: Tensor, camera: Camera) -> RunGraph:
+    """The graph of a clip with the pixels and weights that its features have by now; worth (T, N) of the keypoints."""
+    run = _still_seen(run, features.mask)
+    rows = (run.frame_ids[run.frame_index], run.keypoint_index)
+    weights = run.weights
+    if features.information is not None:
+        weights = Noise.of(features.scales[rows], features.information[rows]).weights.double()
+    weights = times(weights, worth[rows])
+    return replace(run, pixels=features.keypoints[rows].double(), weights=weights, camera=camera)
+
+
+def _posed(
+    graph: RunGraph | None,
+    solution: GraphSolution | None,
+    features: Features,
+    worth: Tensor,
+    camera: Camera,
+) -> tuple[Tensor, Tensor]:
+    """The poses (T, 4, 4) of a clip, and which frames have one (T,)."""
+    # Zero times all that poses depend on: where there is no pose, there is a gradient all the same.
+    nothing = features.keypoints.sum() + worth.sum() + camera.params.sum()
+    nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
+    frames, device = len(features.mask), nothing.device
+    T_cw = torch.eye(4, dtype=torch.float64, device=device) + nothing.expand(frames, 1, 1)
+    posed = torch.zeros(frames, dtype=torch.bool, device=device)
+    if graph is None or solution is None:
+        return T_cw, posed
+    T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
+    return T_cw, posed.index_copy(0, graph.frame_ids, solution.success)
+
+
 def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
     """The graph without observations of keypoints that are none by mask (T, N)."""
     kept = mask[graph.frame_ids[graph.frame_index], graph.keypoint_index]
@@ -282,8 +298,10 @@ def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
     return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
 
 
-def _reason(solution: GraphSolution, posed: Tensor) -> str:
-    """Why a clip with a map failed."""
+def _reason(solution: GraphSolution | None, posed: Tensor) -> str:
+    """Why a clip failed."""
+    if solution is None:
+        return "no map started"
     if not any(bundle.success for bundle in solution.keyframes):
         return "its keyframes and points are not determined"
     return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"

@@ -68,6 +68,27 @@ class BundleSolution:
             marginals.frames[..., rows[0], :, :], marginals.points[..., rows[1], :, :], marginals.camera
         )
 
+    def element(self, row: int, num_frames: int, num_points: int) -> BundleSolution:
+        """One problem of a batch, without the frames and points that came after its own to fill it up."""
+        frames, points = slice(num_frames), slice(num_points)
+
+        def marginals() -> Marginals:
+            of_all = self._covariance
+            blocks = of_all.frames[row, frames], of_all.points[row, points], of_all.camera[row]
+            return Marginals(*blocks)
+
+        return BundleSolution(
+            self.T_cw[row, frames],
+            self.points_w[row, points],
+            self.camera[row],
+            self.cost[row],
+            self.success[row],
+            self.moved_frames[row, frames],
+            self.moved_points[row, points],
+            self.convergence.of(row),
+            marginals,
+        )
+
 
 @full_precision
 def bundle_adjust(

@@ -32,6 +32,7 @@ from torchslam.solvers.residuals import (
     flat_along,
     gauss_newton_expansion,
     linearize,
+    rounding_cost,
     variance_factor,
     weigh,
 )
@@ -77,6 +78,9 @@ class GridBundle:
     def start(self) -> GridEstimate:
         inputs = self.data.inputs
         return GridEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
+
+    def rounding(self) -> Tensor:
+        return rounding_cost(self.data.inputs.weights, self.data.inputs.params)
 
     def part(self, rows: Tensor) -> GridBundle:
         """The problems of some elements of the batch."""
@@ -271,7 +275,9 @@ class GridBundle:
     ) -> FactorizedGrid:
         layout = self.data.layout
         more = equations.reduced.shape[-1] - 6 * layout.free.shape[1]
-        return factorized_grid(equations, layout.free_points, more, damping, self._gauge(estimate))
+        return factorized_grid(
+            equations, layout.free, layout.free_points, more, damping, self._gauge(estimate)
+        )
 
     def _gauge(self, estimate: GridEstimate) -> Tensor | None:
         """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None

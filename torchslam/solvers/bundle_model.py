@@ -25,6 +25,7 @@ from torchslam.solvers.residuals import (
     exact_expansion_of_each,
     gauss_newton_expansion,
     linearize_each,
+    rounding_cost,
     variance_factor,
 )
 from torchslam.solvers.schur import (
@@ -95,6 +96,12 @@ class Bundle:
         has_prior = inputs.pose_prior is not None and len(layout.free_frames) > 0
         solvable = len(layout.observations) > 0 or has_prior
         self.solvable = torch.tensor([solvable], device=inputs.pixels.device)
+
+    def rounding(self) -> Tensor:
+        weights = self.inputs.weights
+        if self.observations.has_matrices:
+            weights = weights.diagonal(dim1=-2, dim2=-1)
+        return rounding_cost(weights[None], self.inputs.params[None])
 
     def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
         seen, terms = self._seen(estimate), self._priors(estimate)

@@ -157,7 +157,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
     is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
     seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, rows)
     counted = asked & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
-    wanted = torch.zeros_like(frame_index[:, :1]).expand(batch, num_frames)
+    wanted = frame_index.new_zeros(batch, num_frames)
     wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
     return Given(

@@ -221,10 +221,8 @@ def solve(
     bundles: list[BundleSolution] = []
     options = (kernel, scale, backward, iterations, tolerance)
     for world in worlds:
-        frames, rows, points = graph.part(world)
+        keyframes, points, problem = keyframes_of(graph, world)
         solved[points] += 1
-        keyframes = frames[graph.is_keyframe[frames]]
-        problem = _problem(graph, keyframes, rows, points)
         bundle = bundle_adjust(
             problem, kernel, scale, free_camera, backward, iterations, tolerance, progress=progress
         )
@@ -241,20 +239,25 @@ def solve(
     if not bundles:
         raise ValueError("the graph has no keyframe")
     camera = bundles[0].camera
-    T_cw, success = _between(graph, T_cw, points_w, camera, moved, success, *options)
+    T_cw, success = between(graph, T_cw, points_w, camera, moved, success, *options)
     return GraphSolution(
         graph.timestamps, T_cw, points_w, camera, success, moved, graph.world, tuple(bundles)
     )
 
 
-def _problem(graph: ObservationGraph, keyframes: Tensor, rows: Tensor, points: Tensor) -> BundleProblem:
-    """The keyframes (k,) of one world and its points (p,), of the observations of its frames, in rows (o,)."""
+def keyframes_of(graph: ObservationGraph, world: int) -> tuple[Tensor, Tensor, BundleProblem]:
+    """The keyframes (k,) of one world, its points (p,), and their bundle adjustment.
+
+    Raises ValueError where there is no keyframe.
+    """
+    frames, rows, points = graph.part(world)
+    keyframes = frames[graph.is_keyframe[frames]]
     if len(keyframes) == 0:
         raise ValueError("a world of the graph has no keyframe")
     slots = torch.full_like(graph.world, -1)
     slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
-    return BundleProblem(
+    problem = BundleProblem(
         graph.T_cw[keyframes],
         graph.points_w[points],
         slots[graph.frame_index[rows]],
@@ -264,9 +267,10 @@ def _problem(graph: ObservationGraph, keyframes: Tensor, rows: Tensor, points: T
         graph.weights[rows],
         fixed_frames=(0,),
     )
+    return keyframes, points, problem
 
 
-def _between(
+def between(
     graph: ObservationGraph,
     T_cw: Tensor,
     points_w: Tensor,
@@ -279,7 +283,10 @@ def _between(
     iterations: int,
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
-    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; and who succeeded."""
+    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; and who succeeded.
+
+    camera: of all frames, or with params (F, K) of each its own
+    """
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
@@ -293,7 +300,7 @@ def _between(
             graph.T_cw[frames],
             points_w[graph.point_index[seen]],
             graph.pixels[seen],
-            camera,
+            camera if camera.params.ndim == 1 else camera[frames],
             graph.weights[seen],
             mask,
             kernel,

@@ -151,6 +151,7 @@ class FactorizedGrid(NamedTuple):
 
 def factorized_grid(
     equations: GridEquations,
+    free: Tensor,
     free_points: Tensor,
     num_camera: int,
     damping: Tensor | None = None,
@@ -158,7 +159,8 @@ def factorized_grid(
 ) -> FactorizedGrid:
     """Eliminate the points and factorise what is left, as `NormalEquations.factorized` does.
 
-    free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,); gauge: (B, 6 F, g)
+    free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,)
+    gauge: (B, 6 F, g)
     """
     root = _inverse_root(equations.points, free_points, damping)
     c0, c1, c2 = equations.coupling.unbind(2)
@@ -178,10 +180,19 @@ def factorized_grid(
         reduced = reduced + torch.diag_embed(growth)
     reduced = torch.baddbmm(reduced, whitened, whitened.mT, alpha=-1)
     if gauge is not None:
-        c = gauge * reduced.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()[:, None, None]
+        c = gauge * _mean_of(reduced, free, num_camera).sqrt()[:, None, None]
         c = torch.nn.functional.pad(c, (0, 0, 0, num_camera))
         reduced = torch.baddbmm(reduced, c, c.mT)
     return FactorizedGrid(root, whitened, factorize(reduced, strict=damping is None))
+
+
+def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
+    """(B,) mean of the diagonal, without the rows that only fill up: each problem has the one that it has alone."""
+    diagonal = reduced.diagonal(dim1=-2, dim2=-1)
+    if free.all():
+        return diagonal.mean(-1)
+    rows = torch.nn.functional.pad(free.repeat_interleave(6, dim=1), (0, num_camera), value=True)
+    return torch.where(rows, diagonal, 0.0).sum(-1) / rows.sum(-1).clamp_min(1)
 
 
 def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:

@@ -73,6 +73,15 @@ class Divisible(Protocol):
         ...
 
 
+@runtime_checkable
+class Rounded(Protocol):
+    """A problem that knows how much of its costs is rounding: where no more is left, steps only shuffle it."""
+
+    def rounding(self) -> Tensor:
+        """(B,) the cost of exact data."""
+        ...
+
+
 @dataclass(frozen=True)
 class Convergence:
     """How a minimisation went, per element.
@@ -86,6 +95,11 @@ class Convergence:
     converged: Tensor
     initial_cost: Tensor
     cost: Tensor
+
+    def of(self, row: int) -> Convergence:
+        """Of one element."""
+        one = slice(row, row + 1)
+        return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
 
 
 def minimize(
@@ -102,11 +116,14 @@ def minimize(
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
-    initial_cost = initial = model.cost.detach()
+    initial_cost = model.cost.detach()
     # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
-    rounding = torch.finfo(initial.dtype).eps
+    rounding = torch.finfo(initial_cost.dtype).eps
     slack = 1 + 100 * rounding
-    damping = torch.full_like(initial, _INITIAL_DAMPING)
+    vanished = rounding**1.5 * initial_cost
+    if isinstance(problem, Rounded):
+        vanished = torch.maximum(vanished, problem.rounding())
+    damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
     rows, resting = torch.arange(len(active), device=active.device), []
     for iteration in range(iterations):
@@ -117,7 +134,7 @@ def minimize(
         trial = problem.evaluate(estimate, share < _NEAR)
         accept = active & (share < torch.inf) & (trial.cost <= slack * model.cost)
         steps = steps.index_add(0, rows, active.long())
-        active = active & (share > tolerance) & (model.cost.detach() > rounding**1.5 * initial)
+        active = active & (share > tolerance) & (model.cost.detach() > vanished)
         model = problem.select(accept, trial, model)
         damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():
@@ -126,7 +143,7 @@ def minimize(
             rest, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
             resting.append((rows[rest], taken(model, rest)))
             problem, model = problem.part(stay), taken(model, stay)
-            rows, active, damping, initial = taken((rows, active, damping, initial), stay)
+            rows, active, damping, vanished = taken((rows, active, damping, vanished), stay)
     converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
     if resting:
         where, models = zip(*resting, (rows, model), strict=True)

@@ -59,6 +59,21 @@ class Observations:
         return Observations(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
+# Projecting a point ends in so many roundings of a pixel's coordinates, with room to spare.
+_ROUNDINGS = 16.0
+
+
+def rounding_cost(weights: Tensor, params: Tensor) -> Tensor:
+    """(B,) what exact observations cost because numbers are rounded: below it there is nothing to be gained.
+
+    weights: (B, ...) inverse variances, or the diagonals of inverse covariances, zero where nothing counts
+    params:  (B, C, K) of the cameras: focal lengths and principal points are as large as what is added up to a pixel
+    """
+    pixels = params.detach()[..., :4].abs().amax((1, 2))
+    rounding = _ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
+    return 0.5 * weights.detach().flatten(1).sum(1) * rounding.square()
+
+
 class Linearization(NamedTuple):
     """Reprojection errors and their first derivatives.
 

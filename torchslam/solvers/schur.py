@@ -234,7 +234,8 @@ class FactorizedEquations:
             halves[tile.points] - (A @ solution[equations._rows(tile)]).view(-1, 3)
             for tile, A in zip(tiles, self.whitened, strict=True)
         ]
-        points = (self.points_root.mT @ torch.cat(remainders)[..., None]).squeeze(-1)
+        halves = torch.cat(remainders) if remainders else halves  # without points there are no tiles
+        points = (self.points_root.mT @ halves[..., None]).squeeze(-1)
         split = 6 * equations.structure.num_frames
         points = torch.where(self.reduced.definite, points, 0.0)
         return Tangent(solution[:split].view(-1, 6), points, solution[split:])
@@ -256,7 +257,8 @@ class FactorizedEquations:
         split = 6 * equations.structure.num_frames
         frames = inverse[:split, :split].unflatten(0, (-1, 6)).unflatten(-1, (-1, 6))
         frames = frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        return Marginals(frames, torch.cat(points), inverse[split:, split:])
+        blocks = torch.cat(points) if points else self.points_root
+        return Marginals(frames, blocks, inverse[split:, split:])
 
 
 class Marginals(NamedTuple):
