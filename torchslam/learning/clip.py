@@ -39,20 +39,23 @@ class ClipGraph:
     cameras: one per clip, float64
     frames:  T
     batched: whether this is of B clips, were it only one
+    reasons: one per clip: why no map started, empty where one did
     """
 
     runs: tuple[RunGraph | None, ...]
     cameras: tuple[Camera, ...]
     frames: int
-    batched: bool = False
+    batched: bool
+    reasons: tuple[str, ...]
 
     @staticmethod
     def stack(graphs: Sequence[ClipGraph]) -> ClipGraph:
         """One of B clips of several of one clip each, all with as many frames."""
         if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
             raise ValueError("graphs to stack must be of one clip each, and of equally many frames")
-        runs, cameras = zip(*((graph.runs[0], graph.cameras[0]) for graph in graphs), strict=True)
-        return ClipGraph(runs, cameras, graphs[0].frames, batched=True)
+        clips = ((graph.runs[0], graph.cameras[0], graph.reasons[0]) for graph in graphs)
+        runs, cameras, reasons = zip(*clips, strict=True)
+        return ClipGraph(runs, cameras, graphs[0].frames, True, reasons)
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,8 @@ class ClipSLAM(nn.Module):
         camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
         cameras = _cameras(camera, len(clips))
         looked = (self._look(*one) for one in zip(clips, seen, cameras, strict=True))
-        return ClipGraph(tuple(looked), cameras, clips.shape[1], batched)
+        runs, reasons = zip(*looked, strict=True)
+        return ClipGraph(runs, cameras, clips.shape[1], batched, reasons)
 
     def pose(
         self, graph: ClipGraph, features: Features | Sequence[Features], camera: Camera | None = None
@@ -227,13 +231,13 @@ class ClipSLAM(nn.Module):
         success = posed.sum(-1) >= MIN_POSES
         reasons = (
             "" if good else _reason(*one)
-            for good, *one in zip(success.tolist(), solutions, posed, strict=True)
+            for good, *one in zip(success.tolist(), graph.reasons, solutions, posed, strict=True)
         )
         row = slice(None) if graph.batched else 0
         return ClipPoses(T_cw[row], posed[row], success[row], tuple(reasons), graphs, solutions)
 
-    def _look(self, images: Tensor, features: Features, camera: Camera) -> RunGraph | None:
-        """What the system makes of the features of one clip; None where no map starts."""
+    def _look(self, images: Tensor, features: Features, camera: Camera) -> tuple[RunGraph | None, str]:
+        """What the system makes of the features of one clip; None where no map starts, and why."""
         check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
         slam = SLAM(camera, self.config, self.extractor)
@@ -242,7 +246,7 @@ class ClipSLAM(nn.Module):
             for index, image in enumerate(images)
         ]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
-        return None if run.main is None else run.main.history.graph(run.map, run.camera)
+        return None if run.main is None else run.main.history.graph(run.map, run.camera), run.failure
 
 
 def _per_clip(features: Features | Sequence[Features]) -> Sequence[Features]:
@@ -298,10 +302,10 @@ def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
     return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
 
 
-def _reason(solution: GraphSolution | None, posed: Tensor) -> str:
+def _reason(no_map: str, solution: GraphSolution | None, posed: Tensor) -> str:
     """Why a clip failed."""
     if solution is None:
-        return "no map started"
+        return no_map
     if not any(bundle.success for bundle in solution.keyframes):
         return "its keyframes and points are not determined"
     return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"
