@@ -45,8 +45,8 @@ def outcome_of(name: str, seed: int, weights: Path | None, file: Path) -> Outcom
         evaluate(run.trajectory, sequence.groundtruth).ate_m,
         len(run.trajectory),
         len(sequence),
-        found and found.nees,
-        found and found.ratio,
+        found.nees if found else None,
+        found.ratio if found else None,
     )
     file.write_text(json.dumps(asdict(outcome)))
     return outcome

@@ -67,8 +67,8 @@ def figures_of(example: Example, model: NoiseModel | None, file: Path, splits: i
     pairs = [apart(halves(informed, seed)) for seed in range(splits)]
     figures = Figures(
         float(position_error(example, solution)) if has_truth else None,
-        found and found.nees,
-        found and found.ratio,
+        found.nees if found else None,
+        found.ratio if found else None,
         [unit * distance for distance, _ in pairs],
         sum(nees for _, nees in pairs) / splits,
         None if model is None else float(negative_log_likelihood(model, residuals(example, informed))),

@@ -59,11 +59,11 @@ class Residuals:
     @classmethod
     def cat(cls, parts: Sequence[Residuals]) -> Residuals:
         """Of several runs, which count alike."""
-        columns = (
+        errors, values, directions = (
             torch.cat([getattr(part, name) for part in parts]) for name in ("errors", "values", "directions")
         )
         shares = torch.cat([part.shares / part.shares.sum() for part in parts]) / len(parts)
-        return cls(*columns, shares)
+        return cls(errors, values, directions, shares)
 
 
 def weighed(example: Example, model: NoiseModel) -> Example:
@@ -154,8 +154,8 @@ def fit_trajectories(model: NoiseModel, examples: Sequence[Example], settings: S
             solution = solve(informed.graph, scale=BEND, iterations=10, tolerance=1e-8)
             (position_error(example, solution).log() / len(now)).backward()
             # The next step starts where this one ended.
-            moved = {"T_cw": solution.T_cw.detach(), "points_w": solution.points_w.detach()}
-            now[row] = replace(example, graph=replace(example.graph, **moved))
+            graph = replace(example.graph, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())
+            now[row] = replace(example, graph=graph)
         optimizer.step()
     return found
 
@@ -168,8 +168,14 @@ def halves(example: Example, seed: int) -> list[Example]:
     for chosen in (first, ~first):
         rows = chosen[graph.point_index].nonzero().squeeze(-1)
         points, point_index = torch.unique(graph.point_index[rows], return_inverse=True)
-        columns = {name: getattr(graph, name)[rows] for name in ("frame_index", "pixels", "weights")}
-        part = replace(graph, points_w=graph.points_w[points], point_index=point_index, **columns)
+        part = replace(
+            graph,
+            points_w=graph.points_w[points],
+            point_index=point_index,
+            frame_index=graph.frame_index[rows],
+            pixels=graph.pixels[rows],
+            weights=graph.weights[rows],
+        )
         parts.append(
             replace(example, graph=part, values=example.values[rows], directions=example.directions[rows])
         )
