@@ -21,10 +21,12 @@ class NoiseModel(nn.Module):
     values (..., C) are standardised by the mean and the deviation of those trained on; then a line and a hidden layer.
     kind: "constant": one number for all; "isotropic": a number each; "directed": the power of the structure tensor
           besides, so that the information is larger along the gradient
+    level_of_image: what the information times scale squared is in the geometric mean of every image; zero: as it is
     """
 
     mean: Tensor
     deviation: Tensor
+    level_of_image: Tensor
 
     def __init__(self, kind: str = "directed", seed: int = 0) -> None:
         super().__init__()
@@ -38,6 +40,7 @@ class NoiseModel(nn.Module):
         self.bend = nn.Parameter(torch.zeros(HIDDEN, dtype=torch.float64))
         self.outer = nn.Parameter(torch.zeros(HIDDEN, dtype=torch.float64))
         self.power = nn.Parameter(torch.zeros((), dtype=torch.float64))
+        self.register_buffer("level_of_image", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(len(NAMES), dtype=torch.float64))
         self.register_buffer("deviation", torch.ones(len(NAMES), dtype=torch.float64))
 
@@ -55,12 +58,24 @@ class NoiseModel(nn.Module):
         )  # what was never seen is taken for the outermost
         return self.level + x @ self.line + torch.tanh(x @ self.inner + self.bend) @ self.outer
 
-    def forward(self, values: Tensor, directions: Tensor, scales_squared: Tensor) -> Tensor:
-        """Information px^-2 (...), or (..., 2, 2) if directed; directions (..., 2, 2), scales_squared (...) px^2."""
-        number = self.log_factor(values).exp() / scales_squared
+    def forward(self, values: Tensor, directions: Tensor, scales_squared: Tensor, images: Tensor) -> Tensor:
+        """Information px^-2 (n,), or (n, 2, 2) if directed, of keypoints (n,).
+
+        directions: (n, 2, 2); scales_squared: (n,) px^2; images: (n,) int64, in which image each is
+        """
+        logs = self.log_factor(values)
+        if self.level_of_image > 0:
+            logs = logs - means(logs, images)[images] + self.level_of_image.log()
+        number = logs.exp() / scales_squared
         if self.kind != "directed":
             return number
         return number[..., None, None] * powers(directions, self.power)
+
+
+def means(values: Tensor, groups: Tensor) -> Tensor:
+    """(G,) of the values (n,) of each group, zero where it is empty; groups: (n,) int64."""
+    sums = values.new_zeros(int(groups.max()) + 1).index_add(0, groups, values)
+    return sums / torch.bincount(groups).clamp_min(1)
 
 
 def powers(A: Tensor, exponent: Tensor) -> Tensor:
@@ -99,9 +114,13 @@ class Informed(nn.Module):
     @torch.no_grad()
     def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         features = self.orb(images, wanted)
-        squared = features.scales.double().square()
-        if self.model.kind == "constant":
-            return replace(features, information=(self.model.level.exp() / squared).to(images.dtype))
         cues = describe(self.orb, images, features)
-        information = self.model(cues.values.double(), cues.directions.double(), squared)
-        return replace(features, information=information.to(images.dtype))
+        squared, mask = features.scales.double().square(), features.mask
+        of = torch.arange(len(mask), device=mask.device)[:, None].expand_as(mask)
+        found = self.model(
+            cues.values[mask].double(), cues.directions[mask].double(), squared[mask], of[mask]
+        )
+        shape = (*mask.shape, *found.shape[1:])
+        information = torch.zeros(shape, dtype=images.dtype, device=mask.device)
+        information[mask] = found.to(images.dtype)
+        return replace(features, information=information)

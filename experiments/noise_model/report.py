@@ -10,23 +10,28 @@ from experiments.common import table
 from experiments.noise_model.runs import Outcome
 from experiments.noise_model.same_graph import Figures
 
-HAND, LEVEL, LIKELIHOOD, TRAJECTORY, OWN = (
+HAND, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN = (
     "hand-set",
     "level, fitted",
     "likelihood",
+    "shape",
     "trajectory",
     "its own trajectory",
 )
-RULES = (HAND, LEVEL, LIKELIHOOD, TRAJECTORY, OWN)
-"""hand-set: one noise per level, not stated; level, fitted: the same, stated, as large as is most likely; likelihood,
-trajectory: learned on the other sequences; its own trajectory: learned on the very run it is measured on, a bound."""
+RULES = (HAND, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN)
+"""hand-set: one noise per level, not stated; level, fitted: the same, stated, as large as is most likely; likelihood:
+learned on the other sequences; shape: the same, but every image has the level of the hand-set rule; trajectory: that,
+moved on by the trajectories of the other sequences; its own trajectory: by that of the very run it is measured on."""
 RENDERED = "synthetic:"
 STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5 % of Student's t, of one to nine degrees of freedom."""
 
-Cells = dict[str, dict[str, list[Figures]]]
-"""Of each sequence and rule, the figures of all seeds."""
-Runs = dict[str, dict[str, list[Outcome]]]
+WHOLE = 0.95
+"""Share of the frames posed without which an ATE is not compared: it is that of another, shorter path."""
+
+Cells = dict[str, dict[str, dict[int, Figures]]]
+"""Of each sequence, rule and seed."""
+Runs = dict[str, dict[str, dict[int, Outcome]]]
 
 
 def mean_log(numbers: Iterable[float]) -> float:
@@ -42,108 +47,100 @@ def geometric_mean(logs: Sequence[float]) -> str:
     return f"{math.exp(middle):.3f} ({math.exp(middle - reach):.3f} to {math.exp(middle + reach):.3f})"
 
 
-def real(logs: dict[str, float]) -> list[float]:
-    """Those of sequences that are not rendered."""
-    return [value for name, value in logs.items() if not name.startswith(RENDERED)]
+def overall(logs: dict[str, float]) -> str:
+    """Over the sequences that are not rendered, and how many these are."""
+    found = [value for name, value in logs.items() if not name.startswith(RENDERED)]
+    return f"{geometric_mean(found)} of {len(found)}" if found else ""
 
 
-def _known(figures: Iterable[float | None]) -> list[float]:
-    return [each for each in figures if each is not None]
+def _mean(figures: Iterable[float | None], form: str) -> str:
+    found = [each for each in figures if each is not None]
+    return f"{fmean(found):{form}}" if found else ""
 
 
 def graph_table(cells: Cells) -> str:
     """Two tables: what the error is made of, and what other weights do to the same observations."""
-    made_of = []
+    rows, without = [], {}
     for name, cell in cells.items():
-        (hand,), likelihood, level = cell[HAND], cell[LIKELIHOOD], cell[LEVEL]
-        gain = fmean(_known(each.loss for each in level)) - fmean(_known(each.loss for each in likelihood))
-        first, learned = hand, likelihood
-        row = [
-            _name(name),
-            "",
-            "",
-            "",
-            "",
-            f"{hand.nees_halves:.2f}",
-            f"{fmean(x.nees_halves for x in learned):.2f}",
-        ]
-        if first.ate_m is not None and first.nees is not None and first.noise_share is not None:
-            nees = fmean(_known(each.nees for each in learned))
-            row[1:5] = (
-                f"{1e3 * first.ate_m:.2f}",
-                f"{first.noise_share:.0%}",
-                f"{first.nees:.1f}",
-                f"{nees:.1f}",
-            )
-        made_of.append([*row, f"{gain:.3f}"])
-    header = ["sequence", "ATE (mm)", "of its square, noise", "NEES", "NEES, likelihood", "NEES of halves"]
-    header += ["of halves, likelihood", "likelihood gained per observation"]
-    return table(header, made_of) + "\n" + _ratios(cells)
+        hand, learned = cell[HAND].values(), cell[LIKELIHOOD].values()
+        share = next(iter(hand)).noise_share
+        if share is not None:
+            without[name] = 0.5 * math.log1p(-share)
+        rows.append(
+            [
+                _name(name),
+                _mean((1e3 * each.ate_m for each in hand if each.ate_m), ".2f"),
+                "" if share is None else f"{share:.1%}",
+                "" if share is None else f"{math.sqrt(1 - share):.3f}",
+                *(_mean((each.nees for each in part), ".1f") for part in (hand, learned)),
+                *(_mean((each.nees_halves for each in part), ".2f") for part in (hand, learned)),
+            ]
+        )
+    rows.append(["**all real ones**", "", "", overall(without), "", "", "", ""])
+    header = ["sequence", "ATE (mm)", "of its square, noise", "without it, ratio", "NEES", "NEES: likelihood"]
+    header += ["NEES of halves", "of halves: likelihood"]
+    return table(header, rows) + "\n" + _ratios(cells)
 
 
 def _ratios(cells: Cells) -> str:
     rules = [rule for rule in RULES if rule != HAND]
     ates: dict[str, dict[str, float]] = {rule: {} for rule in rules}
     aparts: dict[str, dict[str, float]] = {rule: {} for rule in rules}
-    rows = []
     for name, cell in cells.items():
-        (hand,) = cell[HAND]
+        hand = next(iter(cell[HAND].values()))
         for rule in rules:
-            pairs = [zip(each.apart, hand.apart, strict=True) for each in cell[rule]]
-            aparts[rule][name] = fmean(mean_log(one / other for one, other in pair) for pair in pairs)
-            if hand.ate_m is not None:
-                ates[rule][name] = mean_log(each / hand.ate_m for each in _known(x.ate_m for x in cell[rule]))
-        rows.append(
-            [
-                _name(name),
-                *(f"{math.exp(ates[rule][name]):.3f}" if name in ates[rule] else "" for rule in rules),
-                *(f"{math.exp(aparts[rule][name]):.3f}" for rule in rules),
-            ]
-        )
-    means = [geometric_mean(real(logs[rule])) for logs in (ates, aparts) for rule in rules]
-    header = ["sequence", *(f"ATE: {rule}" for rule in rules), *(f"halves: {rule}" for rule in rules)]
-    return table(header, [*rows, ["**all real ones**", *means]])
+            found = cell[rule].values()
+            if found:
+                logs = [
+                    mean_log(x / y for x, y in zip(each.apart, hand.apart, strict=True)) for each in found
+                ]
+                aparts[rule][name] = fmean(logs)
+            if found and hand.ate_m is not None:
+                ates[rule][name] = mean_log(each.ate_m / hand.ate_m for each in found if each.ate_m)
+    columns = [(label, logs[rule]) for label, logs in (("ATE", ates), ("halves", aparts)) for rule in rules]
+    columns = [
+        (f"{label}: {rule}", logs) for (label, logs), rule in zip(columns, [*rules, *rules], strict=True)
+    ]
+    rows = [[_name(name), *(_ratio(logs.get(name)) for _, logs in columns)] for name in cells]
+    rows.append(["**all real ones**", *(overall(logs) for _, logs in columns)])
+    return table(["sequence", *(label for label, _ in columns)], rows)
+
+
+def _ratio(log: float | None) -> str:
+    return "" if log is None else f"{math.exp(log):.3f}"
 
 
 def run_table(runs: Runs) -> str:
-    """Whole runs by each rule, and what their errors are of those by the hand-set rule."""
-    rules = list(next(iter(runs.values())))
-    logs: dict[str, dict[str, float]] = {rule: {} for rule in rules}
+    """Whole runs by each rule, and what their errors are of those by the hand-set rule with the same seeds."""
+    logs: dict[str, dict[str, float]] = {}
     rows = []
     for name, cell in runs.items():
-        for rule in rules:
-            logs[rule][name] = mean_log(each.ate_m for each in cell[rule]) - mean_log(
-                x.ate_m for x in cell[HAND]
-            )
-        rows.append(
-            [
-                _name(name),
-                str(len(cell[HAND])),
-                *(_errors(cell[rule]) for rule in rules),
-                *(f"{math.exp(logs[rule][name]):.3f}" for rule in rules if rule != HAND),
-                *(_posed(cell[rule]) for rule in rules),
-                *(_nees(cell[rule]) for rule in rules),
+        hand = cell[HAND]
+        for rule, found in cell.items():
+            if not found:
+                continue
+            common = [
+                seed for seed in found if seed in hand and is_whole(found[seed]) and is_whole(hand[seed])
             ]
-        )
-    means = [geometric_mean(real(logs[rule])) for rule in rules if rule != HAND]
-    header = ["sequence", "seeds", *(f"ATE (mm): {rule}" for rule in rules)]
-    header += [f"ratio: {rule}" for rule in rules if rule != HAND]
-    header += [f"posed: {rule}" for rule in rules] + [f"NEES: {rule}" for rule in rules]
-    empty = [""] * len(rules)
-    return table(header, [*rows, ["**all real ones**", "", *empty, *means, *empty, *empty]])
+            if common:
+                pairs = [found[seed].ate_m / hand[seed].ate_m for seed in common]
+                logs.setdefault(rule, {})[name] = mean_log(pairs)
+            rows.append(
+                [
+                    _name(name),
+                    rule,
+                    ", ".join(f"{1e3 * each.ate_m:.4g}" for each in found.values()),
+                    _ratio(logs[rule][name]) if common and rule != HAND else "",
+                    ", ".join(f"{each.posed}" for each in found.values()) + f" of {found[min(found)].frames}",
+                    _mean((each.nees for each in found.values()), ".1f"),
+                ]
+            )
+    rows += [["**all real ones**", rule, "", overall(logs[rule]), "", ""] for rule in logs if rule != HAND]
+    return table(["sequence", "rule", "ATE (mm) by seed", "ratio", "posed", "NEES"], rows)
 
 
-def _errors(outcomes: list[Outcome]) -> str:
-    return ", ".join(f"{1e3 * each.ate_m:.4g}" for each in outcomes)
-
-
-def _posed(outcomes: list[Outcome]) -> str:
-    return f"{fmean(each.posed / each.frames for each in outcomes):.1%}"
-
-
-def _nees(outcomes: list[Outcome]) -> str:
-    found = _known(each.nees for each in outcomes)
-    return f"{fmean(found):.1f}" if found else ""
+def is_whole(outcome: Outcome) -> bool:
+    return outcome.posed >= WHOLE * outcome.frames
 
 
 def _name(name: str) -> str:

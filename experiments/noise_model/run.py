@@ -17,21 +17,24 @@ from experiments.noise_model.report import (
     LIKELIHOOD,
     OWN,
     RULES,
+    SHAPE,
     TRAJECTORY,
     graph_table,
     run_table,
 )
 from experiments.noise_model.runs import Outcome, outcome_of
 from experiments.noise_model.same_graph import Figures, figures_of
-from experiments.noise_model.training import Settings, fit_likelihood, fit_trajectories
+from experiments.noise_model.training import Settings, at_level, fit_likelihood, fit_trajectories
 from torchslam import load_config
+from torchslam.geometry.gating import MARGIN
 
 HERE = Path(__file__).parent
 SEQUENCES = ("fr2_desk_20", "shelf_bin", "kitti07", "machine_hall", "drone", "redkitchen")
 ROOM = "synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3"
 """Rendered, with the truth and the camera exact; never trained on."""
 SEEDS = (0, 1, 2)
-RUN_RULES = (HAND, LEVEL, LIKELIHOOD, TRAJECTORY)
+RUN_RULES = (HAND, LIKELIHOOD, SHAPE, TRAJECTORY)
+KINDS = {LEVEL: "constant", LIKELIHOOD: "directed", SHAPE: "isotropic"}
 TAUGHT = ("fr2_desk_20", "shelf_bin", "kitti07", "machine_hall")
 """By whose trajectories models learn: the drone's keyframes have no true poses, and redkitchen's error is not the noise
 of its keypoints, see the table."""
@@ -66,22 +69,25 @@ class Experiment:
     def _fitted(self, rule: str, test: str, seed: int) -> NoiseModel:
         settings = Settings(seed=seed)
         seen = {name: self.example(name) for name in self.names if name != test}
-        if rule in (LEVEL, LIKELIHOOD):
-            return fit_likelihood(list(seen.values()), "constant" if rule == LEVEL else "directed", settings)
+        if rule in (LEVEL, LIKELIHOOD, SHAPE):
+            model = fit_likelihood(list(seen.values()), KINDS[rule], settings)
+            return at_level(model, MARGIN**2) if rule == SHAPE else model
         taught = [self.example(test)] if rule == OWN else [seen[name] for name in TAUGHT if name in seen]
-        return fit_trajectories(load(self.model(LIKELIHOOD, test, seed)), taught, settings)
+        return fit_trajectories(load(self.model(SHAPE, test, seed)), taught, settings)
 
     def outcome(self, rule: str, name: str, seed: int) -> Outcome:
         """Of a whole run; seed: of the run and of the training."""
         weights = None if rule == HAND else self.model(rule, name, seed).absolute()
-        file = self.output / "outcomes" / f"{short(name)}_{short(rule)}_{seed}.json"
-        return outcome_of(name, seed, weights, file)
+        return outcome_of(name, seed, weights, self.place("outcomes", rule, name, seed))
 
     def figures(self, rule: str, name: str, seed: int) -> Figures:
         """Of the graph of the run by the hand-set rule, solved anew."""
         model = None if rule == HAND else load(self.model(rule, name, seed))
-        file = self.output / "figures" / f"{short(name)}_{short(rule)}_{seed}.json"
-        return figures_of(self.example(name), model, file)
+        return figures_of(self.example(name), model, self.place("figures", rule, name, seed))
+
+    def place(self, kind: str, rule: str, name: str, seed: int) -> Path:
+        """Where the figures of a graph or the outcome of a run are kept."""
+        return self.output / kind / f"{short(name)}_{short(rule)}_{seed}.json"
 
 
 def short(text: str) -> str:
@@ -91,8 +97,11 @@ def short(text: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("results") / "noise_model")
+    parser.add_argument("--output", type=Path, default=Path("results") / "noise_model", metavar="DIR")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    parser.add_argument(
+        "--kept", action="store_true", help="tables of what is in DIR already; nothing is run"
+    )
     parser.add_argument("--no-readme", action="store_true", help="print only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -100,20 +109,27 @@ def main() -> None:
     if missing:
         raise SystemExit(f"not at {DATA_DIR}: {', '.join(missing)}; every model has seen all but one of them")
     experiment, names = Experiment(arguments.output), (*SEQUENCES, ROOM)
+
+    def seeds_of(kind: str, rule: str, name: str) -> list[int]:
+        seeds = arguments.seeds[:1] if kind == "figures" and rule == HAND else arguments.seeds
+        return [
+            seed for seed in seeds if not arguments.kept or experiment.place(kind, rule, name, seed).exists()
+        ]
+
     by_graph = {
         name: {
-            rule: [
-                experiment.figures(rule, name, seed)
-                for seed in (arguments.seeds[:1] if rule == HAND else arguments.seeds)
-            ]
+            rule: {seed: experiment.figures(rule, name, seed) for seed in seeds_of("figures", rule, name)}
             for rule in RULES
         }
         for name in names
     }
     print(text := graph_table(by_graph), flush=True)
     by_run = {
-        name: {rule: [experiment.outcome(rule, name, seed) for seed in arguments.seeds] for rule in RUN_RULES}
-        for name in names
+        name: {
+            rule: {seed: experiment.outcome(rule, name, seed) for seed in seeds_of("outcomes", rule, name)}
+            for rule in RUN_RULES
+        }
+        for name in SEQUENCES
     }
     print(more := run_table(by_run), flush=True)
     if not arguments.no_readme:

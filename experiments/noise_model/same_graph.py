@@ -15,11 +15,11 @@ from experiments.noise_model.model import NoiseModel
 from experiments.noise_model.training import (
     halves,
     negative_log_likelihood,
-    position_error,
     residuals,
     solved,
     weighed,
 )
+from torchslam.evaluation import ate
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.alignment import umeyama
 from torchslam.solvers.graph import solve
@@ -35,7 +35,7 @@ class Figures:
     apart:  of some splits, how far the keyframes of two random halves of the points are apart, root mean square after
             alignment, in metres where the truth is known
     nees_halves: squared, as a share of what their covariances say
-    loss:   negative log likelihood of an observation, None for the hand-set rule
+    loss:   negative log likelihood of an observation, None for what says nothing of how large errors are
     """
 
     ate_m: float | None
@@ -59,19 +59,21 @@ def figures_of(example: Example, model: NoiseModel | None, file: Path, splits: i
     if file.exists():
         return Figures(**json.loads(file.read_text()))
     informed = example if model is None else weighed(example, model)
-    solution = solve(informed.graph, backward="detached")
     informed = solved(informed)
     known, has_truth = example.known, int(example.known.sum()) >= LEAST_TRUE
     found = consistency(informed.graph, example.T_cw, known) if has_truth else None
     unit = scale_of(informed.graph.T_cw[known], example.T_cw[known]) if has_truth else 1.0
     pairs = [apart(halves(informed, seed)) for seed in range(splits)]
+    loss = None
+    if model is not None and model.level_of_image == 0:
+        loss = float(negative_log_likelihood(model, residuals(example, informed)))
     figures = Figures(
-        float(position_error(example, solution)) if has_truth else None,
+        float(ate(informed.graph.T_cw[known], example.T_cw[known])) if has_truth else None,
         found.nees if found else None,
         found.ratio if found else None,
         [unit * distance for distance, _ in pairs],
         sum(nees for _, nees in pairs) / splits,
-        None if model is None else float(negative_log_likelihood(model, residuals(example, informed))),
+        loss,
     )
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(asdict(figures)))

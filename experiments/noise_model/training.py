@@ -68,8 +68,9 @@ class Residuals:
 
 def weighed(example: Example, model: NoiseModel) -> Example:
     """The run with the information of the model in place of that of the hand-set rule, scale^-2."""
-    weights = model(example.values, example.directions, 1 / example.graph.weights)
-    return replace(example, graph=replace(example.graph, weights=weights))
+    graph = example.graph
+    weights = model(example.values, example.directions, 1 / graph.weights, graph.frame_index)
+    return replace(example, graph=replace(graph, weights=weights))
 
 
 def solved(example: Example) -> Example:
@@ -102,8 +103,12 @@ def residuals(example: Example, informed: Example) -> Residuals:
 
 
 def negative_log_likelihood(model: NoiseModel, found: Residuals) -> Tensor:
-    """Mean over observations, up to a constant; its density is that of which the kernel of `solve` is the logarithm."""
-    weights = model(found.values, found.directions, found.errors.new_ones(len(found.errors)))
+    """Mean over observations, up to a constant; its density is that of which the kernel of `solve` is the logarithm.
+
+    Of models without a level of the image: these say nothing of how large errors are.
+    """
+    ones = found.errors.new_ones(len(found.errors))
+    weights = model(found.values, found.directions, ones, torch.zeros_like(ones, dtype=torch.int64))
     if weights.ndim == 1:
         squared = weights * found.errors.square().sum(-1)
         log_determinant = 2 * weights.log()
@@ -134,6 +139,14 @@ def fit_likelihood(examples: Sequence[Example], kind: str, settings: Settings) -
             (negative_log_likelihood(model, found) + settings.decay * decay).backward()
             optimizer.step()
     return model
+
+
+def at_level(model: NoiseModel, level: float) -> NoiseModel:
+    """The same model, but that it only says which keypoints of an image are known better than others."""
+    found = NoiseModel(model.kind)
+    found.load_state_dict(model.state_dict())
+    found.level_of_image.fill_(level)
+    return found
 
 
 def position_error(example: Example, solution: GraphSolution) -> Tensor:

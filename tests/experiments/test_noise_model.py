@@ -20,6 +20,7 @@ from experiments.noise_model.same_graph import figures_of
 from experiments.noise_model.training import (
     Residuals,
     Settings,
+    at_level,
     fit_likelihood,
     fit_trajectories,
     negative_log_likelihood,
@@ -161,6 +162,7 @@ def test_trajectories_move_the_model_downhill() -> None:
     moved = fit_trajectories(start, examples, SMALL)
     assert float(start.line.detach().abs().max()) == 0.0
 
+    @torch.no_grad()
     def loss(model: NoiseModel) -> float:
         return sum(float(position_error(each, solve(weighed(each, model).graph)).log()) for each in examples)
 
@@ -221,8 +223,24 @@ def test_the_front_end_says_what_the_model_does(image: Tensor, tmp_path: Path, k
     assert features.information is not None
     again = load(tmp_path / "model.safetensors")
     cues = describe(ORB(200), image, features)
-    wanted = again(cues.values.double(), cues.directions.double(), features.scales.double().square())
-    torch.testing.assert_close(features.information, wanted.detach().float())
+    squared, of = features.scales[0].double().square(), torch.zeros(200, dtype=torch.int64)
+    wanted = again(cues.values[0].double(), cues.directions[0].double(), squared, of)
+    torch.testing.assert_close(features.information[0], wanted.detach().float())
+
+
+def test_at_a_level_every_image_has_it() -> None:
+    model = NoiseModel("isotropic")
+    torch.nn.init.constant_(model.line, 0.3)
+    values, of = normal(7, 90, len(NAMES)), torch.arange(90) // 30
+    directions = torch.eye(2, dtype=torch.float64).expand(90, 2, 2)
+    ones = torch.ones(90, dtype=torch.float64)
+    values[30:60] += 1.0
+    plain = model(values, directions, ones, of).detach().log()
+    found = at_level(model, 4.0)(values, directions, ones, of).detach().log()
+    for image in range(3):
+        rows = of == image
+        assert float(found[rows].mean()) == pytest.approx(math.log(4.0))
+        torch.testing.assert_close(found[rows] - found[rows].mean(), plain[rows] - plain[rows].mean())
 
 
 def test_intervals_are_those_of_student() -> None:
