@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +71,13 @@ class NoiseModel(nn.Module):
         if self.kind != "directed":
             return number
         return number[..., None, None] * powers(directions, self.power)
+
+
+def constant(level: float) -> NoiseModel:
+    """Of one information for all, in units of scale^-2."""
+    model = NoiseModel("constant")
+    torch.nn.init.constant_(model.level, math.log(level))
+    return model
 
 
 def means(values: Tensor, groups: Tensor) -> Tensor:

@@ -10,8 +10,9 @@ from experiments.common import table
 from experiments.noise_model.runs import Outcome
 from experiments.noise_model.same_graph import Figures
 
-HAND, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN = (
+HAND, STATED, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN = (
     "hand-set",
+    "stated",
     "level, fitted",
     "likelihood",
     "shape",
@@ -19,9 +20,10 @@ HAND, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN = (
     "its own trajectory",
 )
 RULES = (HAND, LEVEL, LIKELIHOOD, SHAPE, TRAJECTORY, OWN)
-"""hand-set: one noise per level, not stated; level, fitted: the same, stated, as large as is most likely; likelihood:
-learned on the other sequences; shape: the same, but every image has the level of the hand-set rule; trajectory: that,
-moved on by the trajectories of the other sequences; its own trajectory: by that of the very run it is measured on."""
+"""hand-set: one noise per level, not stated. stated: the same, said, half as large: tests stay as they are and
+only the kernel bends earlier. level, fitted: as large as is most likely. likelihood: learned on the other sequences.
+shape: likewise, but every image has the level of "stated", and directions are alike. trajectory: that, moved on by the
+trajectories of the other sequences; its own trajectory: by that of the run that it is measured on."""
 RENDERED = "synthetic:"
 STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5 % of Student's t, of one to nine degrees of freedom."""
