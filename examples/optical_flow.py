@@ -23,14 +23,14 @@ class Samples(torch.nn.Module):
 
     def __init__(self, num_keypoints: int = 800) -> None:
         super().__init__()
-        self.most, self.flow = num_keypoints, cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self.most, self.flow = num_keypoints, cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self.last = np.zeros((0, 0), np.uint8)
         self.at, self.names = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
 
     def carried(self, at: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Where pixels (n, 2) of one image are in another. Here goes a dense matcher of your own."""
-        field = self.flow.calc(first, second, None)
-        return at + cv2.remap(field, at[:, None], None, cv2.INTER_LINEAR)[:, 0]
+        field = self.flow.calc(first, second, np.zeros((*first.shape, 2), np.float32))
+        return at + np.asarray(cv2.remap(field, at[:, :1], at[:, 1:], cv2.INTER_LINEAR))[:, 0]
 
     def forward(self, images: torch.Tensor) -> Features:
         return Features.cat([self.of(image.mul(255).round().byte().numpy()) for image in images[:, 0]])
