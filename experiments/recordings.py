@@ -156,11 +156,11 @@ def interval(ratios: dict[str, dict[int, float]], kin: dict[str, str], seed: int
     return low, high
 
 
-HEADER = ["recording", "arm", "posed, %", "ATE", "over the default"]
+HEADER = ["recording", "arm", "posed, %", "ATE"]
 
 
 def report(outcomes: Outcomes, arms: Sequence[str], beside: str = DEFAULT) -> str:
-    """A row for every recording and arm, seed by seed, `-` for one not run, and the geometric means with intervals."""
+    """A row for every recording and arm, seed by seed, `-` for one not run, and the geometric means."""
     labels = list(dict.fromkeys(label for label, _, _ in outcomes))
     made = dict.fromkeys((label, arm) for label, arm, _ in outcomes)
     rows = [_row(outcomes, label, arm, beside) for label in labels for arm in arms if (label, arm) in made]
@@ -172,7 +172,7 @@ def report(outcomes: Outcomes, arms: Sequence[str], beside: str = DEFAULT) -> st
         mean = f"**{geometric_mean(ratios):.2f}** ({low:.2f} to {high:.2f})"
         if arm != beside and counted:
             rows.append([f"geometric mean of {counted}", arm, "", "", mean])
-    return table(HEADER, rows)
+    return table([*HEADER, f"over {beside}"], rows)
 
 
 def _row(outcomes: Outcomes, label: str, arm: str, beside: str) -> list[str]:
