@@ -211,3 +211,26 @@ def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
     (tmp_path / "other.pt").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="cannot read the weights"):
         LightGlue(tmp_path / "other.pt")
+
+
+def test_optical_flow_brings_its_own_samples_to_a_whole_run(tmp_path: Path) -> None:
+    """A dense matcher from end to end, as the example's docstring has it."""
+    names = ["--features", "examples.optical_flow:Samples", "--matcher", "examples.optical_flow:same"]
+    assert main(["run", ROOM, "-o", str(tmp_path), *names, "--set", "features.num_keypoints=500"]) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["posed"] >= 12
+    assert metrics["ate_m"] < 0.05
+
+
+def test_samples_keep_their_names_along_the_flow() -> None:
+    from examples.optical_flow import Samples, same
+
+    room, samples = open_sequence(ROOM), Samples(300)
+    one, other = (
+        View.of(room[index], samples(room.image(index)), torch.zeros(0).double()) for index in (0, 1)
+    )
+    found = same(one, other, None)
+    assert int(found.mask.sum()) > 200
+    moved = other.keypoints[found.indices_2[found.mask]] - one.keypoints[found.indices_1[found.mask]]
+    assert 0 < float(moved.norm(dim=-1).median()) < 20
+    assert len(torch.unique(found.indices_2[found.mask])) == int(found.mask.sum())

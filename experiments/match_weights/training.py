@@ -6,20 +6,24 @@ and everybody adds them in the order of the shards: the sum does not depend on w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
 
 from experiments.match_weights.evaluation import UNIFORM
 from experiments.match_weights.problems import Problems
-from experiments.match_weights.weighting import MatchWeights, refine, refine_learned
+from experiments.match_weights.weighting import refine, refine_learned
 from torchslam.learning.losses import pose_errors
 from torchslam.learning.training import Training
+from torchslam.solvers import RefinedPose
 
 SHARDS = 2  # of a batch; the number of processes divides it
 _CHUNK = 64
+RefinedBy = Callable[[Any, Problems], list[RefinedPose]]
 
 
 @dataclass(frozen=True)
@@ -34,13 +38,15 @@ class Settings:
     seed: int = 0
 
 
-def losses(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
+def losses(
+    network: nn.Module, problems: Problems, units: Tensor, refined_by: RefinedBy = refine_learned
+) -> Tensor:
     """(P,) how large the errors of position and rotation are in units (P, 2) of metres and radians.
 
     Grows like a logarithm, so that the problems in the middle count, not the hopeless ones; zero on failure.
     """
     total = torch.zeros_like(units[:, 0])
-    for refined in refine_learned(network, problems):
+    for refined in refined_by(network, problems):
         errors = pose_errors(refined.T_cw, problems.T_true)
         total = total + torch.where(refined.success, (errors / units).log1p().sum(-1), 0.0)
     return total
@@ -55,8 +61,12 @@ def expected_errors(problems: Problems) -> Tensor:
     return variances.unflatten(-1, (2, 3)).sum(-1).clamp_min(1e-12).sqrt()
 
 
-def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> list[float]:
+def train(
+    network: nn.Module, parts: list[Problems], settings: Settings, refined_by: RefinedBy = refine_learned
+) -> list[float]:
     """Fit the network in place, every part being drawn as often as any other.
+
+    refined_by: poses of problems by the network's weights, as often as they count in the loss
 
     Returns the mean loss of every step, the same on every process.
     """
@@ -79,7 +89,10 @@ def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> l
         shards = list(zip(rows.chunk(SHARDS), keys.chunk(SHARDS), strict=True))
         mine = [
             _gradient(
-                network, problems[some].thinned(key.to(problems.mask.device), settings.matches), units[some]
+                network,
+                problems[some].thinned(key.to(problems.mask.device), settings.matches),
+                units[some],
+                refined_by,
             )
             for some, key in shards[rank * SHARDS // ranks : (rank + 1) * SHARDS // ranks]
         ]
@@ -91,9 +104,9 @@ def train(network: MatchWeights, parts: list[Problems], settings: Settings) -> l
     return training.losses
 
 
-def _gradient(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
+def _gradient(network: nn.Module, problems: Problems, units: Tensor, refined_by: RefinedBy) -> Tensor:
     """The gradient of the summed loss, flat, and the sum itself at the end."""
-    total = losses(network, problems, units).sum()
+    total = losses(network, problems, units, refined_by).sum()
     gradients = torch.autograd.grad(total, list(network.parameters()))
     return torch.cat([*(gradient.flatten() for gradient in gradients), total.detach()[None]])
 

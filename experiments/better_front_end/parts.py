@@ -1,0 +1,36 @@
+"""A matcher without a ratio test, as learned features are mostly matched. See README.md."""
+
+from __future__ import annotations
+
+from torchslam.config import MatchingConfig
+from torchslam.features import match, match_projected
+from torchslam.tracking.matcher import DescriptorMatcher, Prior, max_distance
+from torchslam.values import Matches, View
+
+
+class Mutual:
+    """Each other's nearest descriptors, as learned ones are matched where they are published: no ratio test.
+
+    Along epipolar lines torchslam's own matches are such already.
+    """
+
+    def __init__(self) -> None:
+        self.settings = MatchingConfig()
+        self.own = DescriptorMatcher(self.settings)
+
+    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+        limit = max_distance(view_2.descriptors, self.settings)
+        if prior is None:
+            return match(view_1.features, view_2.features, ratio=None, mutual=True, max_distance=limit)
+        if prior.radius_px is None:
+            return self.own(view_1, view_2, prior)
+        return match_projected(
+            view_1.descriptors[None],
+            view_1.keypoints[None],
+            prior.radius_px[None],
+            view_2.features,
+            mask=view_1.mask[None],
+            scales=view_1.scales[None],
+            max_distance=limit,
+            ratio=None,
+        )

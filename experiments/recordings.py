@@ -1,0 +1,188 @@
+"""Whole runs over all real recordings, with something changed beside the default: ratios of errors with intervals."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from experiments.common import DATA_DIR, add_engine, at_hand, figures_of_all, row_of, table
+from torchslam.batch import Columns, Row
+from torchslam.batch.kept import RUNS
+from torchslam.output.results import read_metrics
+
+SEEDS = (0, 1, 2)
+DEFAULT = "default"
+KEPT_ORB = ("features.kind=experiments.kept_features:ORB",)
+"""The default's features, found once: the same bytes."""
+ENOUGH = 0.9
+"""Of the frames that the default poses: with fewer an error is that of another path, and not compared."""
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A real sequence: file or folder in the data; camera, truth, limit as of a `Row`.
+
+    kin: recordings of the same images, which are drawn together for intervals
+    """
+
+    name: str
+    kin: str
+    camera: str | None = None
+    groundtruth: str | None = None
+    limit: int | None = None
+
+    def row(self, label: str, arm: str, seed: int, overrides: Sequence[str]) -> Row:
+        truth = None if self.groundtruth is None else str(DATA_DIR / self.groundtruth)
+        settings = (*overrides, f"seed={seed}")
+        return row_of(
+            self.name, label, arm, str(seed),
+            overrides=settings, camera=self.camera, groundtruth=truth, limit=self.limit,
+        )  # fmt: skip
+
+
+RECORDINGS = {
+    "redkitchen, 200 frames": Recording("redkitchen", "redkitchen", limit=200),
+    "kitti07": Recording("kitti07", "kitti07"),
+    "kitti07, 685 px": Recording("kitti07", "kitti07", camera="685.42,685.42,601.8873,183.1104"),
+    "machine_hall, 160 frames": Recording("machine_hall", "machine_hall", limit=160),
+    "shelf_bin": Recording("shelf_bin", "shelf_bin"),
+    "fr2_desk_20": Recording("fr2_desk_20", "fr2_desk_20"),
+    "drone, 160 frames": Recording(
+        "drone.mp4", "drone", camera="553,553,319.5,179.5", groundtruth="drone_colmap.txt", limit=160
+    ),
+}
+"""kitti07 with the camera that comes with it, which is 3 % wrong, and with COLMAP's; drone by COLMAP's poses, whose
+units are arbitrary."""
+
+
+def recordings(labels: Sequence[str]) -> dict[str, Recording]:
+    """Those of the labels, all if there are none, whose data are at hand."""
+    chosen = {label: RECORDINGS[label] for label in labels or RECORDINGS}
+    there = set(at_hand(dict.fromkeys(one.name for one in chosen.values())))
+    return {label: one for label, one in chosen.items() if one.name in there}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run came to: share of frames with a pose, and ATE, None without a map."""
+
+    posed: float
+    ate: float | None
+
+    @classmethod
+    def of(cls, figures: Columns) -> Outcome:
+        return cls(figures["posed"] / figures["frames"], figures.get("ate_m"))
+
+
+Outcomes = dict[tuple[str, str, int], Outcome]
+"""By recording, arm and seed."""
+
+
+Overrides = Callable[[str, str, int], Sequence[str]]
+"""The settings of a run by recording, arm and seed, its seed apart."""
+
+
+def add_choices(parser: argparse.ArgumentParser, arms: Sequence[str]) -> None:
+    """Which recordings, arms and seeds are run; runs of all experiments lie together: the default's are made once."""
+    parser.add_argument("labels", nargs="*", choices=[[], *RECORDINGS], help="recordings; all by default")
+    parser.add_argument("--arms", nargs="*", choices=arms, default=list(arms))
+    parser.add_argument("--seeds", nargs="*", type=int, default=list(SEEDS))
+    parser.add_argument("--kept", action="store_true", help="no run: a table of those that were made before")
+    parser.add_argument("--no-readme", action="store_true", help="print only")
+    add_engine(parser, "recordings")
+
+
+def outcomes_of(options: argparse.Namespace, overrides: Overrides) -> Outcomes:
+    """The runs that the options of `add_choices` name, made unless they are there. Raises SystemExit for an error."""
+    cases = [
+        (label, arm, seed)
+        for seed in options.seeds
+        for arm in options.arms
+        for label in recordings(options.labels)
+    ]
+    if options.kept:
+        folders = {case: options.output / RUNS / RECORDINGS[case[0]].row(*case, ()).name for case in cases}
+        return {case: Outcome.of(read_metrics(path)) for case, path in folders.items() if path.is_dir()}
+    rows = [RECORDINGS[case[0]].row(*case, overrides(*case)) for case in cases]
+    figures = figures_of_all(rows, options)
+    return {case: Outcome.of(found) for case, found in zip(cases, figures, strict=True)}
+
+
+def log_ratios(outcomes: Outcomes, label: str, arm: str, beside: str = DEFAULT) -> dict[int, float]:
+    """By seed, the logarithm of an arm's ATE over that of another; without seeds in which too little is posed."""
+    found = {}
+    for seed in SEEDS:
+        one, other = outcomes.get((label, arm, seed)), outcomes.get((label, beside, seed))
+        if one is None or other is None or one.ate is None or other.ate is None:
+            continue
+        if one.posed >= ENOUGH * other.posed:
+            found[seed] = math.log(one.ate / other.ate)
+    return found
+
+
+def geometric_mean(ratios: dict[str, dict[int, float]]) -> float:
+    """The mean ratio of recordings, each being the mean of its seeds; NaN where there are none."""
+    means = [sum(by_seed.values()) / len(by_seed) for by_seed in ratios.values() if by_seed]
+    return math.exp(sum(means) / len(means)) if means else math.nan
+
+
+def interval(ratios: dict[str, dict[int, float]], kin: dict[str, str], seed: int = 0) -> tuple[float, float]:
+    """95 % of `geometric_mean` when images are drawn anew, with the recordings that share them, and seeds within each.
+
+    ratios: by recording; kin: of each recording
+    """
+    groups: dict[str, list[list[float]]] = {}
+    for label, by_seed in ratios.items():
+        if by_seed:
+            groups.setdefault(kin[label], []).append(list(by_seed.values()))
+    if len(groups) < 2:
+        return math.nan, math.nan
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(count: int) -> list[int]:
+        return torch.randint(count, (count,), generator=generator).tolist()
+
+    families, means = list(groups.values()), []
+    for _ in range(_DRAWS):
+        some = [values for number in drawn(len(families)) for values in families[number]]
+        each = [sum(values[k] for k in drawn(len(values))) / len(values) for values in some]
+        means.append(math.exp(sum(each) / len(each)))
+    low, high = torch.tensor(means).quantile(torch.tensor([0.025, 0.975])).tolist()
+    return low, high
+
+
+HEADER = ["recording", "arm", "posed, %", "ATE"]
+
+
+def report(outcomes: Outcomes, arms: Sequence[str], beside: str = DEFAULT) -> str:
+    """A row for every recording and arm, seed by seed, `-` for one not run, and the geometric means."""
+    labels = list(dict.fromkeys(label for label, _, _ in outcomes))
+    made = dict.fromkeys((label, arm) for label, arm, _ in outcomes)
+    rows = [_row(outcomes, label, arm, beside) for label in labels for arm in arms if (label, arm) in made]
+    kin = {label: RECORDINGS[label].kin for label in labels}
+    for arm in arms:
+        ratios = {label: log_ratios(outcomes, label, arm, beside) for label in labels}
+        counted = sum(bool(by_seed) for by_seed in ratios.values())
+        low, high = interval(ratios, kin)
+        mean = f"**{geometric_mean(ratios):.2f}** ({low:.2f} to {high:.2f})"
+        if arm != beside and counted:
+            rows.append([f"geometric mean of {counted}", arm, "", "", mean])
+    return table([*HEADER, f"over {beside}"], rows)
+
+
+def _row(outcomes: Outcomes, label: str, arm: str, beside: str) -> list[str]:
+    runs = [outcomes.get((label, arm, seed)) for seed in SEEDS]
+    posed = " ".join("-" if run is None else f"{100 * run.posed:.0f}" for run in runs)
+    ates = " ".join("-" if run is None else _ate(run) for run in runs)
+    ratios = log_ratios(outcomes, label, arm, beside)
+    ratio = "" if arm == beside else f"{geometric_mean({label: ratios}):.2f}" if ratios else "not compared"
+    return [label, arm, posed, ates, ratio]
+
+
+def _ate(run: Outcome) -> str:
+    return "none" if run.ate is None else f"{run.ate:.4f}"
