@@ -69,3 +69,11 @@ def test_beyond_the_distortion_the_table_has_its_edge():
         0.999 * float(camera.limit)
     )  # it does not reach there
     torch.testing.assert_close(quick.xy, exact.xy, atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
+def test_normalized_pixels_are_those_of_the_camera_in_any_shape(camera):
+    batch, focal = pixels().view(2, 25, 2), camera.params[:2]
+    found, exact = Undistortion(camera).normalize(batch), camera.normalize(batch)
+    torch.testing.assert_close(found * focal, exact * focal, rtol=0, atol=0.02)
+    assert torch.equal(found, exact) == (camera.model == "pinhole")

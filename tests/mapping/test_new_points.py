@@ -295,7 +295,7 @@ def test_keypoints_that_see_a_point_are_left_alone_where_others_have_more_free_o
     known = torch.nonzero(table[0] >= 0)[:40, 0]
     slam_map.forget(torch.zeros_like(known), known)  # the first keyframe has 40 free keypoints more
     before = table.clone()
-    free = FreeKeypoints.of(slam_map, torch.tensor([0, 1]), CAMERA)
+    free = FreeKeypoints.of(slam_map, torch.tensor([0, 1]), CAMERA.normalize)
     for row in range(2):
         rows = free.rows[row, free.features.mask[0 + row]]
         assert bool((before[row, rows] < 0).all())

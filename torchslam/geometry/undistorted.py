@@ -78,6 +78,12 @@ class Undistortion:
         off = torch.addcmul(pixels.mT, at, self._step, value=-1)
         return Undistorted(xy + (inverse * off[:, None]).sum(0), slope)
 
+    def normalize(self, pixels: Tensor) -> Tensor:
+        """As `Camera.normalize`, from the table. (..., 2) -> (..., 2)."""
+        if self.camera.model == "pinhole":
+            return self.camera.normalize(pixels)
+        return self(pixels.reshape(-1, 2)).xy.mT.reshape(pixels.shape)
+
     @cached_property
     def _step(self) -> Tensor:
         """() pixels from node to node, along x and y."""

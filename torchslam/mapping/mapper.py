@@ -6,7 +6,7 @@ import torch
 
 from torchslam.config import Config
 from torchslam.errors import ConfigError
-from torchslam.geometry import Camera, se3_inverse, triangulation_covariance
+from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_covariance
 from torchslam.mapping.adjusting import Adjusting
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
@@ -25,13 +25,20 @@ class Mapper:
     """Grows the map, keyframe by keyframe."""
 
     def __init__(
-        self, camera: Camera, config: Config, clock: Stopwatch, matcher: Matcher | None = None
+        self,
+        camera: Camera,
+        config: Config,
+        clock: Stopwatch,
+        matcher: Matcher | None = None,
+        undistortion: Undistortion | None = None,
     ) -> None:
+        """undistortion: of this camera, where somebody has one already"""
         self.camera = camera
         self.config = config
         self.clock = clock
         self.adjusting = Adjusting(camera, config.bundle, config.measurement.gate == "mahalanobis")
         self.matcher = matcher
+        self.undistortion = undistortion or Undistortion(camera)
 
     def start(self, slam_map: Map, start: Start) -> tuple[int, int]:
         """Make the first map of two views, at the configured scale; returns the two keyframes."""
@@ -67,7 +74,10 @@ class Mapper:
             last = range(keyframe - 1, max(keyframe - 1 - settings.neighbours, -1), -1)
             partners = neighbours if settings.partners == "covisible" else slam_map.ids(*last)
             partners = partners[: settings.neighbours]
-            triangulate_against(slam_map, keyframe, partners, self.camera, self.config, self.matcher)
+            normalize = self.undistortion.normalize
+            triangulate_against(
+                slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
+            )
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)

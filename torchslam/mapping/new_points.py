@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -31,19 +32,23 @@ def triangulate_against(
     camera: Camera,
     config: Config,
     matcher: Matcher | None = None,
+    normalize: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
     """Add the points that a keyframe and neighbours (k,) see with enough parallax and that the map does not have yet.
 
     Of several neighbours with which a keypoint makes a point the first one counts.
 
-    matcher: one of one's own; along epipolar lines, by descriptors, if None
+    matcher:   one of one's own; along epipolar lines, by descriptors, if None
+    normalize: a quicker way for `camera.normalize`
     """
     settings, limit = config.mapping, config.measurement.chi_square
     neighbours = neighbours[has_baseline(slam_map, keyframe, neighbours, settings.min_baseline)]
     if len(neighbours) == 0:
         return
-    here = FreeKeypoints.of(slam_map, slam_map.ids(keyframe), camera)
-    there = FreeKeypoints.of(slam_map, neighbours, camera)
+    here, there = (
+        FreeKeypoints.of(slam_map, rows, normalize or camera.normalize)
+        for rows in (slam_map.ids(keyframe), neighbours)
+    )
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours]
     T_21, weights = T_2w @ se3_inverse(T_1w), None
     if matcher is None or isinstance(matcher, DescriptorMatcher):

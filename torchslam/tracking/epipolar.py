@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -29,8 +30,8 @@ class FreeKeypoints:
     noise: Noise
 
     @classmethod
-    def of(cls, slam_map: Map, keyframes: Tensor, camera: Camera) -> FreeKeypoints:
-        """Those of keyframes (k,)."""
+    def of(cls, slam_map: Map, keyframes: Tensor, normalize: Callable[[Tensor], Tensor]) -> FreeKeypoints:
+        """Those of keyframes (k,). normalize: pixels (k, n, 2) to undistorted coordinates."""
         table = slam_map.keyframes
         free = table["mask"][keyframes] & (table["point_ids"][keyframes] == NO_POINT)
         free, rows = torch.sort(free, dim=1, descending=True, stable=True)
@@ -38,7 +39,7 @@ class FreeKeypoints:
         rows = rows[:, : free.shape[1]]
         features = replace(slam_map.features(keyframes, rows), mask=free)
         noise = slam_map.noise(keyframes[:, None], rows)
-        return cls(features, rows, camera.normalize(features.keypoints), noise)
+        return cls(features, rows, normalize(features.keypoints), noise)
 
 
 def match_along_epipolar_lines(
