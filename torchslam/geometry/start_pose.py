@@ -14,9 +14,7 @@ from torchslam.geometry.projections import fit_projections, pose_tangent, square
 from torchslam.geometry.ransac import SUPPORT_WIDTH
 from torchslam.geometry.undistorted import Undistorted
 
-_FIRST_ROUND = (
-    64  # samples: enough where half of the matches are right; each round has twice as many as the one before
-)
+_FIRST_ROUND = 160  # samples, then twice as many: from 64 on, poor images are lost that need not be
 _CANDIDATES = 2  # hypotheses of each round that are optimised
 _ITERATIONS = 1
 _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
