@@ -108,6 +108,14 @@ def estimator_cases() -> dict[str, Case]:
             with_camera(geometry.estimate_similarity, 2),
             (views.points_1, geometry.transform(views.T_21, views.points_1), *pair[2:], params),
         ),
+        "start_pose": (
+            with_camera(
+                lambda points_w, pixels, camera: geometry.start_pose(
+                    points_w[0], geometry.Undistorted.of(pixels[0], camera), size, 2.0
+                )
+            ),
+            (points_w, pixels, params),
+        ),
         "triangulate": (with_camera(geometry.triangulate, 2), (*pair, params)),
         "triangulate_many": (
             with_camera(lambda pixels, T, camera: geometry.triangulate_many(T, pixels, camera)),

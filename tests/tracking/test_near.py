@@ -49,17 +49,18 @@ def test_it_finds_what_match_projected_finds(ratio: float | None, limit: int, si
             ratio=ratio,
             max_distance=limit,
         )
-        rows, columns = match_within(expected, view, radius, ratio, limit)
+        rows, columns, distances = match_within(expected, view, radius, ratio, limit)
         mask = wanted.mask[0]
         assert torch.equal(rows, wanted.indices_1[0][mask])
         assert torch.equal(columns, wanted.indices_2[0][mask])
+        assert torch.equal(distances, wanted.distances[0][mask])
         found += len(rows)
     assert found > 0
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
 def test_nothing_matches_nothing(rows: int, columns: int) -> None:
-    first, second = match_within(view_of(rows, 0), view_of(columns, 1), torch.ones(rows).double(), 0.9, 64)
+    first, second, _ = match_within(view_of(rows, 0), view_of(columns, 1), torch.ones(rows).double(), 0.9, 64)
     assert len(first) == len(second) == 0
     assert first.dtype == torch.int64
 
@@ -67,5 +68,5 @@ def test_nothing_matches_nothing(rows: int, columns: int) -> None:
 def test_no_keypoint_in_any_window() -> None:
     view = view_of(20, 0)
     elsewhere = replace(view, keypoints=view.keypoints + 500)
-    rows, _ = match_within(view, elsewhere, torch.full((20,), 9.0).double(), 0.9, 64)
+    rows, *_ = match_within(view, elsewhere, torch.full((20,), 9.0).double(), 0.9, 64)
     assert len(rows) == 0

@@ -90,7 +90,7 @@ class FrameProblem:
         ones = torch.ones_like(points_w[:, :1])
         self.homogeneous = torch.cat((points_w, ones), dim=1).mT
         self.xy = xy
-        self.along_x, self.along_y = whitened.unbind(0)
+        self.along_x, self.along_y = whitened.contiguous().unbind(0)  # rows of memory are counted on below
         self.tangent = pose_tangent(points_w.dtype, points_w.device)
         self.nearest = torch.finfo(points_w.dtype).eps
 

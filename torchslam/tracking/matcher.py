@@ -73,8 +73,8 @@ class DescriptorMatcher:
                 max_distance=limit,
             )
         if prior.radius_px is not None and view_2.descriptors.dtype == torch.uint8:
-            rows, columns = match_within(view_1, view_2, prior.radius_px, prior.ratio, limit)
-            return Matches(rows[None], columns[None], *_all_alike(rows))
+            rows, columns, distances = match_within(view_1, view_2, prior.radius_px, prior.ratio, limit)
+            return Matches(rows[None], columns[None], distances[None], torch.ones_like(rows).bool()[None])
         if prior.radius_px is not None:
             return match_projected(
                 view_1.descriptors[None],

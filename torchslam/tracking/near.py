@@ -18,15 +18,16 @@ _SAME_SCALE = 0.05
 
 def match_within(
     expected: View, view: View, radius: Tensor, ratio: float | None, max_distance: float
-) -> tuple[Tensor, Tensor]:
-    """Rows (m,), ascending, of expected keypoints and of a view's that match: nearest descriptors within a radius.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows (m,), ascending, of expected keypoints and of a view's that match, nearest descriptors within a radius, and
+    their distances (m,), bits.
 
     expected: keypoints, scales and descriptors (M, 32) uint8 as they should appear in the view; radius: (M,) pixels
     ratio, max_distance: as of `match_projected`
     """
     rows, columns, bits = len(expected.mask), len(view.mask), 8 * view.descriptors.shape[-1]
     if rows == 0 or columns == 0:
-        return (nobody := torch.zeros(0, dtype=torch.int64, device=radius.device)), nobody
+        return (nobody := torch.zeros(0, dtype=torch.int64, device=radius.device)), nobody, nobody.float()
     row, column = _in_windows(expected, view, radius)
     factor = view.scales.index_select(0, column) / expected.scales.index_select(0, row)
     alike = torch.nonzero((factor <= _SCALE_TOLERANCE) & (factor * _SCALE_TOLERANCE >= 1))[:, 0]
@@ -53,7 +54,8 @@ def match_within(
     keys = nearest.index_select(0, first) * rows + first
     least = keys.new_full((columns,), unset * rows).scatter_reduce_(0, partner, keys, "amin")
     kept = torch.nonzero(least.index_select(0, partner) == keys)[:, 0]
-    return first.index_select(0, kept), partner.index_select(0, kept)
+    first = first.index_select(0, kept)
+    return first, partner.index_select(0, kept), nearest.index_select(0, first).float()
 
 
 def _in_windows(expected: View, view: View, radius: Tensor) -> tuple[Tensor, Tensor]:
