@@ -16,7 +16,8 @@ from torchslam.geometry.undistorted import Undistorted
 
 _FIRST_ROUND = 160  # samples, then twice as many: from 64 on, poor images are lost that need not be
 _CANDIDATES = 2  # hypotheses of each round that are optimised
-_ITERATIONS = 1
+_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 1, 10
+_FINAL_WIDTH = 1.5  # thresholds; without this last optimisation kitti07 is lost with twice as many seeds
 _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
 _FALSE_ALARMS = 1e-3  # expected among wrong matches
 _SOLUTIONS = 4  # of P3P
@@ -33,7 +34,7 @@ def start_pose(
     confidence: float = 0.9999,
     max_samples: int = 3000,
 ) -> Tensor | None:
-    """The pose (4, 4) that explains most matches, by RANSAC over P3P, optimised on them once; None where matches that
+    """The pose (4, 4) that explains most matches, by RANSAC over P3P, optimised on them; None where matches that
     are wrong could agree as well, or those that agree are on a line.
 
     points_w: (N, 3), and where they are seen, all finite; size: of the image; threshold: of an inlier, pixels
@@ -60,6 +61,9 @@ def start_pose(
             needed = _samples_needed(support / N, confidence)
     if least == math.inf:
         return None
+    P = search.fit(P[None, None], _FINAL_ITERATIONS, _FINAL_WIDTH)[0][0]
+    agrees = search.squared_errors(P) < 1
+    inliers = int(agrees.sum())
     chance = math.pi * threshold**2 / (size[0] * size[1])
     if not _is_significant(inliers, N, chance) or _is_on_a_line(search.points[agrees]):
         return None
@@ -104,7 +108,7 @@ class _Search:
         )
         costs = squared[0].clamp_max_(1.0).nan_to_num_(1.0).sum(1)
         best = P[costs.topk(min(_CANDIDATES, len(P)), largest=False).indices][None]
-        P, cost = self._fit(best)
+        P, cost = self.fit(best, _LOCAL_ITERATIONS)
         row = int(cost.nan_to_num(torch.inf).argmin())
         return P[row], float(cost[row])
 
@@ -114,11 +118,15 @@ class _Search:
         order = torch.rand(-(-count // each), len(self.points), generator=generator).argsort(1)
         return order[:, : 3 * each].reshape(-1, 3)[:count].to(self.points.device)
 
-    def _fit(self, P: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses (K, 3, 4) and costs (K,) of those (1, K, 3, 4), optimised on what agrees with them."""
+    def fit(self, P: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Poses (K, 3, 4) and costs (K,) of those (1, K, 3, 4), optimised on what agrees with them.
+
+        width: thresholds within which that is
+        """
         mask = torch.ones_like(self.xy[..., 0], dtype=torch.bool)
         tangent = pose_tangent(P.dtype, P.device)
-        P, cost = fit_projections(P, tangent, self.homogeneous, self.xy, self.scale, mask, _ITERATIONS)
+        found = self.homogeneous, self.xy, self.scale
+        P, cost = fit_projections(P, tangent, *found, mask, iterations, width)
         return P[0], cost[0]
 
     def squared_errors(self, P: Tensor) -> Tensor:
