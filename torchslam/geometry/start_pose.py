@@ -1,4 +1,4 @@
-"""A pose to start a refinement from, for every frame of a run: `estimate_absolute_pose` in half of the calls."""
+"""A pose to start a refinement from, for every frame of a run: `estimate_absolute_pose` of one frame, in few calls."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torchslam.geometry.projections import fit_projections, pose_tangent, square
 from torchslam.geometry.ransac import SUPPORT_WIDTH
 from torchslam.geometry.undistorted import Undistorted
 
-_FIRST_ROUND = 160  # samples, then twice as many: from 64 on, poor images are lost that need not be
+_FIRST_ROUND = 160  # samples, then twice as many; with 64, frames of sheared and blurred images are lost
 _CANDIDATES = 2  # hypotheses of each round that are optimised
 _LOCAL_ITERATIONS, _FINAL_ITERATIONS = 1, 10
-_FINAL_WIDTH = 1.5  # thresholds; without this last optimisation kitti07 is lost with twice as many seeds
+_FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without the last optimisation more runs are lost
 _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
 _FALSE_ALARMS = 1e-3  # expected among wrong matches
 _SOLUTIONS = 4  # of P3P
