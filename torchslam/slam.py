@@ -224,12 +224,14 @@ class SLAM:
         world = self.world or self.worlds.main(self.session.number)
         return History() if world is None else world.history
 
+    @torch.inference_mode()
     def settle(self) -> None:
         """Believe a young world as it is: the frames from before its start get their poses."""
         self._following.beginning.settle()
 
+    @torch.inference_mode()
     def conclude(self) -> None:
-        """The last frame has come: what is held back keeps its pose, uncertain as it is, and nothing is built on it."""
+        """The last frame has come: what is held back keeps its pose, uncertain as it is."""
         self._following.conclude(None if self.last_frame is None else self.last_frame[0])
 
     def _scouts(self, frame: Frame) -> bool:

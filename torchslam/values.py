@@ -212,6 +212,7 @@ class Tracked:
     matches:     how many matches the inliers were chosen from
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
     weights:     (m,) of the matches, where the matcher gave some
+    expected:    (n,) points that it should see; None: those that it does see
     depth:       median depth of the points it sees
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
     coverage:    share of the image in which the points that were expected are found
@@ -228,6 +229,7 @@ class Tracked:
     coverage: float = 1.0
     explained: float = 1.0
     weights: Tensor | None = None
+    expected: Tensor | None = None
 
     @property
     def inliers(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from tests.scene import Scene, pose
@@ -99,3 +100,29 @@ def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
     probation.hold(*frame(2), "")
     assert not probation
     assert [held[0].index for held in probation.release()] == [2]
+
+
+def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_ones() -> None:
+    probation = Probation(Config())
+    for index in range(5):
+        probation.hold(*frame(index), "odd", is_mapped=index > 2)
+    assert probation.reason == "to be confirmed by 5 more frames"
+    for index in range(5, 9):
+        probation.hold(*frame(index), "", is_mapped=True)
+        assert probation
+    probation.hold(*frame(9), "", is_mapped=True)
+    assert not probation
+    probation.release()
+    probation.hold(*frame(10), "odd", is_mapped=True)  # who was believed begins anew
+    assert probation.reason == "to be confirmed by 2 more frames"
+
+
+def test_no_more_than_so_many_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.tracking.probation.MOST", 3)
+    probation = Probation(Config())
+    for index in range(3):
+        assert not probation.is_full
+        probation.hold(*frame(index), "odd")
+    assert probation.is_full
+    probation.hand_over()
+    assert not probation.is_full

@@ -175,9 +175,28 @@ def test_a_frame_is_where_it_is_and_sees_what_it_sees() -> None:
     assert tracked.coverage == 1.0
     depth = transform(T_cw, here.map.positions_w[tracked.point_ids])[:, 2].median()
     assert tracked.depth == pytest.approx(float(depth), abs=1e-6)
-    expected = here.map.points["times_visible"] - visible
-    assert set(expected.tolist()) == {0, 1}
-    assert (expected[tracked.point_ids] == 1).all()
+    assert tracked.expected is not None
+    assert torch.isin(tracked.point_ids, tracked.expected).all()
+    assert torch.equal(here.map.points["times_visible"], visible)  # it is not believed yet
+
+
+def test_a_frame_that_is_believed_speaks_for_what_it_saw_and_should_have_seen() -> None:
+    here, follower = world(), tracker()
+    points, tracked = here.map.points, followed(here, SCENE.view(50, se3_exp(3 * STEP)))
+    tracked = replace(tracked, point_ids=tracked.point_ids[:50])
+    visible, found = points["times_visible"].clone(), points["times_found"].clone()
+    follower.expect(here.map, tracked)
+    follower.vouch(here.map, tracked)
+    assert tracked.expected is not None
+    assert torch.nonzero(points["times_visible"] - visible)[:, 0].tolist() == sorted(
+        tracked.expected.tolist()
+    )
+    assert torch.nonzero(points["times_found"] - found)[:, 0].tolist() == sorted(tracked.point_ids.tolist())
+    follower.expect(here.map, replace(tracked, expected=None))
+    assert (points["times_visible"] - visible)[tracked.point_ids].tolist() == [2] * 50
+    follower.counts = False
+    follower.expect(here.map, tracked)
+    assert int((points["times_visible"] - visible).max()) == 2
 
 
 def test_the_error_is_in_units_of_the_noise() -> None:

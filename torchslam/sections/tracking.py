@@ -115,7 +115,7 @@ class PatchesConfig(Settings, section="patches"):
 
 @dataclass(frozen=True)
 class JudgeConfig(Settings, section="judge"):
-    """When a pose is uncertain: it makes no keyframe and no point until later frames confirm it."""
+    """When a pose is uncertain: what is mapped from it is on trial until later frames confirm it."""
 
     min_inlier_share: float = setting(0.5, "of the matches around the predicted pixels", low=0, high=1)
     max_error: float = setting(

@@ -8,10 +8,11 @@ from torchslam.stages.beginning import Beginning
 from torchslam.stages.finding import Finding
 from torchslam.stages.local_mapping import LocalMapping
 from torchslam.stages.loop_closing import LoopClosing
+from torchslam.stages.on_trial import OnTrial
 from torchslam.stages.parts import Outcome, Parts
 from torchslam.stages.tracking_back import TrackingBack
 from torchslam.tracking.independent_motion import NOTHING
-from torchslam.tracking.judge import why_doubt
+from torchslam.tracking.judge import why_strange, why_unsound
 from torchslam.values import Followed, Frame, State, Tracked, View
 from torchslam.world.world import World
 
@@ -25,6 +26,7 @@ class Following:
     def __init__(self, parts: Parts) -> None:
         self.parts = parts
         self.mapping = LocalMapping(parts)
+        self.on_trial = OnTrial(parts, self.mapping)
         self.back = TrackingBack(parts, self.mapping)
         self.beginning = Beginning(parts, self.back)
         self.loop_closing = LoopClosing(parts, self.mapping, self.beginning)
@@ -35,7 +37,8 @@ class Following:
         parts = self.parts
         with parts.clock("patches"):
             view, tracked = parts.patches.place(world, frame, parts.session.number, followed)
-            parts.tracker.see(world.map, tracked)
+            parts.tracker.expect(world.map, tracked)
+            parts.tracker.vouch(world.map, tracked)
             world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return view, Outcome("", self.loop_closing.catch_up(world, frame.index), tracked)
 
@@ -53,19 +56,21 @@ class Following:
             tracked = parts.tracker.track(world, view)
         if tracked is None:
             return self._lose(world, view)
-        doubt = why_doubt(tracked, expected, world.track, parts.config.judge)
+        unsound = why_unsound(tracked, expected, parts.config.judge)
+        doubt = unsound or why_strange(tracked, world.track, parts.config.judge)
         moves = parts.foreign.moves(tracked) if not doubt else NOTHING
         if doubt or moves.is_doubt or parts.probation:
+            if not unsound and not moves.is_doubt and self._wants_map(doubt):
+                self.on_trial.take(world, view, tracked)
             return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
         return self._build(world, view, tracked, moves.words)
 
     def conclude(self, frame: int | None) -> None:
-        """The last frame has come: what is held back keeps its pose, uncertain as it is, and nothing is built on it."""
+        """The last frame has come: what is held back keeps its pose, uncertain as it is."""
         here = self.parts.here
         self.beginning.settle()
-        for held in self.parts.probation.hand_over():
-            assert here.world is not None  # nothing is held back without one
-            here.world.history.add(*held)
+        if here.world is not None:
+            self._keep_uncertain(here.world)
         if here.world is not None and frame is not None:
             self.loop_closing.catch_up(here.world, frame, now=True)
 
@@ -95,15 +100,23 @@ class Following:
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)
 
+    def _wants_map(self, doubt: str) -> bool:
+        """Whether frames that are held back are to be mapped: not what came back and is certain so far."""
+        return bool(doubt or self.on_trial) and not self.parts.probation.came_back
+
     def _hold(self, world: World, view: View, tracked: Tracked, doubt: str) -> Outcome:
         """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""
         parts, probation = self.parts, self.parts.probation
-        probation.hold(view, tracked, world.track, doubt)
+        probation.hold(view, tracked, world.track, doubt, bool(self.on_trial))
         if probation:
+            if probation.is_full:
+                self._keep_uncertain(world)
             parts.here.state = State.UNCERTAIN
             return Outcome(doubt or probation.reason, world, tracked)
+        self.on_trial.keep(world)
         came_back, held = probation.came_back, probation.release()
         for earlier in held:
+            parts.tracker.expect(world.map, earlier[1])
             parts.tracker.vouch(world.map, earlier[1])
             world.history.add(*earlier)
         if came_back:
@@ -112,9 +125,16 @@ class Following:
         parts.here.state = State.TRACKING
         return Outcome("", world, tracked)
 
+    def _keep_uncertain(self, world: World) -> None:
+        """What is held back keeps its pose, uncertain as it is, and so does what was mapped of it."""
+        self.on_trial.keep(world)
+        for held in self.parts.probation.hand_over():
+            world.history.add(*held)
+
     def _lose(self, world: World, view: View) -> Outcome:
         """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
         self.loop_closing.catch_up(world, view.index, now=True)
+        self.on_trial.take_back(world)
         self.back.waiting.add(*self.parts.probation.views(), view)
         taken_back = self.beginning.lose()
         self.finding.seek()

@@ -20,6 +20,7 @@ class LocalMapping:
         is_later: what is around a keyframe is adjusted while the next frames are tracked; there is no other until then
         """
         parts, adjusting = self.parts, self.adjusting
+        parts.tracker.expect(world.map, tracked)
         why = why_keyframe(view, tracked, world, parts.config.keyframes) if parts.session.mapping else ""
         if why and adjusting:
             adjusting.hurry(view.index)

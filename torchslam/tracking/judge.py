@@ -19,15 +19,14 @@ def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, set
     predicted_T_cw: (4, 4) where the camera was expected; None where nothing was
     track: what the frames before it were like
     """
+    return why_unsound(tracked, predicted_T_cw, settings) or why_strange(tracked, track, settings)
+
+
+def why_unsound(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeConfig) -> str:
+    """Why a pose is not even what its own matches say; empty when it is. Arguments as of `why_doubt`."""
     share = tracked.inliers / max(tracked.matches, 1)
     if share < settings.min_inlier_share:
         return f"only {share:.0%} of {tracked.matches} matches agree with the pose"
-    if track.error > settings.max_error:
-        return f"the matches of the last frames are off by {track.error**0.5:.1f} times their noise in the median"
-    if track.explained < settings.min_explained:
-        return f"the map explains only {track.explained:.0%} of the image"
-    if tracked.coverage < settings.min_coverage:
-        return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     position, rotation = deviations(tracked)
     if position > settings.max_position_std:
         return f"the position is known to {position:.3f} of the scene's depth"
@@ -38,6 +37,17 @@ def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, set
     moved, turned = jump(tracked, predicted_T_cw)
     if moved > settings.max_jump or turned > settings.max_turn_deg:
         return f"jumped by {moved:.2f} of the scene's depth and {turned:.0f} degrees"
+    return ""
+
+
+def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> str:
+    """Why the images of late are not what the map leads to expect; empty when they are."""
+    if track.error > settings.max_error:
+        return f"the matches of the last frames are off by {track.error**0.5:.1f} times their noise in the median"
+    if track.explained < settings.min_explained:
+        return f"the map explains only {track.explained:.0%} of the image"
+    if tracked.coverage < settings.min_coverage:
+        return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     return ""
 
 

@@ -167,7 +167,7 @@ class Tracker:
         if int(inliers.sum()) < settings.min_inliers:
             return None
         T_cw, seen = refined.T_cw, ids[inliers]
-        tracked = Tracked(
+        return Tracked(
             T_cw,
             seen,
             at[inliers],
@@ -178,10 +178,8 @@ class Tracker:
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
             weights=None if weights is None else weights[inliers],
+            expected=near.ids,
         )
-        if self.counts:
-            slam_map.points["times_visible"][near.ids] += 1
-        return tracked
 
     def _project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
         max_angle = self.settings.max_view_angle_deg
@@ -285,11 +283,11 @@ class Tracker:
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
 
-    def see(self, slam_map: Map, tracked: Tracked) -> None:
-        """A frame that was not asked for all that it should see: what it saw was there to be seen."""
+    def expect(self, slam_map: Map, tracked: Tracked) -> None:
+        """A frame is believed: the points that it should see were there to be seen."""
         if self.counts:
-            slam_map.points["times_visible"][tracked.point_ids] += 1
-        self.vouch(slam_map, tracked)
+            expected = tracked.point_ids if tracked.expected is None else tracked.expected
+            slam_map.points["times_visible"][expected] += 1
 
     def vouch(self, slam_map: Map, tracked: Tracked) -> None:
         """A frame is believed: it speaks for the points that it saw."""

@@ -63,6 +63,10 @@ class Table:
                 column[: len(rows)] = kept
         self._size = len(rows)
 
+    def cut(self, size: int) -> None:
+        """Forget the rows from `size` on; the next ones go there."""
+        self._size = min(size, self._size)
+
     def _check(self, rows: dict[str, Tensor]) -> None:
         if rows.keys() != self.schema.keys():
             raise ValueError(f"columns are {sorted(self.schema)}, not {sorted(rows)}")
