@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
+from tests.world.simulated import tracked_at
 from torchslam.config import load_config
 from torchslam.geometry import Noise, Undistorted, se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
@@ -197,6 +198,34 @@ def test_a_frame_that_is_believed_speaks_for_what_it_saw_and_should_have_seen() 
     follower.counts = False
     follower.expect(here.map, tracked)
     assert int((points["times_visible"] - visible).max()) == 2
+
+
+@pytest.mark.parametrize(
+    ("poses", "chosen", "heard"),
+    [
+        ([(50, 100), (90, 100)], 0, 1),  # half agree: nobody else is heard
+        ([(49, 100), None, (60, 61), (90, 90)], 2, 3),
+        ([None, (40, 100), (45, 100), (20, 60)], 2, 4),
+        ([None, None], None, 2),
+    ],
+)
+def test_where_few_of_the_matches_agree_others_are_heard(
+    poses: list[tuple[int, int] | None], chosen: int | None, heard: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, follower = world(), tracker()
+    answers = [
+        None
+        if found is None
+        else tracked_at(pose(), torch.arange(found[0]), torch.arange(found[0]), matches=found[1])
+        for found in poses
+    ]
+    asked = iter(answers)
+    monkeypatch.setattr(follower, "_locate", lambda *_: next(asked))
+    nobody = Pairs(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
+    view = SCENE.view(50, pose())
+    tracked = follower.locate(here.map, view, iter([nobody] * len(poses)), here.track.local_points)
+    assert tracked is (None if chosen is None else answers[chosen])
+    assert len(list(asked)) == len(poses) - heard
 
 
 def test_the_error_is_in_units_of_the_noise() -> None:

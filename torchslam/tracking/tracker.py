@@ -55,6 +55,7 @@ class Tracker:
         self.settings = config.tracking
         self.matching = config.matching
         self.measurement = config.measurement
+        self.least_share = config.judge.min_inlier_share
         self.seed = config.seed
 
     # --- the track -------------------------------------------------------------------------------------------
@@ -129,12 +130,18 @@ class Tracker:
     def locate(
         self, slam_map: Map, view: View, candidates: Iterator[Pairs], local_points: Tensor
     ) -> Tracked | None:
-        """The pose by the first of several sets of matches that gives one, refined against the local points (n,)."""
+        """The pose by the first of several sets of matches that gives one, refined against the local points (n,).
+
+        Where too few of the matches agree with a pose, the next sets are heard too, and most inliers win.
+        """
+        best: Tracked | None = None
         for pairs in candidates:
             tracked = self._locate(slam_map, view, pairs, local_points)
-            if tracked is not None:
-                return tracked
-        return None
+            if tracked is not None and (best is None or tracked.inliers > best.inliers):
+                best = tracked
+            if best is not None and best.inliers >= self.least_share * best.matches:
+                break
+        return best
 
     def _locate(self, slam_map: Map, view: View, pairs: Pairs, local_points: Tensor) -> Tracked | None:
         """PnP RANSAC over matches, then all local points near their projection, then robust refinement."""
