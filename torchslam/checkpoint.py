@@ -56,6 +56,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
         "adjusting": slam.mapper.adjusting.due,
+        "looks_known": slam.looks_known,
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
@@ -135,7 +136,7 @@ def _go_on(
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["adjusting"] is not None:  # of the newest keyframe, around which the map is as it was then
         slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, int(run["adjusting"]))
-        slam.memory.remove(world.map.keys[-1:])  # until it is adjusted
+        slam.looks_known = run["looks_known"]
 
 
 def _check_track(track: Track) -> None:

@@ -45,14 +45,18 @@ class Memory:
         found = (self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.tries].tolist())
         return [candidate for candidate in found if candidate is not None]
 
-    def recognize(self, world: World, keyframe: int) -> Recognition | None:
+    def looks_known(self, world: World, keyframe: int) -> bool:
+        """Whether a keyframe shows a place that was seen before, by the map as it is; nothing is changed."""
+        return self.config.loops.enabled and self.recognizer.recognize(world, keyframe) is not None
+
+    def recognize(self, world: World, keyframe: int, looks_new: bool = False) -> Recognition | None:
         """The place that a keyframe shows, if it was seen before and that is certain.
 
-        What the map knows already of earlier visits is tied to the keyframe.
+        looks_new: it is known that it shows none. What the map knows already of earlier visits is tied to the keyframe.
         """
         if not self.config.loops.enabled:
             return None
-        found = self.recognizer.recognize(world, keyframe)
+        found = None if looks_new else self.recognizer.recognize(world, keyframe)
         if found is None:
             sew_on(world, keyframe, self.camera, self.config)
         return found

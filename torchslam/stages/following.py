@@ -96,6 +96,8 @@ class Following:
         is_settled = self.beginning.youth is None and closing.count == recalls
         if parts.patches.is_enabled and is_settled and not stays:
             parts.patches.add(world, view, tracked)
+        if not is_keyframe and not mapping.is_due(view.index):
+            closing.look_ahead(world)
         world = closing.catch_up(world, view.index)
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)

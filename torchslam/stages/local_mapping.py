@@ -27,12 +27,15 @@ class LocalMapping:
             why = ""
         if why:
             keyframe = parts.mapper.insert(world.map, view, tracked, is_later)
-            if not adjusting:
-                parts.memory.add(world.map, keyframe)
+            parts.memory.add(world.map, keyframe)
             parts.tracker.follow(world, keyframe)
         parts.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
+
+    def is_due(self, frame: int) -> bool:
+        """Whether what was adjusted is taken over with this frame."""
+        return self.adjusting.is_due(frame)
 
     def take_over(self, world: World, frame: int, now: bool = False) -> bool:
         """If it is time, put the map to where the adjustment around the newest keyframe has it; whether it was.
@@ -41,8 +44,7 @@ class LocalMapping:
         """
         if now:
             self.adjusting.hurry(frame)
-        if not self.adjusting.is_due(frame):
+        if not self.is_due(frame):
             return False
         self.parts.mapper.take_over(world.map)
-        self.parts.memory.add(world.map, world.map.num_keyframes - 1)
         return True

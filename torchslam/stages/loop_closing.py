@@ -13,6 +13,7 @@ class LoopClosing:
 
     def __init__(self, parts: Parts, mapping: LocalMapping, beginning: Beginning) -> None:
         self.parts, self.mapping, self.beginning = parts, mapping, beginning
+        self.looks_known: bool | None = None  # whether the newest keyframe's place does; None: not asked yet
 
     @property
     def count(self) -> int:
@@ -22,6 +23,15 @@ class LoopClosing:
     def catch_up(self, world: World, frame: int, now: bool = False) -> World:
         """Take over the adjustment around the newest keyframe when it is due, or `now`, and look back from there."""
         return self.look_back(world) if self.mapping.take_over(world, frame, now) else world
+
+    def look_ahead(self, world: World) -> None:
+        """Ask whether the newest keyframe's place looks known while the adjustment around it is waited for.
+
+        Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
+        """
+        if self.mapping.adjusting and self.looks_known is None:
+            with self.parts.clock("loops"):
+                self.looks_known = self.parts.memory.looks_known(world, world.map.num_keyframes - 1)
 
     def look_back(self, world: World) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.
@@ -37,9 +47,10 @@ class LoopClosing:
 
     def _recall(self, world: World) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
-        parts = self.parts
+        parts, looks_known = self.parts, self.looks_known
+        self.looks_known = None
         with parts.clock("loops"):
-            found = parts.memory.recognize(world, world.map.num_keyframes - 1)
+            found = parts.memory.recognize(world, world.map.num_keyframes - 1, looks_known is False)
             if found is None:
                 return world
             if not found.is_loop:
