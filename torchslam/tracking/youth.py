@@ -7,7 +7,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, epipolar_offsets, se3_inverse
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.matcher import Matcher
+from torchslam.tracking.matcher import Matcher, matched, matcher_of
 from torchslam.values import Start, View
 from torchslam.world.world import World
 
@@ -38,22 +38,25 @@ class Youth:
         """
         if self.age % INTERVAL != 0:
             return None
+        first, last = self.views[0], self.views[-1]
+        threshold_px = config.initialization.threshold_px
+        T_1w, T_2w = self.world.history.T_cw(self.world.map)[0], self.world.T_cw
+        T_21 = T_2w @ se3_inverse(T_1w)
+        pairs = matched(matcher_of(config.matching, matcher), first, last)
+        pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
+        if support(*pixels, T_21, camera, threshold_px) >= LEAST_SUPPORT * len(pairs.first):
+            return None  # no motion can have so much more
         initializer = Initializer(camera, config, matcher)
-        initializer.step(self.views[0])
-        start, _ = initializer.step(self.views[-1])
+        initializer.step(first)
+        start, _ = initializer.step(last)
         if start is None:
             return None
-        T_1w, T_2w = self.world.history.T_cw(self.world.map)[0], self.world.T_cw
-        own, by_map = (
-            support(start, T_21, camera, config.initialization.threshold_px)
-            for T_21 in (start.T_cw, T_2w @ se3_inverse(T_1w))
-        )
+        pixels = first.keypoints[start.keypoints_1], last.keypoints[start.keypoints_2]
+        own, by_map = (support(*pixels, T, camera, threshold_px) for T in (start.T_cw, T_21))
         return start if by_map < LEAST_SUPPORT * own else None
 
 
-def support(start: Start, T_21: Tensor, camera: Camera, threshold_px: float) -> float:
-    """How well a motion T_21 (4, 4) explains the matches of a start: sum of 1 - (error / threshold)^2, if positive."""
-    pixels_1 = start.reference.keypoints[start.keypoints_1]
-    pixels_2 = start.view.keypoints[start.keypoints_2]
+def support(pixels_1: Tensor, pixels_2: Tensor, T_21: Tensor, camera: Camera, threshold_px: float) -> float:
+    """How well a motion T_21 (4, 4) explains matches (n, 2), (n, 2): sum of 1 - (error / threshold)^2, if positive."""
     across, _ = epipolar_offsets(T_21, pixels_1, pixels_2, camera, camera)
     return float((1 - (across / threshold_px) ** 2).clamp_min(0.0).sum())
