@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from torchslam.geometry.implicit import implicit_step
-from torchslam.geometry.least_squares import minimize, small_rotation
+from torchslam.geometry.estimate_gradients import implicit_step
 from torchslam.geometry.lie import so3_exp
+from torchslam.geometry.local_optimization import minimize, small_rotation
 from torchslam.geometry.ransac import (
     is_significant,
     pad_groups,

@@ -75,9 +75,8 @@ def nearest_bits(
     nearest, chosen = torch.div(best, columns, rounding_mode="floor"), best % columns
     accepted = nearest <= limit
     if ratio is not None:
-        rival = (
-            scales.index_select(0, column) / scales.index_select(0, chosen).index_select(0, row) - 1
-        ).abs_() < SAME_SCALE
+        of_nearest = scales.index_select(0, chosen).index_select(0, row)
+        rival = (scales.index_select(0, column) / of_nearest - 1).abs_() < SAME_SCALE
         rival &= keys != best.index_select(0, row)
         others = torch.where(rival, distance.float(), torch.inf)
         second = others.new_full((rows,), torch.inf).scatter_reduce_(0, row, others, "amin")

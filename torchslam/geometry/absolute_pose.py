@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.implicit import implicit_step, needs_gradient
-from torchslam.geometry.least_squares import State, minimize, retract_pose
+from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, se3_exp, transform
+from torchslam.geometry.local_optimization import State, minimize, retract_pose
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import (

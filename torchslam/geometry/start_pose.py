@@ -16,7 +16,7 @@ from torchslam.geometry.absolute_pose import (
     is_success,
     unit_rays,
 )
-from torchslam.geometry.least_squares import State
+from torchslam.geometry.local_optimization import State
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
