@@ -88,6 +88,7 @@ def helpers() -> list[BaseProcess]:
 def come(worker: Worker) -> None:
     end = time.monotonic() + 120
     while not worker.is_there():
+        assert worker._process.exitcode is None, "it died"
         assert time.monotonic() < end, "it never came"
         time.sleep(0.01)
 
