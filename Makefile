@@ -47,7 +47,7 @@ test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## run all that the documentation
 fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB
 	$(BIN)/python -m tests.fuzz
 
-mutation: $(INSTALLED_MUTATION)  ## small changes to the system layer: how many of them do its tests notice?
+mutation: $(INSTALLED_MUTATION)  ## small changes to the system layer: how many of them do the tests notice?
 	$(BIN)/python -m tests.mutation --sample $(SAMPLE) --seed $(SEED)
 
 lint: $(INSTALLED_DEV) types  ## ruff and mypy

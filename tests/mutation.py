@@ -1,4 +1,4 @@
-"""Mutation testing of the system layer: does a small change to it make its own tests fail?
+"""Mutation testing of the system layer, and of what it does for every frame: does a small change make tests fail?
 
 python -m tests.mutation --sample 200 --seed 0
 

@@ -23,8 +23,11 @@ from torchslam.processes import helped
 from torchslam.run import Run, run_sequence
 from torchslam.scouting import Scouting
 from torchslam.slam import SLAM
-from torchslam.values import Followed, State, StepResult
+from torchslam.stages.following import Following
+from torchslam.stages.parts import Outcome
+from torchslam.values import Followed, Frame, State, StepResult, View
 from torchslam.worker import Worker
+from torchslam.world.world import World
 
 CONFIG = load_config(
     None,
@@ -91,6 +94,33 @@ def test_most_frames_are_followed(alone: Run) -> None:
     frames = [index_at[time] for time in alone.trajectory.timestamps.tolist()]
     moved = replace(alone.trajectory, timestamps=truth.timestamps[frames])
     assert evaluate(moved, truth).ate_m < 0.01
+
+
+def test_an_adjustment_is_taken_over_in_its_frame_where_only_patches_are_followed(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(
+        CONFIG, bundle=replace(CONFIG.bundle, window=3, delay=2)
+    )  # few keyframes are enough to wait
+    slam, taken = SLAM(sequence.camera, config), []
+    go_along = Following.go_along
+
+    def watched(self: Following, world: World, frame: Frame, followed: Followed) -> tuple[View, Outcome]:
+        due = slam.mapper.adjusting.due
+        found = go_along(self, world, frame, followed)
+        if due is not None and not slam.mapper.adjusting:
+            taken.append(frame.index == due)
+        return found
+
+    def after(result: StepResult) -> None:
+        due = slam.mapper.adjusting.due
+        assert due is None or due > result.index
+
+    monkeypatch.setattr(Following, "go_along", watched)
+    with pytest.warns(UserWarning, match="skipped a frame"):
+        slam.run(sequence, after)
+    assert taken
+    assert all(taken)
 
 
 def same(one: Run, other: Run) -> bool:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 
 import pytest
 import torch
 
 from torchslam.errors import FrameError
-from torchslam.worker import READY, attempt, outcome, questions, reply, serve, task
+from torchslam.worker import READY, Worker, attempt, outcome, questions, reply, serve, task
 
 
 def fail(error: Exception) -> None:
@@ -54,3 +61,70 @@ def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
 
     serve(work, theirs)
     assert heard == [READY, ("twice", 6), ("twice", 8)]
+
+
+def multiply(connection: Connection, factor: int) -> None:
+    """What a process of these tests does; asked for nothing, it ends as if somebody had killed it."""
+    for number in questions(connection):
+        if number is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        reply(connection, (factor * number, torch.get_num_threads()))
+
+
+@pytest.fixture(params=[True, False], ids=["copied", "spawned"])
+def worker(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
+    if request.param and sys.platform != "linux":
+        pytest.skip("processes are copied on Linux alone")
+    monkeypatch.setattr("torchslam.worker.starts_at_once", lambda: request.param)
+    found = Worker(multiply)
+    yield found
+    found.end()
+
+
+def helpers() -> list[BaseProcess]:
+    return [process for process in multiprocessing.active_children() if process.name == "torchslam helper"]
+
+
+def come(worker: Worker) -> None:
+    end = time.monotonic() + 120
+    while not worker.is_there():
+        assert worker._process.exitcode is None, "it died"
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.01)
+
+
+def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
+    (process,) = helpers()
+    assert process.daemon  # none outlives this one
+    come(worker)
+    assert worker.send(task(3))
+    for number in (1, 2):
+        assert worker.send(pickle.dumps(number))
+        assert worker.receive() == (3 * number, torch.get_num_threads())
+    worker.end()
+    assert not helpers()
+
+
+def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker) -> None:
+    come(worker)
+    assert worker.send(task(3))
+    assert worker.send(pickle.dumps(None))
+    with pytest.warns(UserWarning, match=r"has ended \(-9\): going on without it"):
+        assert worker.receive() is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not worker.is_there()
+        assert not worker.send(pickle.dumps(1))
+        assert worker.receive() is None
+
+
+def test_nothing_is_sent_to_a_process_that_was_not_seen_to_be_there() -> None:
+    worker = Worker(multiply)
+    try:
+        assert not worker.send(task(3))
+        come(worker)
+        assert worker.send(task(4))
+        assert worker.send(pickle.dumps(1))
+        assert worker.receive() == (4, torch.get_num_threads())
+    finally:
+        worker.end()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -78,6 +80,26 @@ def test_corrupt_images_are_counted(tmp_path: Path) -> None:
     columns = run_row(Task(row, str(tmp_path / "all"), pictures=False).as_dict())
     assert columns["status"] in ("error", "no map")
     assert columns["error"]
+
+
+@pytest.mark.parametrize("setting", ["features.weights", "matching.weights"])
+def test_results_are_those_of_the_content_of_the_weights(
+    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.batch.one._run", lambda todo, folder: {"status": "done"})
+    weights = tmp_path / "a.safetensors"
+    row = Row("mine", "synthetic:room", overrides=(f'{setting}="{weights}"',))
+    todo = Task(row, str(tmp_path / "batch"), pictures=False)
+    statuses = []
+    for content in (None, b"first", b"first", b"other"):
+        if content is not None:
+            weights.write_bytes(content)
+            os.utime(weights, ns=(1, 1))
+        replaced = replace(todo, overwrite=content == b"first").as_dict()
+        columns = [run_row(replaced), run_row(todo.as_dict())]
+        statuses.append([(each["status"], each["is_new"]) for each in columns])
+    known, new, stale = ("done", False), ("done", True), ("error", True)
+    assert statuses == [[new, known], [new, known], [known, known], [stale, stale]]
 
 
 def test_live_sources_are_refused(tmp_path: Path) -> None:

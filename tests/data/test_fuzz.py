@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
 
+from tests.fuzz.__main__ import _outcomes
 from tests.fuzz.inputs import clear, numbers, outcome
-from tests.fuzz.readers import readers
+from tests.fuzz.readers import Reader, readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
 from torchslam.data.eth3d_tum import read_image_list
 from torchslam.data.image_file import read_grey
@@ -96,6 +100,47 @@ def test_images(tmp_path: Path, start: bytes, rest: bytes) -> None:
     (tmp_path / "image").write_bytes(start + rest)
     with contextlib.suppress(FrameError):
         assert read_grey(tmp_path / "image", "here").shape[:2] == (1, 1)
+
+
+def spin(root: Path) -> None:
+    while True:
+        sum(range(1000))
+
+
+def spin_deaf(root: Path) -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGPROF, signal.SIGALRM])
+    spin(root)
+
+
+def sleep(root: Path) -> None:
+    time.sleep(1.0)
+
+
+def wait(root: Path) -> None:
+    time.sleep(60.0)
+
+
+@pytest.mark.parametrize(
+    ("read", "patience", "verdict", "where"),
+    [(spin, 0.2, "hang", "in spin"), (sleep, 0.4, "read", ""), (wait, 0.1, "hang", "in wait")],
+)
+def test_patience_is_of_the_processor_and_what_waits_for_ever_ends(
+    tmp_path: Path, read: Callable[[Path], None], patience: float, verdict: str, where: str
+) -> None:
+    found = outcome(Reader("mine", lambda: {"a.txt": b"a"}, read, 1), 0, tmp_path, patience)
+    assert found.verdict == verdict
+    assert where in found.what
+    assert signal.getitimer(signal.ITIMER_PROF) == signal.getitimer(signal.ITIMER_REAL) == (0, 0)
+
+
+def test_a_process_that_no_signal_reaches_is_ended_and_the_next_input_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tests.fuzz.__main__.LOOK", 0.05)
+    verdicts = dict(_outcomes(Reader("mine", lambda: {"a.txt": b"a"}, spin_deaf, 2), [0, 1], patience=0.2))
+    assert [verdicts[number].verdict for number in (0, 1)] == ["hang", "hang"]
+    verdicts = dict(_outcomes(Reader("mine", lambda: {"a.txt": b"a"}, sleep, 2), [0, 1], patience=0.4))
+    assert [verdicts[number].verdict for number in (0, 1)] == ["read", "read"]
 
 
 @pytest.mark.parametrize("name", readers())

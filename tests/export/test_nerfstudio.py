@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from tests.export.conftest import reprojection_error
-from torchslam.export.conventions import upright_rotation
 from torchslam.export.nerfstudio import write_nerfstudio
 from torchslam.export.ply import VERTEX
 from torchslam.export.scene import Scene
+from torchslam.geometry.conventions import upright_rotation
 
 
 def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,11 +14,11 @@ import pytest
 from tests.export.conftest import reprojection_error
 from tests.walks import Walk, arc
 from torchslam.errors import ResultsError
-from torchslam.export.conventions import upright_rotation
 from torchslam.export.images import Images
 from torchslam.export.recording import import_rerun, write_recording
 from torchslam.export.scene import Scene
 from torchslam.export.undistortion import undistorted
+from torchslam.geometry.conventions import upright_rotation
 
 chunks = pytest.importorskip("rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'")
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchslam.features import expand_runs, hamming, match, match_pairs, match_projected, matching
+from torchslam.features import expand_runs, hamming, match, match_pairs, match_projected
+from torchslam.features.windows import window_pairs
 from torchslam.values import Features, Matches
 
 WIDTH, HEIGHT = 320, 240
@@ -343,7 +344,7 @@ def test_matching_moves_to_the_device(device: torch.device) -> None:
 def test_numpy_reference_of_the_windows() -> None:
     first, second = features(2, 60, 14), features(2, 70, 15)
     radius = torch.full((2, 60), 25.0)
-    row, column = matching._window_pairs(first.keypoints, radius, first.mask, second.keypoints, second.mask)
+    row, column = window_pairs(first.keypoints, radius, first.mask, second.keypoints, second.mask)
     apart = np.linalg.norm(first.keypoints.numpy()[:, :, None] - second.keypoints.numpy()[:, None], axis=-1)
     near = (apart <= 25) & first.mask.numpy()[:, :, None] & second.mask.numpy()[:, None]
     b, i, j = np.nonzero(near)

@@ -14,18 +14,23 @@ import select
 import signal
 import sys
 import tempfile
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict
+from io import RawIOBase
 from pathlib import Path
 
 import torch
 
-from tests.fuzz.inputs import MEGABYTES, PATIENCE, Outcome, clear, numbers, outcome
+from tests.fuzz.inputs import MEGABYTES, PATIENCE, WALL, Outcome, clear, numbers, outcome
 from tests.fuzz.readers import Reader, readers
 
-GRACE = 60.0
-"""Seconds of the wall after which a process is taken to hang in what no signal reaches."""
+GRACE = 2.0
+"""Times the patience, of processor and wall, after which a process is taken to hang in what no signal reaches."""
+LOOK = 1.0
+"""Seconds from one look at its use of the processor to the next."""
+TICKS = os.sysconf("SC_CLK_TCK")
 ROOM = 3 * MEGABYTES << 20
 """Bytes of addresses that a process may have beside those of the libraries."""
 GOOD = ("read", "refused")
@@ -34,7 +39,9 @@ GOOD = ("read", "refused")
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--inputs", type=int, default=30_000)
-    parser.add_argument("--patience", type=float, default=PATIENCE, help="seconds of the wall for an input")
+    parser.add_argument(
+        "--patience", type=float, default=PATIENCE, help="seconds of the processor for an input"
+    )
     parser.add_argument("--only", default="", metavar="READER[:NUMBER]")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -98,17 +105,32 @@ def _process(reader: Reader, tried: list[int], patience: float) -> Iterator[tupl
         os.close(receiving)
         _work(reader, tried, sending, patience)
     os.close(sending)
-    with os.fdopen(receiving) as lines:
+    with os.fdopen(receiving, "rb", buffering=0) as lines:  # a line in a buffer would not wake `select`
         for number in tried:
-            ready, _, _ = select.select([lines], [], [], GRACE)
-            line = lines.readline() if ready else ""
+            ready = _answers(lines, child, patience)
+            line = lines.readline() if ready else b""
             if not line:
                 os.kill(child, signal.SIGKILL)
                 _, status = os.waitpid(child, 0)
-                yield number, Outcome("death" if ready else "hang", f"status {status}", GRACE, 0)
+                yield number, Outcome("death" if ready else "hang", f"status {status}", GRACE * patience, 0)
                 return
             yield number, Outcome(**json.loads(line))
     os.waitpid(child, 0)
+
+
+def _answers(lines: RawIOBase, child: int, patience: float) -> bool:
+    """Whether a line, or the end, comes from a process before it is taken to hang."""
+    limit, end = _processor(child) + GRACE * patience, time.monotonic() + GRACE * WALL * patience
+    while _processor(child) < limit and time.monotonic() < end:
+        if select.select([lines], [], [], LOOK)[0]:
+            return True
+    return False
+
+
+def _processor(process: int) -> float:
+    """Seconds of the processor that a process, or what is left of it, has used."""
+    numbers = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, numbers[11:13])) / TICKS  # utime and stime, proc(5)
 
 
 def _work(reader: Reader, tried: list[int], sending: int, patience: float) -> None:

@@ -19,8 +19,11 @@ from tests.fuzz.readers import Reader
 from torchslam.errors import TorchslamError
 
 SECONDS = 10.0
-"""No input may take longer."""
+"""Of the processor: no input may take longer, however busy the machine is."""
 PATIENCE = 3 * SECONDS
+"""After so many it is ended."""
+WALL = 20
+"""Times the patience, on the wall: the end of what waits for ever, for which the processor has nothing to do."""
 MEGABYTES = 1024
 """Nor more memory on top of what the program has."""
 LONGEST = 4000
@@ -54,7 +57,7 @@ def mutated(reader: Reader, number: int) -> Mutated:
 
 
 def outcome(reader: Reader, number: int, scratch: Path, patience: float = PATIENCE) -> Outcome:
-    """Write the input, read it and judge. patience: seconds of the wall, which may be longer on a busy machine."""
+    """Write the input, read it and judge. patience: seconds of the processor; WALL times as many on the wall."""
     root = scratch / "wrong input"
     shutil.rmtree(root, ignore_errors=True)
     root.mkdir()
@@ -64,14 +67,13 @@ def outcome(reader: Reader, number: int, scratch: Path, patience: float = PATIEN
     except (OSError, ValueError):  # a name that the system does not take
         return Outcome("read", "", 0.0, 0.0)
     before, start = _memory(reset=True), time.process_time()
-    signal.signal(signal.SIGALRM, _stop)
-    signal.setitimer(signal.ITIMER_REAL, patience)
+    _stop_after(patience)
     try:
         verdict, what = _verdict(reader, root)
     except TooLong:
         verdict, what = "hang", traceback.format_exc(limit=-3)
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        _stop_after(0)
     seconds, megabytes = time.process_time() - start, _memory() - before
     if verdict in ("read", "refused") and (seconds > SECONDS or megabytes > MEGABYTES):
         verdict, what = "too much", f"{seconds:.1f} s, {megabytes:.0f} MB"
@@ -102,6 +104,16 @@ def _judged(reader: Reader, message: str, root: Path) -> tuple[str, str]:
     if not any(place in message for place in places):
         return "unclear", f"no place: {message[:200]}"
     return "refused", ""
+
+
+def _stop_after(seconds: float) -> None:
+    """Raise TooLong in here after seconds of the processor, or WALL times as many on the wall; 0: no longer."""
+    for timer, sent, factor in (
+        (signal.ITIMER_PROF, signal.SIGPROF, 1),
+        (signal.ITIMER_REAL, signal.SIGALRM, WALL),
+    ):
+        signal.signal(sent, _stop)
+        signal.setitimer(timer, factor * seconds)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

@@ -24,24 +24,6 @@ def test_finds_the_pose_among_wrong_pairs(camera: Camera, outliers: float) -> No
         assert float((result.inliers[0] == right).double().mean()) > 0.97
 
 
-@pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial_tangential", "fisheye"])
-def test_without_the_distortion_it_is_a_start(camera: Camera) -> None:
-    """Near the pose of least error, but not it; as good on exact data; without a gradient."""
-    exact, _, T_cw = points_and_pixels(0, outliers=0.2, noise=0.0, camera=camera)
-    points_w, pixels, _ = points_and_pixels(0, outliers=0.2, noise=1.0, camera=camera)
-    assert torch.equal(points_w, exact)
-    whole = estimate_absolute_pose(points_w, pixels, camera)
-    start = estimate_absolute_pose(points_w, pixels, camera, through_distortion=False)
-    assert bool(start.success)
-    between = se3_log(start.T_cw @ torch.linalg.inv(whole.T_cw)).norm()
-    assert 1e-6 < float(between) < 0.01
-    pixels = points_and_pixels(0, outliers=0.2, noise=0.0, camera=camera)[1]
-    start = estimate_absolute_pose(points_w, pixels, camera, through_distortion=False)
-    torch.testing.assert_close(start.T_cw, T_cw, atol=1e-8, rtol=0)
-    with pytest.raises(ValueError, match="has no gradient for a camera that distorts"):
-        estimate_absolute_pose(points_w, pixels.requires_grad_(), camera, through_distortion=False)
-
-
 def test_is_as_good_as_poselib() -> None:
     ours, theirs = [], []
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}

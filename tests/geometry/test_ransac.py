@@ -3,13 +3,14 @@ import math
 import pytest
 import torch
 
-from torchslam.geometry.implicit import implicit_step
-from torchslam.geometry.least_squares import minimize, small_rotation
+from torchslam.geometry.estimate_gradients import implicit_step
 from torchslam.geometry.lie import so3_exp
+from torchslam.geometry.local_optimization import minimize, small_rotation
 from torchslam.geometry.ransac import (
     is_significant,
     pad_groups,
     sample_minimal,
+    sample_minimal_of_all,
     samples_needed,
     truncated_score,
 )
@@ -26,6 +27,13 @@ def test_samples_are_distinct_rows_of_the_mask_and_repeatable() -> None:
         assert allowed[rows].all()
         assert all(len(set(row)) == 5 for row in rows.tolist())
         assert set(rows.flatten().tolist()) == set(allowed.nonzero().flatten().tolist())
+
+
+@pytest.mark.parametrize("rows", [3, 4, 40])
+def test_samples_of_all_rows_are_those_of_a_mask_that_has_all(rows: int) -> None:
+    mask = torch.ones(1, rows, dtype=torch.bool)
+    masked = sample_minimal(mask, 3, 25, torch.Generator().manual_seed(1))[0]
+    assert torch.equal(sample_minimal_of_all(rows, 3, 25, torch.Generator().manual_seed(1)), masked)
 
 
 @pytest.mark.parametrize("available", [0, 1, 2])
@@ -53,6 +61,18 @@ def test_significance_grows_with_inliers_and_falls_with_chance() -> None:
     inliers, available = torch.tensor((5, 10, 60, 60)), torch.tensor((100, 100, 100, 100))
     chance = torch.tensor((0.005, 0.005, 0.005, 0.6))
     assert is_significant(inliers, available, 5, chance, 10).tolist() == [False, False, True, False]
+
+
+def test_significance_is_the_published_number_of_false_alarms() -> None:
+    """Of 100 rows, samples of 5 with 10 solutions: (n - s) solutions C(n, k) C(k, s) p^(k - s), below 0.001."""
+    for chance in (0.01, 0.1, 0.3):
+        alarms = [950 * math.comb(100, k) * math.comb(k, 5) * chance ** (k - 5) for k in range(101)]
+        expected = [k > 5 and alarms[k] < 1e-3 for k in range(101)]
+        found = is_significant(
+            torch.arange(101), torch.full((101,), 100), 5, torch.full((101,), chance).double(), 10
+        )
+        assert found.tolist() == expected
+        assert any(expected)
 
 
 def test_pad_groups() -> None:

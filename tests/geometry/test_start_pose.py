@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from tests.geometry.geometry_scenes import CAMERA, points_and_pixels, rotation_error
-from torchslam.geometry import Camera, Undistorted, estimate_absolute_pose, se3_inverse, start_pose
+from torchslam.geometry import Camera, Undistorted, estimate_absolute_pose, se3_inverse, se3_log, start_pose
 
 DISTORTED = Camera.radial_tangential(
     458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 2e-4, 2e-5, size=(752, 480)
 )  # as of machine_hall
+FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
@@ -40,6 +41,20 @@ def test_it_explains_as_much_as_the_long_way() -> None:
         agrees = ((projected - pixels[0]).norm(dim=1) < 3.0) & valid
         counts.append(int(agrees.sum()) / int(wanted.inliers.sum()))
     assert min(counts) > 0.97
+
+
+@pytest.mark.parametrize("camera", [DISTORTED, FISHEYE], ids=["distorted", "fisheye"])
+def test_it_is_exact_on_exact_data_and_a_start_on_noisy_ones(camera: Camera) -> None:
+    """With noise near the pose of least error, but not it: the error is that of undistorted coordinates."""
+    apart = []
+    for noise in (0.0, 1.0):
+        points_w, pixels, truth = points_and_pixels(0, 150, 0.2, noise, camera)
+        T_cw = start_pose(points_w[0], Undistorted.of(pixels[0], camera), camera.size, 2.0)
+        assert T_cw is not None
+        best = estimate_absolute_pose(points_w, pixels, camera).T_cw[0] if noise else truth[0]
+        apart.append(float(se3_log(T_cw @ se3_inverse(best)).norm()))
+    assert apart[0] < 1e-8
+    assert 1e-6 < apart[1] < 0.01
 
 
 def test_wrong_matches_alone_give_no_pose() -> None:

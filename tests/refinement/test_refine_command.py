@@ -16,9 +16,9 @@ from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.calibration_files import read_calibration
 from torchslam.data.given_poses import read_poses
 from torchslam.data.trajectory_file import write_trajectory
-from torchslam.export.conventions import opengl, quaternion_wxyz
 from torchslam.export.nerfstudio import nerfstudio_camera
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.conventions import opengl, quaternion_wxyz
 from torchslam.refinement.frame import back_to_given
 from torchslam.values import Trajectory
 

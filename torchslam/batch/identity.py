@@ -1,4 +1,4 @@
-"""What a result is the result of, as hashes: of the settings and the program, and of the files that were read."""
+"""What a result is the result of, as hashes: of settings and program, of the files that were read, of weights."""
 
 from __future__ import annotations
 
@@ -54,6 +54,17 @@ def of_files(paths: list[str]) -> str:
             found.update(f"{name}\0{status.st_size} {status.st_mtime_ns}\0".encode(errors="surrogateescape"))
         found.update(b"\1")
     return found.hexdigest()[:DIGITS]
+
+
+def of_content(path: str) -> str:
+    """A hash of what is in a file, such as one of weights: another one may be given the size and time of the last.
+
+    What is no file counts as in `of_files`. Raises OSError for one that cannot be read.
+    """
+    if not os.path.isfile(path):
+        return of_files([path])
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:DIGITS]
 
 
 def _files(path: str) -> Iterator[tuple[str, os.stat_result]]:

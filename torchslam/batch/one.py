@@ -104,10 +104,13 @@ def configuration(task: Task) -> str:
 
 def _input(task: Task) -> str:
     """A hash of the files that the row reads."""
-    row, weights = task.row, settings_of(task.row).features.weights
+    row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
-    paths = [row.path(name) for name in names if name]
-    return identity.of_files([*paths, *([weights] if weights else [])])
+    files = identity.of_files([row.path(name) for name in names if name])
+    weights = [settings.features.weights, settings.matching.weights]
+    return identity.digest(
+        {"files": files, "weights": [identity.of_content(name) for name in weights if name]}
+    )
 
 
 def open_row(row: Row) -> Sequence:

@@ -29,7 +29,6 @@ from torchslam.commands import arguments
 from torchslam.data.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.export.colmap import colmap_camera, write_colmap
-from torchslam.export.conventions import upright_rotation
 from torchslam.export.images import WITHOUT, Images, open_images, write_images
 from torchslam.export.kitti import write_kitti
 from torchslam.export.nerfstudio import IMAGES, write_nerfstudio
@@ -38,6 +37,7 @@ from torchslam.export.recording import import_rerun, write_recording
 from torchslam.export.scene import Scene, scene_of
 from torchslam.export.undistortion import undistorted
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.conventions import upright_rotation
 from torchslam.output.report import table
 from torchslam.output.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
 from torchslam.run import keyframe_rows, keyframe_trajectory

@@ -16,9 +16,9 @@ from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.text_file import numbered_lines, parse_floats, read_text
 from torchslam.data.yaml_text import yaml_numbers, yaml_value
 from torchslam.errors import CalibrationError
+from torchslam.geometry.conventions import HALF_PIXEL
 from torchslam.regular_file import JSON_BYTES, parse_json
 
-HALF_PIXEL = 0.5
 MAX_BYTES = 1 << 18
 LARGEST = 1e12  # numbers in JSON have any number of digits
 FISHEYES = ("equidistant", "fisheye", "kannala", "opencv_fisheye")

@@ -20,7 +20,7 @@ from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.text_file import parse_floats, read_text
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.errors import CalibrationError, TrajectoryError
-from torchslam.export.conventions import opengl
+from torchslam.geometry.conventions import opengl
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from torchslam.export.conventions import corner_camera, corner_pixels, quaternion_wxyz
 from torchslam.export.scene import Scene
 from torchslam.geometry import Camera
+from torchslam.geometry.conventions import corner_camera, corner_pixels, quaternion_wxyz
 
 CAMERA_ID = 1
 MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchslam.export.conventions import corner_camera, opengl
 from torchslam.export.ply import write_ply
 from torchslam.export.scene import Scene
 from torchslam.geometry import Camera
+from torchslam.geometry.conventions import corner_camera, opengl
 
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.export.conventions import upright_rotation
 from torchslam.geometry import se3_inverse
+from torchslam.geometry.conventions import upright_rotation
 from torchslam.run import keyframe_rows
 from torchslam.world.map import Map
 

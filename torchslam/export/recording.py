@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from torchslam.errors import ResultsError
-from torchslam.export.conventions import corner_camera, corner_pixels
 from torchslam.export.images import Images
 from torchslam.export.scene import Scene
 from torchslam.geometry import Camera
+from torchslam.geometry.conventions import corner_camera, corner_pixels
 
 APPLICATION = "torchslam"
 JPEG_QUALITY = 90

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.features.bits import hamming, hamming_pairs, sign_products
 from torchslam.features.contract import NORMALIZE, are_comparable
+from torchslam.features.windows import SAME_SCALE, nearest_bits, window_pairs
 from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
 
@@ -22,9 +23,10 @@ _AMPLITUDE = 64
 _INDEX_BITS = 13
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
+SCALE_TOLERANCE = 1.5
+"""Factor between the scale that is expected of a keypoint and the one that it has."""
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _PIECE = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
-_BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
 
 
 class _Nearest(NamedTuple):
@@ -100,7 +102,7 @@ def match_projected(
     angles: Tensor | None = None,
     ratio: float | None = 0.9,
     max_distance: float | None = 64,
-    scale_tolerance: float = 1.5,
+    scale_tolerance: float = SCALE_TOLERANCE,
     angle_tolerance: float = math.pi / 6,
 ) -> Matches:
     """Match points with known descriptors to the keypoints near their predicted pixels.
@@ -123,10 +125,11 @@ def match_projected(
     if rows == 0 or columns == 0:
         return _no_matches(batch, rows, pixels.device)
     radius = torch.as_tensor(radius, dtype=pixels.dtype, device=pixels.device).expand(batch, rows)
-    mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if mask is None else mask
-    row, column = _window_pairs(
-        pixels.detach(), radius.detach(), mask, features.keypoints.detach(), features.mask
-    )
+    is_near = pixels.detach().abs().amax(-1) < _FAR  # false for NaN as well
+    mask = is_near if mask is None else mask & is_near
+    at = torch.where(mask[..., None], pixels.detach(), 0)
+    around = torch.where(mask, radius.detach(), 0)
+    row, column = window_pairs(at, around, mask, features.keypoints.detach(), features.mask)
 
     keypoint_scales = features.scales.detach().flatten()
     if scales is not None:
@@ -137,6 +140,13 @@ def match_projected(
         row, column = _where(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
 
     distances = _pair_distances(descriptors.flatten(0, 1), row, features.descriptors.flatten(0, 1), column)
+    if descriptors.dtype == torch.uint8:
+        bits = 8 * descriptors.shape[-1]
+        limit = bits if max_distance is None else min(max_distance, bits)
+        first, second, distance = nearest_bits(
+            row, column, distances.long(), batch * rows, keypoint_scales, ratio, limit
+        )
+        return _matches_of(first, second, distance, batch, rows, columns)
     best, accepted, distance = _best_of_pairs(row, column, distances, keypoint_scales, batch * rows, ratio)
     if max_distance is not None:
         accepted = accepted & (distance <= max_distance)
@@ -165,14 +175,6 @@ def match_pairs(
     kept = torch.nonzero(found).squeeze(1)
     kept = kept[row[column[kept]] == kept]
     return kept, column[kept]
-
-
-def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-    """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
-    counts = ends - starts
-    run = torch.repeat_interleave(counts)
-    shift = starts - (counts.cumsum(0) - counts)
-    return run, torch.arange(run.shape[0], device=run.device) + _take(shift, run)
 
 
 def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
@@ -239,44 +241,6 @@ def _dual_softmax(
     return both.gather(2, column[..., None])[..., 0]
 
 
-def _window_pairs(
-    pixels: Tensor, radius: Tensor, mask: Tensor, keypoints: Tensor, keypoint_mask: Tensor
-) -> tuple[Tensor, Tensor]:
-    """All pairs of a point and a keypoint within its radius: flat rows b * M + i, ascending, and columns b * N + j.
-
-    Keypoints are sorted by band of _BAND rows, then by x: what a window takes of a band is one run in that order.
-    """
-    batch = mask.shape[0]
-    mask = mask & (pixels.abs().amax(-1) < _FAR)  # false for NaN as well
-    pixels = torch.where(mask[..., None], pixels, 0)
-    low_band, high_band = (torch.floor((pixels[..., 1] + sign * radius) / _BAND) for sign in (-1, 1))
-    keypoint_band = torch.floor(keypoints[..., 1] / _BAND)
-    # A lone number per (image, band), with room between images for windows that leave the image.
-    first = torch.minimum(low_band.amin(), keypoint_band.amin())
-    per_image = torch.maximum(high_band.amax(), keypoint_band.amax()) - first + 1
-    image = torch.arange(batch, device=pixels.device)[:, None] * per_image - first
-    width = 2 + 2 * torch.maximum((pixels[..., 0].abs() + radius).amax(), keypoints[..., 0].abs().amax())
-
-    def key(band: Tensor, x: Tensor) -> Tensor:
-        return (image.view(-1, *[1] * (band.dim() - 1)) + band).double() * width + x
-
-    keys = key(keypoint_band, keypoints[..., 0]).masked_fill(~keypoint_mask, torch.inf).flatten()
-    keys, order = keys.sort(stable=True)
-    spans = int((high_band - low_band).masked_fill(~mask, 0).amax()) + 1
-    bands = low_band[..., None] + torch.arange(spans, device=pixels.device)
-    used = mask[..., None] & (bands <= high_band[..., None])
-    left, right = (
-        torch.searchsorted(keys, key(bands, (pixels[..., 0] + sign * radius)[..., None]), right=sign > 0)
-        for sign in (-1, 1)
-    )
-    run, place = expand_runs(left.flatten(), torch.where(used, right, left).flatten())
-    row, column = torch.div(run, spans, rounding_mode="floor"), _take(order, place)
-    dx, dy = (
-        _take(keypoints[..., k].flatten(), column) - _take(pixels[..., k].flatten(), row) for k in (0, 1)
-    )
-    return _where(dx.square() + dy.square() <= _take(radius.flatten() ** 2, row), row, column)
-
-
 def _take(values: Tensor, rows: Tensor) -> Tensor:
     """values[rows], several times faster on the CPU."""
     return values.index_select(0, rows)
@@ -320,7 +284,7 @@ def _best_of_pairs(
     if distances.requires_grad:
         distance = torch.where(found, distances[best_pair], torch.inf)
     if ratio is not None and scales is not None:
-        same = (_take(scales, column) / _take(scales[best], row) - 1).abs() < 0.05
+        same = (_take(scales, column) / _take(scales[best], row) - 1).abs() < SAME_SCALE
         rival_row, rival_value = _where(same & ~chosen, row, values)
         second = _lowest(rival_row, rival_value, rows)
         found = found & (nearest < ratio * second)
@@ -356,6 +320,16 @@ def _matches(column: Tensor, distances: Tensor, mask: Tensor, weights: Tensor | 
         mask,
         weights,
     )
+
+
+def _matches_of(
+    first: Tensor, second: Tensor, distance: Tensor, batch: int, rows: int, columns: int
+) -> Matches:
+    """Matches of flat rows b * M + i (m,) with flat columns b * N + j (m,)."""
+    mask = torch.zeros(batch * rows, dtype=torch.bool, device=first.device).index_fill_(0, first, True)
+    column = first.new_zeros(batch * rows).index_copy_(0, first, second % columns)
+    distances = distance.new_zeros(batch * rows).index_copy_(0, first, distance)
+    return _matches(column.view(batch, rows), distances.view(batch, rows), mask.view(batch, rows))
 
 
 def _no_matches(batch: int, rows: int, device: torch.device) -> Matches:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.implicit import implicit_step, needs_gradient
-from torchslam.geometry.least_squares import State, minimize, retract_pose
+from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, se3_exp, transform
+from torchslam.geometry.local_optimization import State, minimize, retract_pose
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import (
@@ -33,10 +33,11 @@ from torchslam.geometry.ransac import (
     valid_first,
 )
 
-_FIRST_ROUND = 160  # samples
-_CANDIDATES = 2  # hypotheses of each round that are optimised
-_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 1, 10
-_FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
+FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
+CANDIDATES = 2  # hypotheses of each round that are optimised
+LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
+FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
+_ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
 
 
 @dataclass(frozen=True)
@@ -65,15 +66,12 @@ def estimate_absolute_pose(
     seed: int = 0,
     confidence: float = 0.9999,
     max_samples: int = 3000,
-    through_distortion: bool = True,
 ) -> AbsolutePose:
     """Poses of B cameras by RANSAC over P3P, with local optimisation and a least-squares refinement.
 
     points_w:  (B, N, 3); pixels: (B, N, 2)
     threshold: reprojection error of an inlier in pixels
     mask:      (B, N), rows outside it, or with NaN, are ignored
-    through_distortion: without it the least squares is that of undistorted coordinates, in pixels at each of them:
-               enough for a start, in two thirds of the time; there is no gradient then where the camera distorts
 
     The same arguments and seed give the same result. Too few points, points on a line, or pure noise give `success`
     False for that camera.
@@ -98,15 +96,13 @@ def estimate_absolute_pose(
     points_w = torch.where(mask[..., None], points_w, 0.0)
     pixels = torch.where(mask[..., None], pixels, 0.0)
     statics = camera.model, list(camera.size), threshold
-    effort = seed, confidence, max_samples, through_distortion
+    effort = seed, confidence, max_samples
     compiling = torch.compiler.is_compiling()
     find = torch.ops.torchslam.absolute_pose if compiling else find_absolute_pose
     detached = points_w.detach(), pixels.detach(), camera.params.detach()
     T_cw, success, squared, score = find(*detached, mask, *statics, *effort)
     mask = mask & success[:, None]
-    inputs, used = [points_w, pixels, camera.params], (squared < _FINAL_WIDTH**2) & mask
-    if needs_gradient(*inputs) and not through_distortion and camera.model != "pinhole":
-        raise ValueError("through_distortion=False has no gradient for a camera that distorts")
+    inputs, used = [points_w, pixels, camera.params], (squared < FINAL_WIDTH**2) & mask
     if compiling:
         T_cw = torch.ops.torchslam.attached_absolute_pose(T_cw, inputs, [used], *statics[:2])
     elif needs_gradient(*inputs):
@@ -142,8 +138,6 @@ class _Problem:
         camera = camera.with_params(params.expand(len(points), -1))
         normalized = camera.normalize(pixels)
         ones = torch.ones_like(normalized[..., :1])
-        rays = torch.cat((normalized, ones), dim=-1)
-        rays = rays / rays.norm(dim=-1, keepdim=True)
         return _Problem(
             points,
             pixels,
@@ -151,7 +145,7 @@ class _Problem:
             threshold,
             mask,
             centre,
-            rays,
+            unit_rays(normalized),
             torch.cat((points, ones), dim=-1).mT,
             normalized,
             camera.pixel_scale(normalized) / threshold,
@@ -165,9 +159,7 @@ class _Problem:
         chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
         return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
 
-    def solve(
-        self, seed: int, confidence: float, max_samples: int, through_distortion: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
         generator = torch.Generator().manual_seed(seed)
         (P,) = search(
@@ -175,12 +167,13 @@ class _Problem:
             self.mask.sum(-1),
             3,
             confidence,
-            _FIRST_ROUND,
+            FIRST_ROUND,
             max_samples,
         )
-        P = self.refine(P, through_distortion)
+        P = self.refine(P)
         squared = self.squared_errors(P)
-        success = _is_success((squared < 1) & self.mask, self.mask, self.points, self.camera, self.threshold)
+        inliers = (squared < 1) & self.mask
+        success = is_success(inliers, self.mask, self.points, self.camera.size, self.threshold)
         score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
         R = P[..., :3]
         T_cw = rigid(R, P[..., 3] - (R @ self.centre[..., None]).squeeze(-1))
@@ -194,10 +187,10 @@ class _Problem:
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
         first = valid_first(valid)
         P = gather_rows(torch.cat((R, t[..., None]), dim=-1).flatten(2), first)
-        count = min(_CANDIDATES, P.shape[1])
+        count = min(CANDIDATES, P.shape[1])
         best = best_models(self.score, P, valid.gather(1, first), self.mask, count, generator)
         P = gather_rows(P, best).unflatten(-1, (3, 4))
-        P, cost = self.fit(P, _LOCAL_ITERATIONS, 1.0)
+        P, cost = self.fit(P, LOCAL_ITERATIONS, 1.0)
         cost, best = cost.nan_to_num(torch.inf).min(dim=1)
         P = P[torch.arange(len(best), device=best.device), best]
         near = (self.undistorted_errors(P) < SUPPORT_WIDTH**2) & self.mask
@@ -232,10 +225,10 @@ class _Problem:
         squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
         return squared.masked_fill(~valid, torch.inf)
 
-    def refine(self, P: Tensor, through_distortion: bool) -> Tensor:
-        """The poses (B, 3, 4) of least truncated squared reprojection error, or that of undistorted coordinates."""
-        P = self.fit(P[:, None], _FINAL_ITERATIONS, _FINAL_WIDTH)[0][:, 0]
-        if self.camera.model == "pinhole" or not through_distortion:
+    def refine(self, P: Tensor) -> Tensor:
+        """The poses (B, 3, 4) of least truncated squared reprojection error."""
+        P = self.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
+        if self.camera.model == "pinhole":
             return P  # whose undistorted coordinates are pixels up to their scale
 
         def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
@@ -243,27 +236,36 @@ class _Problem:
             projected, valid, J = self.camera.project_with_point_jacobians(points_c)
             residual = projected - self.pixels
             squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / self.threshold**2
-            used, cost = truncated_rows(squared[:, None], self.mask, _FINAL_WIDTH)
+            used, cost = truncated_rows(squared[:, None], self.mask, FINAL_WIDTH)
             J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
             rows = torch.cat((J, J_rotation, residual[..., None]), dim=-1) * used[:, 0, :, None, None]
             rows = rows.flatten(1, 2)
             return torch.bmm(rows.mT, rows), cost[:, 0]
 
-        (P,), _ = minimize((P,), evaluate, retract_pose, _FINAL_ITERATIONS)
+        (P,), _ = minimize((P,), evaluate, retract_pose, FINAL_ITERATIONS)
         return P
 
 
-def _is_success(inliers: Tensor, mask: Tensor, points: Tensor, camera: Camera, threshold: float) -> Tensor:
-    """Whether the inliers are no accident, and fix the pose: four or more, not on one line. (B,)."""
-    chance = torch.full_like(
-        mask[:, 0], math.pi * threshold**2 / (camera.width * camera.height), dtype=torch.float64
-    )
+def unit_rays(normalized: Tensor) -> Tensor:
+    """Directions (..., N, 3) of unit length of undistorted coordinates (..., N, 2)."""
+    rays = torch.nn.functional.pad(normalized, (0, 1), value=1.0)
+    return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+
+
+def is_success(
+    inliers: Tensor, mask: Tensor, points: Tensor, size: tuple[int, int], threshold: float
+) -> Tensor:
+    """Whether inliers (B, N) of rows (B, N) are no accident, and fix the pose: four or more, not on one line. (B,).
+
+    points: (B, N, 3) about their mean; size: of the image; threshold: of an inlier, pixels
+    """
+    chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
     weights = inliers[..., None].to(points.dtype)
     mean = (weights * points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
     centred = weights * (points - mean)
     spread = torch.linalg.eigvalsh(centred.mT @ centred)
-    return significant & (spread[:, 1] > 1e-6 * spread[:, 2])
+    return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
 
 
 def find_absolute_pose(
@@ -278,7 +280,7 @@ def find_absolute_pose(
 ) -> tuple[Tensor, ...]:
     """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
 
-    effort: seed, confidence, max_samples and through_distortion of `estimate_absolute_pose`
+    effort: seed, confidence and max_samples of `estimate_absolute_pose`
     """
     with torch.inference_mode():  # less work per operation than without gradients only
         camera = Camera(model, params, (size[0], size[1]))

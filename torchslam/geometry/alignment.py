@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry.implicit import first_order, needs_gradient
+from torchslam.geometry.estimate_gradients import first_order, needs_gradient
 from torchslam.geometry.lie import so3_exp, vee
 from torchslam.geometry.precision import full_precision
 

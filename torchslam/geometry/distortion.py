@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchslam.geometry.implicit import first_order, needs_gradient
+from torchslam.geometry.estimate_gradients import first_order, needs_gradient
 
 _NEWTON_STEPS = 12
 

@@ -64,7 +64,7 @@ operator("five_point", "(Tensor x_1, Tensor x_2) -> (Tensor, Tensor)", _five_poi
 operator(
     "absolute_pose",
     "(Tensor points_w, Tensor pixels, Tensor params, Tensor mask, str model, int[] size, float threshold, int seed, "
-    "float confidence, int max_samples, bool through_distortion) -> (Tensor, Tensor, Tensor, Tensor)",
+    "float confidence, int max_samples) -> (Tensor, Tensor, Tensor, Tensor)",
     _absolute_pose,
     _absolute_pose_like,
 )

@@ -14,7 +14,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchslam.geometry.least_squares import (
+from torchslam.geometry.local_optimization import (
     State,
     generators,
     in_parts,

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchslam.geometry.least_squares import State
+from torchslam.geometry.local_optimization import State
 
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
@@ -39,6 +39,13 @@ def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generat
     return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
 
 
+def sample_minimal_of_all(rows: int, size: int, count: int, generator: torch.Generator) -> Tensor:
+    """(count, size): the samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
+    each = rows // size
+    order = torch.rand(math.ceil(count / each), rows, generator=generator).argsort(1)
+    return order[:, : size * each].reshape(-1, size)[:count]
+
+
 def best_models(
     score: Callable[[Tensor, Tensor | None], Tensor],
     models: Tensor,
@@ -61,9 +68,14 @@ def best_models(
 
 
 def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: float) -> Tensor:
-    """How many samples contain, with the given confidence, one without outliers. (B,), (B,) -> (B,)."""
-    ratio = (inliers / available.clamp_min(1)).clamp(1e-6, 1 - 1e-6)
-    return math.log(1 - confidence) / torch.log1p(-(ratio**size).clamp_max(1 - 1e-6))
+    """How many samples contain, with the given confidence, one without outliers. (B,), (B,) -> (B,) float64.
+
+    Computed on the host, where a number costs less than a call.
+    """
+    ratios = [k / max(n, 1) for k, n in zip(inliers.tolist(), available.tolist(), strict=True)]
+    clean = [min(max(ratio, 1e-6), 1 - 1e-6) ** size for ratio in ratios]
+    needed = [math.log(1 - confidence) / math.log1p(-min(share, 1 - 1e-6)) for share in clean]
+    return torch.tensor(needed, dtype=torch.float64)
 
 
 def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
@@ -106,6 +118,8 @@ def search(
 
     def propose_in_parts(rows: Tensor, count: int) -> tuple[State, Tensor, Tensor]:
         """Few problems at a time, so that what they compute stays in the cache."""
+        if len(rows) * count <= _SAMPLES_AT_ONCE:
+            return propose(rows, count)
         parts = [propose(part, count) for part in rows.split(max(1, _SAMPLES_AT_ONCE // count))]
         models, scores, supports = zip(*parts, strict=True)
         return tuple(torch.cat(x) for x in zip(*models, strict=True)), torch.cat(scores), torch.cat(supports)
@@ -114,9 +128,10 @@ def search(
     models, best, support = propose_in_parts(rows, first_round)
     drawn, count = first_round, first_round
     while drawn < max_samples:
-        rows = (samples_needed(support, available, size, confidence) > drawn).nonzero().squeeze(-1)
-        if len(rows) == 0:
+        is_open = samples_needed(support, available, size, confidence) > drawn
+        if not bool(is_open.any()):
             break
+        rows = is_open.nonzero().squeeze(-1).to(available.device)
         count = min(2 * count, max_samples - drawn)
         drawn += count
         new, score, new_support = propose_in_parts(rows, count)
@@ -135,14 +150,20 @@ def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor
     minimal sample of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
     matches between two images", 2004, eq. for the number of false alarms.
     """
-    n, k = available.double(), inliers.double()
-    rest = (n - k).clamp_min(0.0)
-    # n over k times k over size, but for what cancels
-    factorials = torch.lgamma(torch.stack((n, rest, (k - size).clamp_min(0.0))) + 1)
-    log_choices = factorials[0] - factorials[1] - factorials[2] - math.lgamma(size + 1)
-    log_alarms = log_choices + (k - size) * torch.log(chance.double().clamp(1e-12, 1))
-    log_alarms = log_alarms + torch.log(solutions * (n - size).clamp_min(1.0))
-    return (k > size) & (log_alarms < math.log(1e-3))
+    problems = zip(inliers.tolist(), available.tolist(), chance.tolist(), strict=True)
+    logs = [_log_false_alarms(k, n, size, p, solutions) for k, n, p in problems]
+    return torch.tensor([log < math.log(1e-3) for log in logs], dtype=torch.bool, device=inliers.device)
+
+
+def _log_false_alarms(inliers: int, available: int, size: int, chance: float, solutions: int) -> float:
+    """For one problem: on the host a number costs less than a call."""
+    if inliers <= size:
+        return math.inf
+    # available over inliers times inliers over size, but for what cancels
+    rest, others = max(available - inliers, 0), inliers - size
+    choices = math.lgamma(available + 1) - math.lgamma(rest + 1) - math.lgamma(others + 1)
+    alarms = choices - math.lgamma(size + 1) + others * math.log(min(max(chance, 1e-12), 1.0))
+    return alarms + math.log(solutions * max(available - size, 1))
 
 
 def valid_first(valid: Tensor) -> Tensor:

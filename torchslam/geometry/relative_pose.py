@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import essential_from_pose, sampson_errors
+from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.homography import transfer_errors
-from torchslam.geometry.implicit import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.geometry.motion_models import (
     ESSENTIAL,

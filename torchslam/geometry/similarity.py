@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.least_squares import State, minimize, small_rotation
 from torchslam.geometry.lie import rigid, transform
+from torchslam.geometry.local_optimization import State, minimize, small_rotation
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
-from torchslam.geometry.least_squares import State, generators, in_parts, minimize, small_rotation
 from torchslam.geometry.lie import skew
+from torchslam.geometry.local_optimization import State, generators, in_parts, minimize, small_rotation
 from torchslam.geometry.projections import (
     fit_projections,
     homography_tangent,

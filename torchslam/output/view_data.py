@@ -14,9 +14,9 @@ from torch import Tensor
 from torchslam.data.association import nearest
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
-from torchslam.export.conventions import upright_rotation
 from torchslam.export.recording import gaps
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.conventions import upright_rotation
 from torchslam.output.pictures import aligned
 from torchslam.output.plots.style import robust_box, thin
 from torchslam.output.results import Results

@@ -15,10 +15,10 @@ from torchslam.data.text_file import read_text
 from torchslam.data.trajectory_file import write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.export.colmap import write_colmap
-from torchslam.export.conventions import opengl
 from torchslam.export.nerfstudio import nerfstudio_camera
 from torchslam.export.scene import Scene, scene_of
 from torchslam.geometry import se3_inverse
+from torchslam.geometry.conventions import opengl
 from torchslam.refinement.refine import Refined
 from torchslam.regular_file import JSON_BYTES, parse_json
 from torchslam.values import Trajectory

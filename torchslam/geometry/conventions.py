@@ -1,4 +1,4 @@
-"""What other programs mean by a pose, a pixel and up: every change of axes of an export is made here.
+"""What other programs mean by a pose, a pixel and up: every change of axes is made here.
 
 | | pose | camera axes | world | centre of the top left pixel |
 |---|---|---|---|---|
@@ -15,7 +15,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, quaternion_from_matrix
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import quaternion_from_matrix
 
 HALF_PIXEL = 0.5  # from an origin at the centre of the top left pixel to one at its corner
 

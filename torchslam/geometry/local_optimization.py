@@ -1,4 +1,7 @@
-"""A small batched Levenberg-Marquardt, for the local optimisation inside the robust estimators."""
+"""A small batched Levenberg-Marquardt, for the local optimisation inside the robust estimators.
+
+For least squares of one's own, with gradients: `solvers.least_squares`.
+"""
 
 from __future__ import annotations
 

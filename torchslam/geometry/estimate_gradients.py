@@ -1,4 +1,7 @@
-"""Gradients of a minimiser with respect to the data, by the implicit function theorem."""
+"""First derivatives of what an estimator found, by the implicit function theorem where it is a minimiser.
+
+Those of any order, of minima of least squares: `solvers.implicit`.
+"""
 
 from __future__ import annotations
 

@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from torchslam.export.conventions import (
+from torchslam.geometry import Camera, rigid, so3_exp, transform
+from torchslam.geometry.conventions import (
     corner_camera,
     corner_pixels,
     opengl,
     quaternion_wxyz,
     upright_rotation,
 )
-from torchslam.geometry import Camera, rigid, so3_exp, transform
 
 
 def looking(*rotations: tuple[float, float, float]) -> torch.Tensor:
