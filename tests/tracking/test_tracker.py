@@ -489,22 +489,21 @@ def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expecte
     here = world()
     ids = here.map.living_points()[:30]
     here.map.points["times_found"][ids] = SENIOR
-    places = [(10.0, 10.0)] * 10 + [(100.0, 10.0)] * 5 + [(300.0, 200.0)] * 2 + [(10.0, 200.0)] * 1
-    pixels = torch.tensor(places).double()
-    expected = Projected(ids[:18], pixels, torch.ones(18), torch.zeros(18))
+    ten, five = [(10.0, 10.0)] * 10, [(100.0, 10.0)] * 5
+    twos = [(300.0, 200.0), (300.0, 100.0), (300.0, 10.0)] * 2
+    places = [*ten, *five, *twos, (10.0, 200.0)]
+    expected = Projected(ids[:22], torch.tensor(places).double(), torch.ones(22), torch.zeros(22))
 
     def share(*seen: int) -> float:
         return coverage(here.map, expected, ids[list(seen)], (320, 240))
 
-    assert share(*range(18)) == 1.0
-    assert share(0, 1, 10, 15) == 1.0  # a fifth of each
-    assert share(0, 10, 15) == pytest.approx(2 / 3)  # a tenth of the first
-    assert share(0, 1) == pytest.approx(1 / 3)
-    assert share(17) == 0.0  # a single point is no expectation
-    here.map.points["times_found"][ids[:10]] = SENIOR - 1
-    assert share(15) == pytest.approx(1 / 2)  # young points are not expected
-    here.map.points["times_found"][ids] = 0
-    assert share() == 1.0
+    assert share(*range(22)) == 1.0
+    assert share(0, 1, 10, 15, 16, 17) == 1.0  # a fifth of each
+    assert share(0, 10, 15, 16, 17) == pytest.approx(4 / 5)  # a tenth of the first
+    assert share(0, 1) == pytest.approx(1 / 5)
+    assert share(21) == 0.0  # a single point is no expectation
+    here.map.points["times_found"][ids[10:15]] = SENIOR - 1  # young points are not expected
+    assert share() == 1.0  # four cells are too few to say anything
 
 
 # --- correspondences --------------------------------------------------------------------------------------------

@@ -16,6 +16,9 @@ from torchslam.world.map import Map
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
 PER_CELL = 5  # matches of a cell that RANSAC hears
 CROWD = 8  # matches of a cell that count in full
+LEAST_ASKED = (
+    5  # cells that old points are expected in, before their absence says anything: one or two leave any image
+)
 SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
 
 
@@ -78,6 +81,8 @@ def explained(view: View, keypoints: Tensor, size: tuple[int, int]) -> float:
 def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
     """The share of the image's cells in which several old points were expected that has at least a fifth of them.
 
+    1 where these cells are too few to tell anything.
+
     expected: points that should be in the image; seen: (m,) those of them that are where they should be
     """
     old = slam_map.points["times_found"][expected.ids] >= SENIOR
@@ -86,6 +91,6 @@ def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, 
     wanted = torch.bincount(cell, minlength=count)
     found = torch.bincount(cell[torch.isin(expected.ids[old], seen)], minlength=count)
     asked = wanted >= 2
-    if not bool(asked.any()):
+    if int(asked.sum()) < LEAST_ASKED:
         return 1.0
     return float((5 * found >= wanted)[asked].double().mean())
