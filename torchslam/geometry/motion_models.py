@@ -46,6 +46,7 @@ _PARAMETERS = (5, 8, 3)  # of the three models
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
+_PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
 _IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
 _EXACT = (
     1 / 16
@@ -197,7 +198,13 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
     of a scene with depth the two can be compared by all matches: what the plane's leaves beyond the gain of a fit, it
     does not know.
     """
-    variance = noise_variance(fits.squared[ESSENTIAL], views.mask).clamp_min(_EXACT**2)[:, None]
+    # The noise as the plane has it, too: an essential matrix that accident chose shows too little.
+    across, both = fits.squared[:2]
+    variance = torch.maximum(
+        noise_variance(across, views.mask),
+        _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask),
+    )
+    variance = variance.clamp_min(_EXACT**2)[:, None]
     near = (torch.minimum(*fits.squared[:2]) < FINAL_WIDTH**2 * variance) & views.mask
 
     def cost(squared: Tensor) -> Tensor:

@@ -204,6 +204,7 @@ def _fit_motion(
         effort.confidence,
         effort.min_samples,
         effort.max_samples,
+        as_needed=kernel != "truncated",
     )
     R, t, one = R[:, None], t[:, None], R.new_ones(len(R))
     if kernel == "truncated":
