@@ -86,7 +86,8 @@ def estimate_relative_pose(
     mask:      (B, N), rows outside it, or with NaN, are ignored
     model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
                that it explains contradict the simpler one, more of them than accident would bring; or, but with the
-               kernel "truncated", all together by the noise that it leaves, or because what it explains is an accident.
+               kernel "truncated", all together by the noise that it leaves, or because what it explains is an accident,
+               or because no motion before the plane explains the matches as the essential matrix does.
                A pure rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
                what contradicts a model, then go by the noise that the matches show, so that the threshold only has to
@@ -98,21 +99,16 @@ def estimate_relative_pose(
     The same arguments and seed give the same result. Too few matches and pure noise give `success` False for that
     pair. Raises ValueError for wrong shapes, and for an unknown model or kernel.
 
-    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits: how many samples it draws depends on
-    the data, which no graph may ask. There, ask for `model_index` in place of `model`.
-
-    Where an input requires a gradient, T_21 carries that of the final least squares of the chosen model with
-    respect to pixels, weights and camera parameters, with the set of matches it uses and the level of the noise fixed
-    (implicit function theorem, exact Hessian).
+    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits; there, ask for `model_index`. Where an
+    input requires a gradient, T_21 carries that of the final least squares of the chosen model with respect to pixels,
+    weights and camera parameters, the matches it uses and the level of the noise fixed (implicit function theorem).
     Sources: Nister, 2004; Chum et al., "Locally optimized RANSAC", 2003; Torr, "An assessment of information
     criteria for motion model selection", 1997, for the problem of choosing.
     """
     _check(pixels_1, pixels_2, weights, model, kernel)
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
         return _nothing(pixels_1)
-    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
-    finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
-    mask = finite if mask is None else mask & finite
+    mask = _usable(pixels_1, pixels_2, mask, weights)
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
     cameras = camera_1.model, list(camera_1.size), camera_2.model, list(camera_2.size)
     inputs = [pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])]
@@ -125,6 +121,11 @@ def estimate_relative_pose(
         T_21 = torch.ops.torchslam.attached_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
     elif needs_gradient(*inputs):
         T_21 = attach_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
+    return _answer(T_21, found)
+
+
+def _answer(T_21: Tensor, found: FoundPose) -> RelativePose:
+    """What was found, with a pose (B, 4, 4) that may carry a gradient."""
     return RelativePose(
         T_21,
         found.inliers,
@@ -136,6 +137,13 @@ def estimate_relative_pose(
         found.scores[2],
         found.T_essential,
     )
+
+
+def _usable(pixels_1: Tensor, pixels_2: Tensor, mask: Tensor | None, weights: Tensor | None) -> Tensor:
+    """(B, N) matches inside the mask that are finite and have a weight."""
+    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
+    finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
+    return finite if mask is None else mask & finite
 
 
 def _check(pixels_1: Tensor, pixels_2: Tensor, weights: Tensor | None, model: str, kernel: str) -> None:
