@@ -35,7 +35,7 @@ from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
-from torchslam.geometry.relative_pose import Model
+from torchslam.geometry.relative_pose_search import Model
 from torchslam.values import Features
 
 HERE = Path(__file__).parent

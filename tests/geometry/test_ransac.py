@@ -12,6 +12,7 @@ from torchslam.geometry.ransac import (
     sample_minimal,
     sample_minimal_of_all,
     samples_needed,
+    search,
     truncated_score,
 )
 
@@ -49,6 +50,26 @@ def test_samples_needed() -> None:
     assert float(needed[0]) == pytest.approx(math.log(0.01) / math.log(1 - 0.125))
     assert float(needed[1]) < 1
     assert float(needed[2]) > 1e6
+
+
+def test_a_round_doubles_or_draws_what_the_support_calls_for() -> None:
+    """34.5 samples of three have one without outliers with 99 %, where half of the rows are."""
+
+    def rounds(as_needed: bool, first: int) -> list[int]:
+        counts = []
+
+        def propose(rows: torch.Tensor, count: int) -> tuple[tuple[torch.Tensor], torch.Tensor, torch.Tensor]:
+            counts.append(count)
+            return (torch.zeros(len(rows)),), torch.full((len(rows),), len(counts)), torch.tensor([50])
+
+        (model,) = search(propose, torch.tensor([100]), 3, 0.99, first, 1000, as_needed)
+        assert model.shape == (1,)
+        return counts
+
+    assert rounds(False, 8) == [8, 16, 32]
+    assert rounds(True, 8) == [8, 16, 11]
+    assert rounds(True, 30) == [30, 30]  # not less than the first one
+    assert rounds(True, 40) == [40]
 
 
 def test_truncated_score_ignores_masked_rows_and_nan() -> None:

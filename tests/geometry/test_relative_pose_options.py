@@ -1,14 +1,17 @@
 """Threshold, model, kernel and weights of `estimate_relative_pose`."""
 
+import math
+
 import poselib
 import pytest
 import torch
 from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_views
 from torch import Tensor
 
-from torchslam.geometry import RelativePose, estimate_relative_pose
+from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
+from torchslam.geometry.motion_models import Fits, PlaneMotions, plane_holds
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import TwoViews, best_in_front, twisted
+from torchslam.geometry.two_view import TwoViews, best_in_front, sampson_squared, twisted
 
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
@@ -83,6 +86,20 @@ def test_parallax_that_no_match_shows_alone_counts(threshold: float) -> None:
         assert result.success.all()
         off.append(errors(result, scene)[1])
     assert sorted(off)[2] < 12
+
+
+@pytest.mark.parametrize(("turn", "holds"), [(0.0, True), (0.5, True), (1.0, False), (2.0, False)])
+def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds: bool) -> None:
+    """Sixty matches with half a pixel of noise tell directions that are degrees apart."""
+    scene = two_views(0, count=60, outliers=0.0, noise=0.5)
+    views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 0.5, scene.mask, None)
+    R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3] / scene.T_21[:, :3, 3].norm()
+    across = torch.linalg.cross(t, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+    turned = t @ so3_exp(math.radians(turn) * across[0] / across.norm()).mT
+    normal = 0.35 / 4 * torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64)
+    squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1).expand(3, -1, -1)
+    fits = Fits(R, t, R + turned[:, :, None] * normal, R, squared).with_mappings(views)
+    assert bool(plane_holds(views, fits, PlaneMotions.of(views, fits))) == holds
 
 
 def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:

@@ -12,7 +12,8 @@ from torchslam.geometry.absolute_pose import attach_absolute_pose, find_absolute
 from torchslam.geometry.essential import five_point
 from torchslam.geometry.operators import attaching, empty, fresh, operator
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.relative_pose import attach_relative_pose, find_relative_pose
+from torchslam.geometry.relative_pose import attach_relative_pose
+from torchslam.geometry.relative_pose_search import find_relative_pose
 
 _CAMERAS = "str model_1, int[] size_1, str model_2, int[] size_2, float threshold, str kernel"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,6 +43,11 @@ _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so fa
 # (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
 _CERTAIN, _NOTABLE = 2.33, 1.5
 _PARAMETERS = (5, 8, 3)  # of the three models
+# Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
+# hundred (chi-square).
+_GAIN_OF_A_FIT = 15.09
+_PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
+_IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
 _EXACT = (
     1 / 16
 )  # units of the noise, which only exact matches are far below: what is left of them is rounding
@@ -160,20 +166,64 @@ def _noisier(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
     return enough & (ratio > _NOTABLE) & (z > mean + _CERTAIN * deviation)
 
 
-def pose_of(views: TwoViews, fits: Fits, model: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+class PlaneMotions(NamedTuple):
+    """What may have moved before the plane of a homography: R (B, 4, 3, 3), direction (B, 4, 3), normal (B, 4, 3) of
+    the plane in units of the distance that the camera moved, squared Sampson errors (B, 4, N) in thresholds, and
+    whether the plane is in front of the cameras (B, 4).
+    """
+
+    R: Tensor
+    direction: Tensor
+    normal: Tensor
+    squared: Tensor
+    possible: Tensor
+
+    @staticmethod
+    def of(views: TwoViews, fits: Fits) -> PlaneMotions:
+        R, t, normals = decompose_homography(fits.H)
+        # All of the plane must be in front of the first camera, and then is in front of the second.
+        plane = views.mask & (fits.squared[HOMOGRAPHY] < 1)
+        ahead = ((views.h_1 @ normals.mT) > 0) & plane[..., None]
+        share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
+        length = t.norm(dim=-1, keepdim=True)
+        direction = t / length.clamp_min(1e-12)
+        squared = sampson_squared(views, R, direction)
+        return PlaneMotions(R, direction, normals * length, squared, share > _IN_FRONT)
+
+
+def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
+    """(B,) whether a motion before the plane explains the matches about as well as the essential matrix does.
+
+    Few matches, most of which lie near some plane, show their depth by too few others to be no accident. But as motions
+    of a scene with depth the two can be compared by all matches: what the plane's leaves beyond the gain of a fit, it
+    does not know.
+    """
+    # The noise as the plane has it, too: an essential matrix that accident chose shows too little.
+    across, both = fits.squared[:2]
+    variance = torch.maximum(
+        noise_variance(across, views.mask),
+        _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask),
+    )
+    variance = variance.clamp_min(_EXACT**2)[:, None]
+    near = (torch.minimum(*fits.squared[:2]) < FINAL_WIDTH**2 * variance) & views.mask
+
+    def cost(squared: Tensor) -> Tensor:
+        whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(FINAL_WIDTH**2)
+        return torch.where(views.mask[:, None], whitened, 0.0).sum(-1)
+
+    costs = cost(plane.squared).where(plane.possible, torch.inf)
+    excess = costs.amin(-1) - cost(fits.squared[ESSENTIAL][:, None])[:, 0]
+    return excess <= (FINAL_WIDTH**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
+
+
+def pose_of(
+    views: TwoViews, fits: Fits, model: Tensor, plane: PlaneMotions
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """R (B, 3, 3), t (B, 3), plane normal (B, 3), and whether a plane leaves two motions (B,)."""
-    inliers = fits.squared < 1
-    R_E, t_E = in_front(views, fits.R, fits.t, views.mask & inliers[ESSENTIAL])
-    R_H, t_H, normals = decompose_homography(fits.H)
-    # All of the plane must be in front of the first camera, and then is in front of the second.
-    plane = views.mask & inliers[HOMOGRAPHY]
-    ahead = ((views.h_1 @ normals.mT) > 0) & plane[..., None]
-    share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
-    length = t_H.norm(dim=-1, keepdim=True)
-    direction = t_H / length.clamp_min(1e-12)
-    squared = sampson_squared(views, R_H, direction)
+    R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
+    R_H, direction, normal, squared, possible = plane
     support = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-    support = torch.where(share > 0.9, support, -1.0)
+    support = torch.where(possible, support, -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
     ambiguous = second > 0.8 * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
@@ -185,7 +235,7 @@ def pose_of(views: TwoViews, fits: Fits, model: Tensor) -> tuple[Tensor, Tensor,
     still = model == ROTATION
     R = torch.where(still[:, None, None], fits.R_only, R)
     t = torch.where(still[:, None], 0.0, t)
-    return R, t, (normals * length)[index, best], flat & ambiguous & apart
+    return R, t, normal[index, best], flat & ambiguous & apart
 
 
 def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:

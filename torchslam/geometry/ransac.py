@@ -108,12 +108,14 @@ def search(
     confidence: float,
     first_round: int,
     max_samples: int,
+    as_needed: bool = False,
 ) -> State:
     """The best model of each problem over rounds of samples, until its support calls for no more of them.
 
     propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores (R,)
     as from `truncated_score`, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
-    rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before.
+    rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before, or,
+    `as_needed`, no more than the support calls for, but as many as the first one.
     """
 
     def propose_in_parts(rows: Tensor, count: int) -> tuple[State, Tensor, Tensor]:
@@ -128,11 +130,13 @@ def search(
     models, best, support = propose_in_parts(rows, first_round)
     drawn, count = first_round, first_round
     while drawn < max_samples:
-        is_open = samples_needed(support, available, size, confidence) > drawn
-        if not bool(is_open.any()):
+        needed = samples_needed(support, available, size, confidence)
+        rows = (needed > drawn).nonzero().squeeze(-1).to(available.device)
+        if len(rows) == 0:
             break
-        rows = is_open.nonzero().squeeze(-1).to(available.device)
         count = min(2 * count, max_samples - drawn)
+        if as_needed:
+            count = min(count, max(first_round, math.ceil(float(needed.max())) - drawn))
         drawn += count
         new, score, new_support = propose_in_parts(rows, count)
         better = score > best[rows]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,27 +42,65 @@ def triangulate_against(
     matcher:   one of one's own; along epipolar lines, by descriptors, if None
     normalize: a quicker way for `camera.normalize`
     """
-    settings, limit = config.mapping, config.measurement.chi_square
-    neighbours = neighbours[has_baseline(slam_map, keyframe, neighbours, settings.min_baseline)]
+    neighbours = neighbours[has_baseline(slam_map, keyframe, neighbours, config.mapping.min_baseline)]
     if len(neighbours) == 0:
         return
     here, there = (
         FreeKeypoints.of(slam_map, rows, normalize or camera.normalize)
         for rows in (slam_map.ids(keyframe), neighbours)
     )
-    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours]
-    T_21, weights = T_2w @ se3_inverse(T_1w), None
+    found = _match(slam_map, keyframe, neighbours, here, there, camera, config, matcher)
+    _triangulate(slam_map, keyframe, neighbours, here, there, found, camera, config)
+
+
+class Matches(NamedTuple):
+    """Matches (m,) of a keyframe with its neighbours: with which one, rows of free keypoints of both, and weights."""
+
+    which: Tensor
+    at_1: Tensor
+    at_2: Tensor
+    weights: Tensor | None
+
+    def select(self, rows: Tensor) -> Matches:
+        weights = None if self.weights is None else self.weights[rows]
+        return Matches(self.which[rows], self.at_1[rows], self.at_2[rows], weights)
+
+
+def _match(
+    slam_map: Map,
+    keyframe: int,
+    neighbours: Tensor,
+    here: FreeKeypoints,
+    there: FreeKeypoints,
+    camera: Camera,
+    config: Config,
+    matcher: Matcher | None,
+) -> Matches:
+    """Along epipolar lines, by descriptors or by a matcher of one's own."""
+    T_21 = slam_map.T_cw[neighbours] @ se3_inverse(slam_map.T_cw[keyframe])
+    epipolar_px = config.mapping.epipolar_px
     if matcher is None or isinstance(matcher, DescriptorMatcher):
-        limit_of = max_distance(here.features.descriptors, config.matching)
-        which, at_1, at_2 = match_along_epipolar_lines(
-            here, there, T_21, camera, settings.epipolar_px, limit_of
-        )
-    else:
-        views = [free_view(slam_map, row) for row in (keyframe, *neighbours.tolist())]
-        prior = Prior(T_21=T_21, camera=camera, epipolar_px=settings.epipolar_px)
-        which, at_1, at_2, weights = match_each(matcher, views, here, there, prior)
-    # From here on every match (m,) is a pair of views of its own, with one point.
-    T_2w, seen_1, seen_2 = T_2w[which], (0, at_1, None), (which, at_2, None)
+        limit = max_distance(here.features.descriptors, config.matching)
+        return Matches(*match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None)
+    views = [free_view(slam_map, row) for row in (keyframe, *neighbours.tolist())]
+    prior = Prior(T_21=T_21, camera=camera, epipolar_px=epipolar_px)
+    return Matches(*match_each(matcher, views, here, there, prior))
+
+
+def _triangulate(
+    slam_map: Map,
+    keyframe: int,
+    neighbours: Tensor,
+    here: FreeKeypoints,
+    there: FreeKeypoints,
+    found: Matches,
+    camera: Camera,
+    config: Config,
+) -> None:
+    """Add the points of those matches that show one. Every match is a pair of views of its own, with one point."""
+    settings, limit = config.mapping, config.measurement.chi_square
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours][found.which]
+    seen_1, seen_2 = (0, found.at_1, None), (found.which, found.at_2, None)
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
     normalized = here.normalized[seen_1], there.normalized[seen_2]
     scale_1, scale_2 = here.features.scales[seen_1], there.features.scales[seen_2]
@@ -72,22 +111,28 @@ def triangulate_against(
         points_c = transform(T_cw, seen.points_w)
         good &= fits(noise.squared_reprojection(points_c, seen_at, camera), limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
-    sizes = tuple(size[which] for size in slam_map.scale_ranges(neighbours))
+    sizes = tuple(size[found.which] for size in slam_map.scale_ranges(neighbours))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
     keep = torch.nonzero(good)[:, 0]
-    keep = keep[first_of_each(at_1[keep])]
+    keep = keep[first_of_each(found.at_1[keep])]
     points_w = seen.points_w[keep]
     covariances_w = triangulation_covariance(
         T_1w, T_2w[keep], points_w, noise_1[keep].spread, noise_2[keep].spread, camera, camera
     )
-    which, at_1, at_2 = which[keep], at_1[keep], at_2[keep]
-    descriptors = here.features.descriptors[0, at_1]
+    found = found.select(keep)
+    descriptors = here.features.descriptors[0, found.at_1]
     ids = slam_map.add_points(points_w[:, 0], descriptors, keyframe, covariances_w[:, 0])
-    slam_map.observe(keyframe, here.rows[0, at_1], ids)
-    slam_map.observe(neighbours[which], there.rows[which, at_2], ids)
+    _observe(slam_map, keyframe, here.rows[0, found.at_1], ids, found.weights)
+    _observe(slam_map, neighbours[found.which], there.rows[found.which, found.at_2], ids, found.weights)
+
+
+def _observe(
+    slam_map: Map, keyframes: int | Tensor, rows: Tensor, ids: Tensor, weights: Tensor | None
+) -> None:
+    """Note that keypoints (n,) of keyframes, one or (n,), see points (n,), with weights (n,) if they have any."""
+    slam_map.observe(keyframes, rows, ids)
     if weights is not None:
-        slam_map.weigh(keyframe, here.rows[0, at_1], weights[keep])
-        slam_map.weigh(neighbours[which], there.rows[which, at_2], weights[keep])
+        slam_map.weigh(keyframes, rows, weights)
 
 
 def free_view(slam_map: Map, keyframe: int) -> View:

@@ -1,0 +1,228 @@
+"""The search behind `estimate_relative_pose`: an essential matrix, the choice of a model, and the pose it gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import rigid
+from torchslam.geometry.motion_models import (
+    ESSENTIAL,
+    FINAL_ITERATIONS,
+    FINAL_WIDTH,
+    HOMOGRAPHY,
+    MODELS,
+    NOISE_WIDTH,
+    Fits,
+    PlaneMotions,
+    choose,
+    fit_models,
+    in_front,
+    is_no_accident,
+    noise_variance,
+    plane_holds,
+    pose_of,
+)
+from torchslam.geometry.ransac import search
+from torchslam.geometry.robust import Kernel
+from torchslam.geometry.two_view import TwoViews, fit_essential, propose_essential, sampson_squared
+
+Model = Literal["auto", "essential"]
+
+KERNEL_WIDTH = 1.5  # deviations of the noise, which for keypoints has a long tail, at which the kernel begins
+_KERNEL_ITERATIONS = 20
+_LEAST_NOISE = 1 / 64  # thresholds; of exact matches
+
+
+class _Effort(NamedTuple):
+    """How long to look for a motion: as the arguments of `estimate_relative_pose`."""
+
+    seed: int
+    confidence: float
+    min_samples: int
+    max_samples: int
+
+
+class FoundPose(NamedTuple):
+    """T_21 (B, 4, 4) of the chosen model (B,), `normal` (B, 3) of its plane, and what it rests on.
+
+    noise: (B,) thresholds, the unit of the fits; significant: (B,) no accident; used: (B, N) matches that the final
+    fit saw; scores: (3, B); T_essential: (B, 4, 4)
+    """
+
+    T_21: Tensor
+    normal: Tensor
+    model: Tensor
+    noise: Tensor
+    significant: Tensor
+    ambiguous: Tensor
+    inliers: Tensor
+    used: Tensor
+    scores: Tensor
+    T_essential: Tensor
+
+
+def views_of(
+    inputs: Sequence[Tensor],
+    mask: Tensor,
+    cameras: tuple[str, Sequence[int], str, Sequence[int]],
+    threshold: float,
+) -> TwoViews:
+    """What `estimate_relative_pose` is given: pixels, parameters of both cameras, and weights if there are any."""
+    pixels_1, pixels_2, params_1, params_2, *weights = inputs
+    model_1, (width_1, height_1), model_2, (width_2, height_2) = cameras
+    camera_1 = Camera(model_1, params_1, (width_1, height_1))
+    camera_2 = Camera(model_2, params_2, (width_2, height_2))
+    weight = weights[0] if weights else None
+    return TwoViews.of(pixels_1, pixels_2, camera_1, camera_2, threshold, mask, weight)
+
+
+def find_relative_pose(
+    inputs: Sequence[Tensor],
+    mask: Tensor,
+    model_1: str,
+    size_1: Sequence[int],
+    model_2: str,
+    size_2: Sequence[int],
+    threshold: float,
+    kernel: Kernel,
+    wanted: Model,
+    *effort: Any,
+) -> FoundPose:
+    """What `estimate_relative_pose` finds, without gradient; inputs as of `views_of`, the rest as its arguments."""
+    with torch.no_grad():
+        views = views_of(inputs, mask, (model_1, size_1, model_2, size_2), threshold)
+        # The probability that a wrong match is within the threshold of an epipolar line.
+        chance = 2 * threshold * math.hypot(*size_2) / (size_2[0] * size_2[1])
+        weights = inputs[4] if len(inputs) > 4 else None
+        chances = chance * _mean_width(mask, weights, views.x_1.dtype)
+        return _search(views, chances, wanted, kernel, _Effort(*effort))
+
+
+class _Chosen(NamedTuple):
+    """R (B, 3, 3), t (B, 3) of the chosen model (B,), and `normal` (B, 3) of its plane, which leaves two motions where
+    it is `ambiguous` (B,); R_E, t_E of the essential matrix; squared: (M, B, N) errors of the models, in units of the
+    noise
+    """
+
+    R: Tensor
+    t: Tensor
+    normal: Tensor
+    model: Tensor
+    ambiguous: Tensor
+    R_E: Tensor
+    t_E: Tensor
+    squared: Tensor
+
+
+def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effort: _Effort) -> FoundPose:
+    """Fit all models, choose one per pair, and take the pose from it."""
+    generator = torch.Generator().manual_seed(effort.seed)
+    R, t, noise, near = _fit_motion(views, kernel, effort, generator)
+    views, by_noise = views.in_units(noise[:, None]), kernel != "truncated"
+    if wanted == "essential":
+        chosen = _essential(views, R, t)
+    else:
+        chosen = _choose(views, fit_models(views, R, t, generator, by_noise), noise, chance, by_noise)
+    mask, model = views.mask, chosen.model
+    squared = chosen.squared[model, torch.arange(len(mask), device=mask.device)]
+    in_thresholds = chosen.squared * noise[:, None].square()
+    inliers = (squared * noise[:, None].square() < 1) & mask
+    significant = is_no_accident(views, squared, noise, chance, by_noise)
+    used = torch.where((model == ESSENTIAL)[:, None], near, (squared < _width(by_noise) ** 2) & mask)
+    scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
+    found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
+    return FoundPose(
+        torch.where(found, rigid(chosen.R, chosen.t), eye),
+        chosen.normal,
+        model,
+        noise,
+        significant,
+        chosen.ambiguous,
+        inliers & significant[:, None],
+        used & significant[:, None],
+        torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
+        torch.where(found, rigid(chosen.R_E, chosen.t_E), eye),
+    )
+
+
+def _width(by_noise: bool) -> float:
+    """Thresholds within which matches count in the final fit of a homography or a rotation."""
+    return NOISE_WIDTH if by_noise else FINAL_WIDTH
+
+
+def _essential(views: TwoViews, R: Tensor, t: Tensor) -> _Chosen:
+    """Nothing but the essential matrix."""
+    squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
+    R, t = in_front(views, R, t, views.mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
+    no = torch.zeros_like(views.mask[:, 0])
+    return _Chosen(R, t, torch.zeros_like(t), no.to(torch.int64), no, R, t, squared)
+
+
+def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise: bool) -> _Chosen:
+    """The model that the matches call for, and its pose. views: in units of the noise (B,), thresholds"""
+    mask = views.mask
+    model = choose(fits, mask, chance * noise, by_noise)
+    simple, plane = model != ESSENTIAL, None
+    if bool(simple.any()):
+        rough, fits = fits.squared, fits.finished(views, _width(by_noise))
+        plane = PlaneMotions.of(views, fits)
+        if by_noise:
+            # As alone, whoever else is in the batch.
+            fits = replace(fits, squared=torch.where(simple[:, None], fits.squared, rough))
+            # One that explains no more than accident does is the simplest of all, and hides what can be used.
+            of_model = fits.squared[model, torch.arange(len(mask), device=mask.device)]
+            certain = is_no_accident(views, of_model, noise, chance, by_noise)
+            certain &= (model != HOMOGRAPHY) | plane_holds(views, fits, plane)
+            model = torch.where(certain, model, ESSENTIAL)
+    R_E, t_E = in_front(views, fits.R, fits.t, mask & (fits.squared[ESSENTIAL] < FINAL_WIDTH**2))
+    if by_noise and not bool((model != ESSENTIAL).any()):
+        zero = torch.zeros_like(t_E)
+        return _Chosen(R_E, t_E, zero, model, torch.zeros_like(mask[:, 0]), R_E, t_E, fits.squared)
+    plane = PlaneMotions.of(views, fits) if plane is None else plane
+    R, t, normal, ambiguous = pose_of(views, fits, model, plane)
+    if by_noise:  # as alone, whoever else is in the batch
+        is_essential = (model == ESSENTIAL)[:, None]
+        R, t = torch.where(is_essential[..., None], R_E, R), torch.where(is_essential, t_E, t)
+    return _Chosen(R, t, normal, model, ambiguous, R_E, t_E, fits.squared)
+
+
+def _fit_motion(
+    views: TwoViews, kernel: Kernel, effort: _Effort, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """R (B, 3, 3) and t (B, 3) of essential matrices, their unit (B,), thresholds, and the matches (B, N) fitted."""
+    R, t = search(
+        lambda rows, count: propose_essential(views.select(rows), count, generator, kernel != "truncated"),
+        views.mask.sum(-1),
+        5,
+        effort.confidence,
+        effort.min_samples,
+        effort.max_samples,
+        as_needed=kernel != "truncated",
+    )
+    R, t, one = R[:, None], t[:, None], R.new_ones(len(R))
+    if kernel == "truncated":
+        R, t, _ = fit_essential(views, R, t, FINAL_ITERATIONS, FINAL_WIDTH * one)
+        return R[:, 0], t[:, 0], one, views.mask & (sampson_squared(views, R, t)[:, 0] < FINAL_WIDTH**2)
+    squared = sampson_squared(views, R, t)[:, 0]
+    # A power of two: the level does not change with the matches, and has no gradient, but where it jumps.
+    noise = torch.exp2((0.5 * noise_variance(squared, views.mask).log2()).ceil()).clamp_min(_LEAST_NOISE)
+    views = views.in_units(noise[:, None])
+    # Of many wrong matches, even a kernel leaves the sum of their pulls.
+    near = views.mask & (squared < (NOISE_WIDTH * noise[:, None]) ** 2)
+    R, t, _ = fit_essential(replace(views, mask=near), R, t, _KERNEL_ITERATIONS, KERNEL_WIDTH * one, kernel)
+    return R[:, 0], t[:, 0], noise, near
+
+
+def _mean_width(mask: Tensor, weights: Tensor | None, dtype: torch.dtype) -> Tensor:
+    """(B,) the mean of the matches' thresholds, in units of that of weight one."""
+    if weights is None:
+        return torch.ones_like(mask[:, 0], dtype=dtype)
+    widths = torch.where(mask, torch.where(mask, weights, 1.0).rsqrt(), 0.0)
+    return widths.sum(-1) / mask.sum(-1).clamp_min(1)
