@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.features import ORB, OpenCVORB, extractor, match
+from torchslam.features import orb as orb_module
 from torchslam.features.brief import blur, describe
 from torchslam.features.pattern import PATTERN
 from torchslam.values import Features
@@ -45,6 +46,12 @@ def distances(first: Tensor, second: Tensor) -> Tensor:
 def same(first: Features, second: Features) -> bool:
     columns = ((getattr(first, f.name), getattr(second, f.name)) for f in fields(Features))
     return all(one is other if one is None else torch.equal(one, other) for one, other in columns)
+
+
+def element(features: Features, index: int) -> Features:
+    """One image of a batch, as a batch of one."""
+    columns = {f.name: getattr(features, f.name) for f in fields(Features)}
+    return Features(**{name: None if x is None else x[index : index + 1] for name, x in columns.items()})
 
 
 @EXTRACTORS
@@ -195,6 +202,34 @@ def test_a_dim_half_has_keypoints_too() -> None:
     features = ORB(num_keypoints=300)(image)
     right = features.keypoints[0][features.mask[0]][:, 0] > 165
     assert 10 <= int(right.sum()) < 150
+
+
+@pytest.mark.parametrize("ranking", ["fast", "harris"])
+def test_an_image_of_weak_texture_has_as_many_keypoints(ranking: str) -> None:
+    bright = scene(240, 320)
+    dim = (bright - 0.5) * 0.12 + 0.5  # no corner exceeds the threshold of 20
+    orb = ORB(num_keypoints=300, ranking=ranking)
+    features = orb(torch.cat([bright, dim]))
+    assert features.mask.sum(1).tolist() == [300, 300]
+    assert same(element(features, 1), orb(dim))  # whatever stands beside it
+    assert same(element(features, 0), orb(bright))
+    near = distances(features.keypoints[0], features.keypoints[1]).amin(0)
+    assert float((near < 1).double().mean()) > 0.7
+
+
+def test_weak_texture_is_less_than_half_of_the_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, decided = scene(400, 500), set()
+    image[..., 60:] = (image[..., 60:] - 0.5) * 0.12 + 0.5
+    for count in (300, 700, 1100, 1300):
+        monkeypatch.setattr(orb_module, "SPARSE", 0.0)
+        strict = ORB(num_keypoints=count)(image)
+        monkeypatch.setattr(orb_module, "SPARSE", 0.5)
+        features, offered = ORB(num_keypoints=count)(image), int(strict.mask.sum())
+        is_weak = offered < count / 2
+        assert same(features, strict) is not is_weak
+        assert (int(features.mask.sum()) > 1.3 * offered) is is_weak
+        decided.add(is_weak)
+    assert decided == {True, False}
 
 
 def test_harris_ranking_finds_other_corners_in_the_same_places() -> None:

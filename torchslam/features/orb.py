@@ -23,6 +23,7 @@ HARRIS_RADIUS = 4  # of the patch that a Harris response needs
 FAST_RADIUS = 3  # of the circle
 SOFT_RADIUS = 1  # of the soft arg-max
 NEVER = 255  # a score that no corner exceeds
+SPARSE = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
 PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 
@@ -58,7 +59,8 @@ class ORB(nn.Module):
     scale_factor:   ratio of the sizes of neighbouring pyramid levels
     num_levels:     of the pyramid; levels too small to hold a keypoint stay empty
     threshold:      of FAST, in grey values of 0 to 255, for corners anywhere
-    low_threshold:  for the best corner of each cell, so that regions of little contrast have keypoints too
+    low_threshold:  for the best corner of each cell, so that regions of little contrast have keypoints too; for all
+                    corners of an image of weak texture, which offers less than half of `num_keypoints` otherwise
     ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
     differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
                     chosen, angles and descriptors stay discrete
@@ -159,6 +161,8 @@ class ORB(nn.Module):
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
         best = best_of_cells(image * num_cells + cell, fast, batch * num_cells)
+        offered = torch.bincount(image, (strong | best).to(torch.float32), minlength=batch)
+        strong |= (offered < SPARSE * self.num_keypoints).index_select(0, image)
         if self.ranking == "fast":  # the whole part of what they compete by
             needed = best | (
                 strong & contend(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
