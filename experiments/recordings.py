@@ -169,7 +169,9 @@ def report(outcomes: Outcomes, arms: Sequence[str], beside: str = DEFAULT) -> st
         ratios = {label: log_ratios(outcomes, label, arm, beside) for label in labels}
         counted = sum(bool(by_seed) for by_seed in ratios.values())
         low, high = interval(ratios, kin)
-        mean = f"**{geometric_mean(ratios):.2f}** ({low:.2f} to {high:.2f})"
+        mean = f"**{geometric_mean(ratios):.2f}**"
+        if not math.isnan(low):  # of one recording there is none
+            mean += f" ({low:.2f} to {high:.2f})"
         if arm != beside and counted:
             rows.append([f"geometric mean of {counted}", arm, "", "", mean])
     return table([*HEADER, f"over {beside}"], rows)

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from experiments.match_weights.layers import InContext, crowd_and_support, masked_median
 from experiments.match_weights.problems import Problems
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
@@ -64,9 +65,11 @@ class Shown:
         mask = self.mask
         residuals = smooth_residuals(self.pixels, self.offsets, mask)
         inliers = (residuals < 3.0) & mask
-        noise = _median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
-        turn = self.turns - _median(self.turns, mask).nan_to_num(0.0)
-        crowd, support = _neighbours(self.pixels, inliers, mask)
+        noise = masked_median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
+        turn = self.turns - masked_median(self.turns, mask).nan_to_num(0.0)
+        inside = torch.where(mask[..., None], self.pixels, self.pixels[:, :1])
+        size = (inside.amax(1) - inside.amin(1)).amax(-1).clamp_min(1.0)[:, None, None]
+        crowd, support = crowd_and_support(self.pixels, NEIGHBOURHOOD * size, inliers, mask)
         columns = [
             self.bits / 32 - 1,
             4 * (self.bits / self.seconds_2.clamp_min(1)) - 3,
@@ -96,51 +99,21 @@ def smooth_residuals(pixels: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         W = weights[..., None] * A
         left = offsets - A @ torch.linalg.solve(A.mT @ W + ridge, W.mT @ offsets)
         lengths = torch.linalg.vector_norm(left, dim=-1)
-        width = 2 * _median(lengths, mask).nan_to_num(1.0).clamp_min(0.2)
+        width = 2 * masked_median(lengths, mask).nan_to_num(1.0).clamp_min(0.2)
         weights = mask / (1 + (lengths / width).square())
     return torch.linalg.vector_norm(left, dim=-1)
 
 
-def _neighbours(pixels: Tensor, inliers: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """(P, N) as `weighting._neighbours`, with neighbourhoods by the range of the pixels."""
-    inside = torch.where(mask[..., None], pixels, pixels[:, :1])
-    size = (inside.amax(1) - inside.amin(1)).amax(-1).clamp_min(1.0)
-    near = (torch.cdist(pixels, pixels) < NEIGHBOURHOOD * size[:, None, None]) & mask[:, None, :]
-    rows, near = mask.to(pixels.dtype), near.to(pixels.dtype)
-    count = near.sum(-1).clamp_min(1)
-    crowd = (count * rows.sum(-1, keepdim=True) / (count * rows).sum(-1, keepdim=True).clamp_min(1)).log()
-    agree = (near @ inliers[..., None].to(pixels.dtype))[..., 0] - inliers.to(pixels.dtype)
-    return crowd, (agree + 0.5) / count
-
-
-def _median(values: Tensor, mask: Tensor) -> Tensor:
-    """(P, 1) median of the masked entries of (P, N), NaN where there are none."""
-    return values.masked_fill(~mask, torch.nan).nanmedian(-1, keepdim=True).values
-
-
-class HookWeights(nn.Module):
+class HookWeights(InContext):
     """Weights of matches from what the hook shows, relative to the median of their frame; all alike at first."""
 
     def __init__(self, width: int = 32, seed: int = 0) -> None:
-        super().__init__()
-        self.local = nn.Linear(NUM_CUES, width, dtype=torch.float64)
-        self.mixed = nn.Linear(2 * width, width, dtype=torch.float64)
-        self.last = nn.Linear(width, 1, dtype=torch.float64)
-        generator = torch.Generator().manual_seed(seed)
-        for layer in (self.local, self.mixed):
-            nn.init.xavier_uniform_(layer.weight, generator=generator)
-            nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        super().__init__(NUM_CUES, width, seed)
 
     def forward(self, cues: Tensor, mask: Tensor) -> Tensor:
         """(P, N, NUM_CUES), (P, N) -> (P, N) factors between 1 / BOUND and BOUND, one outside the mask."""
-        hidden = nn.functional.silu(self.local(cues))
-        rows = mask[..., None].to(hidden.dtype)
-        context = (hidden * rows).sum(1, keepdim=True) / rows.sum(1, keepdim=True).clamp_min(1)
-        hidden = nn.functional.silu(self.mixed(torch.cat([hidden, context.expand_as(hidden)], -1)))
-        raw = self.last(hidden)[..., 0]
-        level = _median(raw.detach(), mask).nan_to_num(0.0)
+        raw = self.numbers(cues, mask)
+        level = masked_median(raw.detach(), mask).nan_to_num(0.0)
         most = torch.tensor(BOUND, dtype=raw.dtype).log()
         return torch.where(mask, (most * torch.tanh((raw - level) / most)).exp(), 1.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from experiments.match_weights.layers import InContext, crowd_and_support, masked_median
 from experiments.match_weights.problems import Problems
 from torchslam.geometry import innovation_covariances, mahalanobis_squared, transform
 from torchslam.geometry.robust import Kernel
@@ -60,31 +61,15 @@ class MatchWeights(nn.Module):
         self.heads = nn.ModuleList(_Head(width, ROUNDS * seed + number) for number in range(ROUNDS))
 
 
-class _Head(nn.Module):
-    """Weights from features, each match seen beside the mean of its problem.
-
-    The network corrects the inverse of a variance that is known; it starts with no correction at all.
-    """
+class _Head(InContext):
+    """Weights from features: the network corrects the inverse of a variance that is known, at first not at all."""
 
     def __init__(self, width: int, seed: int) -> None:
-        super().__init__()
-        self.local = nn.Linear(NUM_FEATURES, width, dtype=torch.float64)
-        self.mixed = nn.Linear(2 * width, width, dtype=torch.float64)
-        self.last = nn.Linear(width, 1, dtype=torch.float64)
-        generator = torch.Generator().manual_seed(seed)
-        for layer in (self.local, self.mixed):
-            nn.init.xavier_uniform_(layer.weight, generator=generator)
-            nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        super().__init__(NUM_FEATURES, width, seed)
 
     def forward(self, features: Tensor, variances: Tensor, mask: Tensor) -> Tensor:
         """(P, N, NUM_FEATURES), (P, N) px^2, (P, N) -> (P, N) weights in px^-2, zero outside the mask."""
-        hidden = nn.functional.silu(self.local(features))
-        rows = mask[..., None].to(hidden.dtype)
-        context = (hidden * rows).sum(1, keepdim=True) / rows.sum(1, keepdim=True).clamp_min(1)
-        hidden = nn.functional.silu(self.mixed(torch.cat([hidden, context.expand_as(hidden)], -1)))
-        logarithm = 6 * torch.tanh(self.last(hidden)[..., 0] / 6)  # between e^-6 and e^6
+        logarithm = 6 * torch.tanh(self.numbers(features, mask) / 6)  # between e^-6 and e^6
         return torch.where(mask, logarithm.exp() / variances, 0.0)
 
 
@@ -99,12 +84,13 @@ def describe(problems: Problems, T: Tensor) -> Tensor:
     errors = projected - problems.pixels
     residuals = torch.where(valid, errors.norm(dim=-1) / cues.scales_query, 100.0)
     inliers = (residuals < 3.0) & mask
-    noise = _median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
+    noise = masked_median(residuals, inliers).nan_to_num(3.0).clamp_min(0.1)
     surprise = mahalanobis_squared(errors, _covariances(problems, T)).clamp_min(0)
     depths_q, depths_b = points_q[..., 2].clamp_min(1e-3), problems.points[..., 2]
     growth = (cues.scales_query * depths_q / (cues.scales_base * depths_b)).log()
-    turn = cues.turns - _median(cues.turns, mask)
-    crowd, support = _neighbours(problems, inliers)
+    turn = cues.turns - masked_median(cues.turns, mask)
+    x = problems.pixels / problems.focals[:, None, None]
+    crowd, support = crowd_and_support(x, NEIGHBOURHOOD, inliers, mask)
     columns = [
         cues.distances / 32 - 1,
         4 * (cues.distances / cues.seconds_query.clamp_min(1)) - 3,
@@ -122,7 +108,7 @@ def describe(problems: Problems, T: Tensor) -> Tensor:
         (cues.parallaxes / 0.03).log(),
         cues.views - 2.5,
         cues.errors - 0.5,
-        (depths_q / _median(depths_q, mask)).log(),
+        (depths_q / masked_median(depths_q, mask)).log(),
         propagated_variances(problems, T).log() / 2,
         crowd,
         4 * support - 3,
@@ -141,22 +127,3 @@ def _covariances(problems: Problems, T: Tensor) -> Tensor:
 def propagated_variances(problems: Problems, T: Tensor) -> Tensor:
     """(P, N) px^2, mean of x and y, at poses T."""
     return 0.5 * _covariances(problems, T).diagonal(dim1=-2, dim2=-1).sum(-1)
-
-
-def _neighbours(problems: Problems, inliers: Tensor) -> tuple[Tensor, Tensor]:
-    """(P, N) logarithm of the number of matches nearby over its mean, and the share of inliers among the others.
-
-    Errors of neighbours are alike: their points were made from the same frames, and move with the same objects.
-    """
-    x = problems.pixels / problems.focals[:, None, None]
-    near = ((torch.cdist(x, x) < NEIGHBOURHOOD) & problems.mask[:, None, :]).to(x.dtype)
-    count = near.sum(-1).clamp_min(1)
-    rows = problems.mask.to(x.dtype)
-    crowd = (count * rows.sum(-1, keepdim=True) / (count * rows).sum(-1, keepdim=True)).log()
-    agree = (near @ inliers[..., None].to(x.dtype))[..., 0] - inliers.to(x.dtype)
-    return crowd, (agree + 0.5) / count
-
-
-def _median(values: Tensor, mask: Tensor) -> Tensor:
-    """(P, 1) median of the masked entries of (P, N), NaN where there are none."""
-    return values.masked_fill(~mask, torch.nan).nanmedian(-1, keepdim=True).values

@@ -33,7 +33,7 @@ SETTINGS = Settings(steps=150, batch=16)
 def network_file(left_out: str, seed: int) -> Path:
     """Of a network that has seen nothing of a recording."""
     parts, settings = parts_without(left_out), replace(SETTINGS, seed=seed)
-    code = (HERE / "hook.py").read_text(encoding="utf-8")
+    code = [(HERE / file).read_text(encoding="utf-8") for file in ("hook.py", "layers.py")]
     name = digest({"parts": parts, "settings": repr(settings), "code": code})
     return CACHE / "hook" / f"{name}.pt"
 

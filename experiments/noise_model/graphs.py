@@ -19,6 +19,8 @@ from torchslam.geometry import se3_inverse
 from torchslam.solvers.graph import ObservationGraph
 from torchslam.world.history import RunGraph
 
+LEAST_KNOWN = 4
+"""Keyframes of which the truth must be known: fewer leave hardly more than the seven directions of their alignment."""
 KITTI_CAMERA = "685,685,601.887,183.110"
 """With COLMAP's focal length: the one that the sequence gives is 3 % too long, see experiments/self_calibration."""
 

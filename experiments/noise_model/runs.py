@@ -7,12 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from experiments.noise_model.consistency import consistency
-from experiments.noise_model.graphs import keyframes_of, opened, truth_of
+from experiments.noise_model.graphs import LEAST_KNOWN, keyframes_of, opened, truth_of
 from torchslam import SLAM, evaluate, load_config
 
 FRONT_END = "experiments.noise_model.model:Informed"
-LEAST_KEYFRAMES = 4
-"""Of which the truth is known: fewer leave hardly more than the seven directions of their alignment."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ def outcome_of(name: str, seed: int, weights: Path | None, file: Path) -> Outcom
     T_cw, known = truth_of(run.graph, sequence)
     graph, frames, _ = keyframes_of(run.graph)
     known = known[frames]
-    found = consistency(graph, T_cw[frames], known) if int(known.sum()) >= LEAST_KEYFRAMES else None
+    found = consistency(graph, T_cw[frames], known) if int(known.sum()) >= LEAST_KNOWN else None
     file.parent.mkdir(parents=True, exist_ok=True)
     outcome = Outcome(
         evaluate(run.trajectory, sequence.groundtruth).ate_m,

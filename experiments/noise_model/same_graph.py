@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from experiments.noise_model.consistency import aligned_covariance, consistency
-from experiments.noise_model.graphs import Example
+from experiments.noise_model.graphs import LEAST_KNOWN, Example
 from experiments.noise_model.model import NoiseModel
 from experiments.noise_model.training import (
     halves,
@@ -25,7 +25,6 @@ from torchslam.geometry.alignment import umeyama
 from torchslam.solvers.graph import solve
 
 SPLITS = 5
-LEAST_TRUE = 4
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def figures_of(example: Example, model: NoiseModel | None, file: Path, splits: i
         return Figures(**json.loads(file.read_text()))
     informed = example if model is None else weighed(example, model)
     informed = solved(informed)
-    known, has_truth = example.known, int(example.known.sum()) >= LEAST_TRUE
+    known, has_truth = example.known, int(example.known.sum()) >= LEAST_KNOWN
     found = consistency(informed.graph, example.T_cw, known) if has_truth else None
     unit = scale_of(informed.graph.T_cw[known], example.T_cw[known]) if has_truth else 1.0
     pairs = [apart(halves(informed, seed)) for seed in range(splits)]

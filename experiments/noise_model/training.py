@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from experiments.noise_model.graphs import Example
+from experiments.noise_model.graphs import LEAST_KNOWN, Example
 from experiments.noise_model.model import NoiseModel
 from torchslam.evaluation import ate
 from torchslam.geometry import transform
@@ -150,7 +150,9 @@ def at_level(model: NoiseModel, level: float) -> NoiseModel:
 
 
 def position_error(example: Example, solution: GraphSolution) -> Tensor:
-    """ATE in metres of the frames whose truth is known, differentiable."""
+    """ATE in metres of the frames whose truth is known, differentiable. Raises ValueError for too few."""
+    if int(example.known.sum()) < LEAST_KNOWN:
+        raise ValueError(f"{int(example.known.sum())} keyframes with true poses: they teach no trajectory")
     return ate(solution.T_cw[example.known], example.T_cw[example.known])
 
 

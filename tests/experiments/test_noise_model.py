@@ -167,6 +167,13 @@ def test_trajectories_move_the_model_downhill() -> None:
     assert loss(moved) < loss(start)
 
 
+def test_without_truth_no_trajectory_teaches() -> None:
+    example = simulated(0)
+    untold = replace(example, known=torch.arange(FRAMES) < 3)
+    with pytest.raises(ValueError, match="3 keyframes with true poses"):
+        fit_trajectories(NoiseModel("isotropic"), [example, untold], SMALL)
+
+
 def test_consistency_is_one_where_noise_is_all_there_is() -> None:
     found = []
     for seed in range(100, 124, 4):

@@ -65,6 +65,8 @@ def test_an_interval_draws_recordings_of_the_same_images_together() -> None:
     assert low == pytest.approx(0.5)
     assert high == pytest.approx(2.0)
     assert math.isnan(interval(ratios, dict.fromkeys(ratios, "a"))[0])
+    alone = {case: found for case, found in outcomes_with(0.8).items() if case[0] == "shelf_bin"}
+    assert report(alone, ["default", "other"]).splitlines()[-1].endswith("| **0.80** |")
 
 
 def test_kept_features_are_those_of_the_front_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
