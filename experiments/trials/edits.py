@@ -43,6 +43,16 @@ def noise(sigma: float) -> Edit:
     return edit
 
 
+def pale(contrast: float) -> Edit:
+    """Fog, or a bad lens: so much of the contrast is left, around middle grey, and the noise of a grey value."""
+    noisy, middle = noise(1.0), WHITE / 2
+
+    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
+        return noisy(np.rint(middle + contrast * (grey - middle)).astype(np.uint8), frame)
+
+    return edit
+
+
 def jpeg(quality: int) -> Edit:
     def edit(grey: np.ndarray, _: int) -> np.ndarray:
         _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])

@@ -81,6 +81,7 @@ FAULTS: dict[str, Fault] = {
     "lensdirt": everywhere(lambda whole, _: edits.lens_dirt(whole.size)),
     "blur9": everywhere(lambda *_: edits.motion_blur(9)),
     "noise25": everywhere(lambda *_: edits.noise(25.0)),
+    "pale20": everywhere(lambda *_: edits.pale(0.2)),
     "jpeg10": everywhere(lambda *_: edits.jpeg(10)),
     "exposure_step": everywhere(lambda *_: edits.exposure_step),
     "kidnap": kidnapped,
