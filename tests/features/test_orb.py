@@ -217,6 +217,28 @@ def test_an_image_of_weak_texture_has_as_many_keypoints(ranking: str) -> None:
     assert float((near < 1).double().mean()) > 0.7
 
 
+def test_faint_corners_count_where_there_are_hardly_others() -> None:
+    bright = scene(240, 320)
+    faint = (bright - 0.5) * 0.06 + 0.5  # fifteen grey values from black to white
+    orb = ORB(num_keypoints=300)
+    features = orb(torch.cat([faint, bright]))
+    assert features.mask.sum(1).tolist() == [300, 300]
+    assert same(element(features, 0), orb(faint))
+    assert same(element(features, 1), orb(bright))
+    wanted = torch.zeros_like(faint, dtype=torch.bool)
+    wanted[..., :160] = True
+    left = orb(faint, wanted)
+    assert int(left.mask.sum()) > 100
+    assert float(left.keypoints[left.mask][:, 0].max()) < 161
+    nothing = (bright - 0.5) * 0.01 + 0.5
+    assert not orb(nothing).mask.any()
+    fainter = (bright - 0.5) * 0.05 + 0.5
+    assert (
+        int(ORB(num_keypoints=300, low_threshold=3)(fainter).mask.sum()) == 300
+    )  # who asks for fainter ones has them
+    assert int(orb(fainter).mask.sum()) < 150
+
+
 def test_weak_texture_is_less_than_half_of_the_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
     image, decided = scene(400, 500), set()
     image[..., 60:] = (image[..., 60:] - 0.5) * 0.12 + 0.5

@@ -24,6 +24,7 @@ FAST_RADIUS = 3  # of the circle
 SOFT_RADIUS = 1  # of the soft arg-max
 NEVER = 255  # a score that no corner exceeds
 SPARSE = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
+FAINT = 4  # grey values: corners of an image of the weakest texture, above the noise of a good camera
 PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 
@@ -60,7 +61,8 @@ class ORB(nn.Module):
     num_levels:     of the pyramid; levels too small to hold a keypoint stay empty
     threshold:      of FAST, in grey values of 0 to 255, for corners anywhere
     low_threshold:  for the best corner of each cell, so that regions of little contrast have keypoints too; for all
-                    corners of an image of weak texture, which offers less than half of `num_keypoints` otherwise
+                    corners of an image of weak texture, which offers less than half of `num_keypoints` otherwise. Where
+                    even so there are fewer, faint corners count, of more than 4 grey values.
     ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
     differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
                     chosen, angles and descriptors stay discrete
@@ -140,7 +142,7 @@ class ORB(nn.Module):
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if wanted is not None:
                 floor = torch.where(_on_atlas(wanted, atlas), floor, NEVER)
-            positions = true_indices(find_peaks(scores, floor, atlas.stride))
+            positions = self._peaks(scores, floor, len(images), atlas.stride)
             positions, slots, strengths = self._choose(pixels, scores, positions, grid, atlas.stride)
             fast = gather_patches(scores, positions, atlas.stride, 1)
             area = grid.table.shape[0]
@@ -149,6 +151,19 @@ class ORB(nn.Module):
             top, left = torch.tensor(atlas.corners, device=images.device)[level].unbind(-1)
             xy = torch.stack([inside % atlas.stride - left, inside // atlas.stride - top], dim=-1)
         return Corners(levels, pixels, atlas, positions, slots, strengths, fast, image, level, xy)
+
+    def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int) -> Tensor:
+        """(K,) where corners are: peaks of the scores above a floor, which is lower in images that offer few."""
+        positions = true_indices(find_peaks(scores, floor, stride))
+        faint = self._is_weak(positions // (len(scores) // batch), batch)
+        if self.low_threshold <= FAINT or not bool(faint.any()):
+            return positions
+        lower = torch.where(faint[:, None] & (floor.view(batch, -1) < NEVER), FAINT, floor.view(batch, -1))
+        return true_indices(find_peaks(scores, lower.flatten(), stride))
+
+    def _is_weak(self, images: Tensor, batch: int) -> Tensor:
+        """(batch,) whether an image has few of some corners, given the image (K,) of each."""
+        return torch.bincount(images, minlength=batch) < SPARSE * self.num_keypoints
 
     def _choose(
         self, pixels: Tensor, scores: Tensor, positions: Tensor, grid: Grid, stride: int
@@ -161,8 +176,7 @@ class ORB(nn.Module):
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
         best = best_of_cells(image * num_cells + cell, fast, batch * num_cells)
-        offered = torch.bincount(image, (strong | best).to(torch.float32), minlength=batch)
-        strong |= (offered < SPARSE * self.num_keypoints).index_select(0, image)
+        strong |= self._is_weak(image[strong | best], batch).index_select(0, image)
         if self.ranking == "fast":  # the whole part of what they compete by
             needed = best | (
                 strong & contend(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
