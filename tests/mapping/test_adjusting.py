@@ -15,7 +15,7 @@ from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.beside import Beside
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
-from torchslam.mapping.adjusting import Adjusting
+from torchslam.mapping.adjusting import Adjusting, Answer, solve_here
 from torchslam.mapping.local_bundle import adjust
 from torchslam.solvers import BundleProblem
 from torchslam.world.map import Map
@@ -71,6 +71,37 @@ def test_nothing_happens_before_it_is_taken_over() -> None:
     assert not adjusting
     adjusting.take_over(slam_map)  # there is nothing more
     check_same(slam_map, adjusted())
+
+
+def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    begun: list[BundleProblem] = []
+
+    def solver(problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+        begun.append(problem)
+        return solve_here(problem, iterations, covariances)
+
+    adjusting.solver = solver
+    adjusting.begin()  # nothing was asked for
+    adjusting.ask(slam_map, 4, due=12)
+    assert not begun
+    adjusting.begin()
+    adjusting.begin()
+    assert len(begun) == 1
+    check_same(slam_map, shaken())
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted())
+    adjusting.begin()
+    assert len(begun) == 1
+    adjusting.ask(slam_map, 3, due=20)
+    adjusting.take_over(slam_map)  # who was not begun begins now
+    assert len(begun) == 2
+    adjusting.ask(slam_map, 4, due=30)
+    adjusting.begin()
+    adjusting.drop()
+    before = [column.clone() for column in columns(slam_map)]
+    adjusting.take_over(slam_map)
+    assert all(torch.equal(a, b) for a, b in zip(columns(slam_map), before, strict=True))
 
 
 def test_it_can_be_hurried_or_dropped() -> None:

@@ -29,9 +29,17 @@ def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> An
 
 @dataclass(frozen=True)
 class Asked:
-    """An adjustment to be taken over at frame `due`; of nothing where there is nothing to adjust."""
+    """An adjustment around a keyframe, to be taken over at frame `due`."""
 
     due: int
+    slam_map: Map
+    keyframe: int
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What is adjusted, and what waits for the outcome; neither where there is nothing to adjust."""
+
     part: Part | None
     answer: Answer | None
 
@@ -47,6 +55,7 @@ class Adjusting:
     def __init__(self, camera: Camera, settings: BundleConfig, covariances: bool) -> None:
         self.camera, self.settings, self.covariances = camera, settings, covariances
         self._asked: Asked | None = None
+        self._begun: Begun | None = None
 
     def __bool__(self) -> bool:
         """Whether there is one to be taken over."""
@@ -69,17 +78,24 @@ class Adjusting:
     def ask(self, slam_map: Map, keyframe: int, due: int) -> None:
         """Have what is around a keyframe adjusted, to be taken over after frame `due`."""
         assert self._asked is None  # the map was to stay as it is
-        part = around(slam_map, keyframe, self.camera, self.settings)
+        self._asked = Asked(due, slam_map, keyframe)
+
+    def begin(self) -> None:
+        """Have the solver begin with what was asked for, if it has not: it is all the same when, as the map stays."""
+        if self._asked is None or self._begun is not None:
+            return
+        part = around(self._asked.slam_map, self._asked.keyframe, self.camera, self.settings)
         find = self.solver
         answer = None if part is None else find(part.problem, self.settings.iterations, self.covariances)
-        self._asked = Asked(due, part, answer)
+        self._begun = Begun(part, answer)
 
     def take_over(self, slam_map: Map) -> None:
         """Put the map to where it belongs, if that was asked for."""
-        asked, self._asked = self._asked, None
-        if asked is not None and asked.part is not None and asked.answer is not None:
-            take(slam_map, asked.part, asked.answer(), self.camera)
+        self.begin()
+        begun, self._asked, self._begun = self._begun, None, None
+        if begun is not None and begun.part is not None and begun.answer is not None:
+            take(slam_map, begun.part, begun.answer(), self.camera)
 
     def drop(self) -> None:
         """The map is gone: nothing is to be taken over."""
-        self._asked = None
+        self._asked = self._begun = None

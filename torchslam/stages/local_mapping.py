@@ -33,6 +33,12 @@ class LocalMapping:
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
+    def begin_adjusting(self) -> None:
+        """What was asked for with the last frame begins: that one was long enough."""
+        if self.adjusting:
+            with self.parts.clock("bundle"):
+                self.adjusting.begin()
+
     def is_due(self, frame: int) -> bool:
         """Whether what was adjusted is taken over with this frame."""
         return self.adjusting.is_due(frame)
