@@ -140,3 +140,25 @@ def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> N
     assert slam.history.frames["frame_index"].tolist() == list(range(32))
     assert int(slam.map.keyframes["frame_index"].max()) < 32
     assert len(slam.memory.places) == slam.map.num_keyframes
+
+
+def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A keyframe whose adjustment is taken over without a look back, as before the first keyframe on trial."""
+    slam, walk = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED)), Walk(arc(60)[:40])
+    frames = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk)
+    for index in range(len(walk)):
+        slam.step(frames[index])
+        newest = slam.map.num_keyframes - 1
+        if slam.mapper.adjusting and slam.looks_known == (slam.map.key(newest), False):
+            break
+    else:
+        pytest.fail("no keyframe was asked about")
+    asked: list[int] = []
+    recognizer, world = slam.memory.recognizer, slam.world
+    assert world is not None
+    monkeypatch.setattr(recognizer, "recognize", lambda _, keyframe: asked.append(keyframe))
+    slam._following.loop_closing.look_back(world)
+    assert not asked  # it is known already
+    slam.looks_known = -1, False
+    slam._following.loop_closing.look_back(world)
+    assert asked == [newest]

@@ -136,7 +136,9 @@ def _go_on(
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["adjusting"] is not None:  # of the newest keyframe, around which the map is as it was then
         slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, int(run["adjusting"]))
-        slam.looks_known = run["looks_known"]
+    if run["looks_known"] is not None:
+        key, looks_known = run["looks_known"]
+        slam.looks_known = int(key), bool(looks_known)
 
 
 def _check_track(track: Track) -> None:

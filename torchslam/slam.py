@@ -154,12 +154,12 @@ class SLAM:
         return self._following.beginning.youth
 
     @property
-    def looks_known(self) -> bool | None:
-        """Whether the newest keyframe's place does, see `LoopClosing.look_ahead`: part of what a checkpoint keeps."""
+    def looks_known(self) -> tuple[int, bool] | None:
+        """A keyframe and whether its place does, see `LoopClosing.look_ahead`: part of what a checkpoint keeps."""
         return self._following.loop_closing.looks_known
 
     @looks_known.setter
-    def looks_known(self, looks_known: bool | None) -> None:
+    def looks_known(self, looks_known: tuple[int, bool] | None) -> None:
         self._following.loop_closing.looks_known = looks_known
 
     @property

@@ -13,7 +13,7 @@ class LoopClosing:
 
     def __init__(self, parts: Parts, mapping: LocalMapping, beginning: Beginning) -> None:
         self.parts, self.mapping, self.beginning = parts, mapping, beginning
-        self.looks_known: bool | None = None  # whether the newest keyframe's place does; None: not asked yet
+        self.looks_known: tuple[int, bool] | None = None  # a keyframe, by key, and whether its place does
 
     @property
     def count(self) -> int:
@@ -29,9 +29,11 @@ class LoopClosing:
 
         Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
         """
-        if self.mapping.adjusting and self.looks_known is None:
+        keyframe = world.map.num_keyframes - 1
+        key = world.map.key(keyframe)
+        if self.mapping.adjusting and (self.looks_known is None or self.looks_known[0] != key):
             with self.parts.clock("loops"):
-                self.looks_known = self.parts.memory.looks_known(world, world.map.num_keyframes - 1)
+                self.looks_known = key, self.parts.memory.looks_known(world, keyframe)
 
     def look_back(self, world: World) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.
@@ -47,10 +49,10 @@ class LoopClosing:
 
     def _recall(self, world: World) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
-        parts, looks_known = self.parts, self.looks_known
-        self.looks_known = None
+        parts, newest = self.parts, world.map.num_keyframes - 1
         with parts.clock("loops"):
-            found = parts.memory.recognize(world, world.map.num_keyframes - 1, looks_known is False)
+            looks_new = self.looks_known == (world.map.key(newest), False)
+            found = parts.memory.recognize(world, newest, looks_new)
             if found is None:
                 return world
             if not found.is_loop:

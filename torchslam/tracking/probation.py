@@ -1,4 +1,4 @@
-"""Frames whose poses are not believed yet: nothing is built on them until the frames after them confirm it."""
+"""Frames whose poses are not believed yet: what is built on them is on trial until the frames after them confirm it."""
 
 from __future__ import annotations
 
