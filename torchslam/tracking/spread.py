@@ -16,9 +16,7 @@ from torchslam.world.map import Map
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
 PER_CELL = 5  # matches of a cell that RANSAC hears
 CROWD = 8  # matches of a cell that count in full
-LEAST_ASKED = (
-    5  # cells that old points are expected in, before their absence says anything: one or two leave any image
-)
+LEAST_ASKED = 5  # cells that old points are expected in, before it says anything that they are missing
 SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
 
 
