@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torchslam.config import MatchingConfig
-from torchslam.features import match, match_projected
+from torchslam.features import match
 from torchslam.tracking.matcher import DescriptorMatcher, Prior, max_distance
 from torchslam.values import Matches, View
 
@@ -22,15 +24,5 @@ class Mutual:
         limit = max_distance(view_2.descriptors, self.settings)
         if prior is None:
             return match(view_1.features, view_2.features, ratio=None, mutual=True, max_distance=limit)
-        if prior.radius_px is None:
-            return self.own(view_1, view_2, prior)
-        return match_projected(
-            view_1.descriptors[None],
-            view_1.keypoints[None],
-            prior.radius_px[None],
-            view_2.features,
-            mask=view_1.mask[None],
-            scales=view_1.scales[None],
-            max_distance=limit,
-            ratio=None,
-        )
+        without = prior if prior.radius_px is None else replace(prior, ratio=None)
+        return self.own(view_1, view_2, without)
