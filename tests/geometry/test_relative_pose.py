@@ -58,6 +58,17 @@ def test_exact_data_give_the_exact_pose() -> None:
         assert direction_error(T_21[:, :3, 3], scene.T_21[:, :3, 3]) < 1e-4
 
 
+@pytest.mark.parametrize(("seed", "baseline"), [(90, 0.35), (116, 0.35), (1, 0.1), (20, 0.1)])
+def test_a_rotation_is_one_also_where_the_root_of_its_sample_was_not(seed: int, baseline: float) -> None:
+    scene = two_views(seed, baseline=baseline)
+    found = estimate(scene)
+    for T_21 in (found.T_21, found.T_21_essential):
+        R = T_21[0, :3, :3]
+        torch.testing.assert_close(R.mT @ R, torch.eye(3, dtype=R.dtype), atol=1e-9, rtol=0)
+        assert torch.linalg.det(R) > 0
+    assert rotation_error(found.T_21[:, :3, :3], scene.T_21[:, :3, :3]) < 1
+
+
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_a_plane_is_called_a_plane_and_its_pose_is_right_or_ambiguous(noise: float) -> None:
     successes = 0
