@@ -139,6 +139,16 @@ def test_a_graph_without_observations_fails_without_an_error():
     assert bundle.covariance().points.shape == (0, 3, 3)
 
 
+def test_frames_say_whether_they_are_at_a_minimum():
+    _, graph = simulated()
+    first = solve(graph, iterations=1)
+    assert not first.converged.any()  # without points there, no frame is where it belongs
+    there = replace(graph, T_cw=solve(graph).T_cw, points_w=solve(graph).points_w)
+    off = replace(there, T_cw=torch.where(graph.is_keyframe[:, None, None], there.T_cw, graph.T_cw))
+    assert solve(there, iterations=2).converged.all()
+    assert torch.equal(solve(off, iterations=2).converged, graph.is_keyframe)
+
+
 def test_keyframes_only_and_no_keyframe():
     _, graph = simulated()
     everyone = replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))

@@ -15,7 +15,7 @@ from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
 from torchslam.solvers.many_graphs import solve_each
 
 SIZES = ((10, 50, 0), (8, 40, 1), (7, 60, 2))
-COLUMNS = ("T_cw", "points_w", "success", "moved_points", "world", "timestamps")
+COLUMNS = ("T_cw", "points_w", "success", "moved_points", "converged", "world", "timestamps")
 
 
 def several(noise: float = 0.5) -> list[ObservationGraph]:
@@ -78,6 +78,20 @@ def test_worlds_of_a_graph_stay_apart() -> None:
         solve_each([one, replace(both, point_index=shared)])
     with pytest.raises(ValueError, match="no keyframe"):
         solve_each([one, replace(one, is_keyframe=torch.zeros(10, dtype=torch.bool))])
+
+
+def test_each_says_of_its_own_worlds_whether_they_are_at_a_minimum() -> None:
+    (*_, apart), (graph, *_) = two_worlds(), several()
+    ends = solve(apart)
+    there = replace(apart, T_cw=ends.T_cw, points_w=ends.points_w)
+    second = (apart.world == 1)[:, None, None]
+    half = replace(there, T_cw=torch.where(second, apart.T_cw, there.T_cw))
+    found = solve_each([graph, half, there], iterations=2)
+    assert [bool(each.converged.any()) for each in found] == [False, True, True]
+    assert torch.equal(found[1].converged, apart.world == 4)
+    assert found[2].converged.all()
+    for each, alone in zip(found, (graph, half, there), strict=True):
+        assert torch.equal(each.converged, solve(alone, iterations=2).converged)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])

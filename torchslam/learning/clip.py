@@ -29,6 +29,11 @@ from torchslam.world.history import RunGraph
 
 OnFailure = Literal["raise", "skip"] | float
 
+# Clips whose keypoints moved by half a pixel take 5 to 70; after 30, the gradients of one in five were wrong.
+_ITERATIONS = 200
+# Share of the cost that the last step promises: gradients then are right to 1e-6, where 1e-10 makes them so to 1e-4.
+_TOLERANCE = 1e-14
+
 
 @dataclass(frozen=True)
 class ClipGraph:
@@ -65,7 +70,8 @@ class ClipPoses:
     T_cw:      (T, 4, 4) or (B, T, 4, 4) world to camera, float64, the identity where there is no pose. The world is
                the camera of the clip's first keyframe, its unit of length the median depth of the first map.
     posed:     (T,) or (B, T) bool; where a clip falls apart into several worlds, the frames of the main one alone
-    success:   () or (B,) bool: a map started, and enough frames are posed for an error to mean something
+    success:   () or (B,) bool: a map started, enough frames are posed for an error to mean something, and their poses
+               are those of a minimum: only there is the gradient one
     reason:    one per clip: why there is no success, empty where there is
     graphs:    one per clip: what the system saw, with differentiable pixels and weights; None where no map started
     solutions: one per clip: the minimiser of the graph, with points and covariances; None where no map started
@@ -224,11 +230,13 @@ class ClipSLAM(nn.Module):
             None if run is None else _as_seen(run, each, worth_of, own)
             for run, each, worth_of, own in zip(graph.runs, seen, worth, cameras, strict=True)
         )
-        found = iter(solve_each([each for each in graphs if each is not None]))
+        there = [each for each in graphs if each is not None]
+        found = iter(solve_each(there, iterations=_ITERATIONS, tolerance=_TOLERANCE))
         solutions = tuple(None if each is None else next(found) for each in graphs)
         clips = [_posed(*one) for one in zip(graphs, solutions, seen, worth, cameras, strict=True)]
         T_cw, posed = (torch.stack(each) for each in zip(*clips, strict=True))
-        success = posed.sum(-1) >= MIN_POSES
+        settled = [each is not None and bool((each.converged | ~each.success).all()) for each in solutions]
+        success = (posed.sum(-1) >= MIN_POSES) & torch.tensor(settled, device=posed.device)
         reasons = (
             "" if good else _reason(*one)
             for good, *one in zip(success.tolist(), graph.reasons, solutions, posed, strict=True)
@@ -308,4 +316,6 @@ def _reason(no_map: str, solution: GraphSolution | None, posed: Tensor) -> str:
         return no_map
     if not any(bundle.success for bundle in solution.keyframes):
         return "its keyframes and points are not determined"
-    return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"
+    if int(posed.sum()) < MIN_POSES:
+        return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"
+    return f"its poses are no minimum after {_ITERATIONS} iterations: their gradient would be wrong"

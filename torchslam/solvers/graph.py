@@ -167,6 +167,8 @@ class GraphSolution:
     success:   (F,) bool. A frame that its observations do not determine stays where it was, without gradient; if the
                keyframes of a world together are not determined, none of them succeeds.
     moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.
+    converged: (F,) bool, the search for a frame's pose, and before for its world's keyframes and points, ended at a
+               minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
     world:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
     keyframes: the bundle adjustments of keyframes and points, with their covariances, one per world in the order of
                `ObservationGraph.worlds`; rows are those of the world's keyframes and of the points its frames see
@@ -178,6 +180,7 @@ class GraphSolution:
     camera: Camera
     success: Tensor
     moved_points: Tensor
+    converged: Tensor
     world: Tensor
     keyframes: tuple[BundleSolution, ...]
 
@@ -239,10 +242,9 @@ def solve(
     if not bundles:
         raise ValueError("the graph has no keyframe")
     camera = bundles[0].camera
-    T_cw, success = between(graph, T_cw, points_w, camera, moved, success, *options)
-    return GraphSolution(
-        graph.timestamps, T_cw, points_w, camera, success, moved, graph.world, tuple(bundles)
-    )
+    T_cw, success, settled = between(graph, T_cw, points_w, camera, moved, success, *options)
+    found = T_cw, points_w, camera, success, moved, settled & converged_of(graph, bundles)
+    return GraphSolution(graph.timestamps, *found, graph.world, tuple(bundles))
 
 
 def keyframes_of(graph: ObservationGraph, world: int) -> tuple[Tensor, Tensor, BundleProblem]:
@@ -270,6 +272,12 @@ def keyframes_of(graph: ObservationGraph, world: int) -> tuple[Tensor, Tensor, B
     return keyframes, points, problem
 
 
+def converged_of(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
+    """(F,) whether the bundle adjustment of each frame's world, in the order of `graph.worlds`, has converged."""
+    converged = torch.cat([bundle.convergence.converged for bundle in bundles])
+    return converged[torch.unique(graph.world, return_inverse=True)[1]]
+
+
 def between(
     graph: ObservationGraph,
     T_cw: Tensor,
@@ -282,15 +290,16 @@ def between(
     backward: Backward,
     iterations: int,
     tolerance: float,
-) -> tuple[Tensor, Tensor]:
-    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; and who succeeded.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; who succeeded, and
+    whose search ended at a minimum: all keyframes, here.
 
     camera: of all frames, or with params (F, K) of each its own
     """
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
-    starts = counts.cumsum(0) - counts
+    starts, converged = counts.cumsum(0) - counts, torch.ones_like(success)
     for frames in others.split(_FRAMES_AT_ONCE) if len(others) else ():
         slot = torch.arange(int(counts[frames].max()), device=frames.device)
         mask = slot < counts[frames, None]
@@ -311,7 +320,8 @@ def between(
         )
         T_cw = T_cw.index_copy(0, frames, refined.T_cw)
         success = success.index_copy(0, frames, refined.success)
-    return T_cw, success
+        converged = converged.index_copy(0, frames, refined.convergence.converged)
+    return T_cw, success, converged
 
 
 def join(graphs: Sequence[Graph]) -> Graph:

@@ -13,7 +13,15 @@ from torch.nn.utils.rnn import pad_sequence
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.solvers.bundle import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.solvers.graph import GraphSolution, ObservationGraph, between, join, keyframes_of, solve
+from torchslam.solvers.graph import (
+    GraphSolution,
+    ObservationGraph,
+    between,
+    converged_of,
+    join,
+    keyframes_of,
+    solve,
+)
 from torchslam.solvers.implicit import Backward
 
 # A bundle adjustment is filled up to the largest of those it is solved with: none should be more than so many times as
@@ -99,14 +107,15 @@ def _solve_alike(
     success = success.index_copy(0, frames, succeeded & finite)
     params = torch.stack([graph.camera.params for graph in graphs])
     camera = graphs[0].camera.with_params(params[joined.world])
-    T_cw, success = between(joined, T_cw, points_w, camera, moved, success, *options)
+    T_cw, success, settled = between(joined, T_cw, points_w, camera, moved, success, *options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
-        own = (bundle for bundle, world in zip(bundles, worlds, strict=True) if world.graph == number)
-        found = T_cw[rows], points_w[places], graph.camera, success[rows], moved[places]
-        solutions.append(GraphSolution(graph.timestamps, *found, graph.world, tuple(own)))
+        own = tuple(bundle for bundle, world in zip(bundles, worlds, strict=True) if world.graph == number)
+        converged = settled[rows] & converged_of(graph, own)
+        found = T_cw[rows], points_w[places], graph.camera, success[rows], moved[places], converged
+        solutions.append(GraphSolution(graph.timestamps, *found, graph.world, own))
     return tuple(solutions)
 
 

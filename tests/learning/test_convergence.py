@@ -1,0 +1,88 @@
+"""A pose is one of a minimum, or no success: only at a minimum is its gradient right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.learning.test_clip import FRAMES, BentEyes, clip_of
+from tests.walks import Walk, arc
+from torchslam import ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
+from torchslam.learning import clip as clips
+from torchslam.learning.losses import relative_ate
+
+NOISE_PX = 3.0  # many observations lie where the kernel bends: the way to the minimum is long
+FEW, MANY = 0, 5  # seeds of a noise with which it takes 22 iterations, and 57
+
+
+class Seen:
+    """A clip that was looked at, and its true poses."""
+
+    def __init__(self) -> None:
+        walk = Walk(arc(FRAMES, length=1.0))
+        images, self.truth = clip_of(walk)
+        self.clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+        with torch.no_grad():
+            features = self.clip_slam.extract(images)
+        assert isinstance(features, Features)
+        self.features, self.graph = features, self.clip_slam.look(images, walk.camera)
+
+    def moved(self, seed: int) -> Features:
+        """The features with keypoints moved at random, which require a gradient."""
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(self.features.keypoints.shape, generator=generator, dtype=torch.float64)
+        return replace(self.features, keypoints=(self.features.keypoints + NOISE_PX * noise).requires_grad_())
+
+    def pose(self, features: Features) -> ClipPoses:
+        return self.clip_slam.pose(self.graph, features)
+
+    def loss(self, features: Features) -> Tensor:
+        return clip_loss(self.pose(features), self.truth, relative_ate).loss
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    return Seen()
+
+
+def test_a_long_way_to_the_minimum_ends_there_and_the_gradient_is_right(seen: Seen) -> None:
+    features = seen.moved(MANY)
+    (gradient,) = torch.autograd.grad(seen.loss(features), features.keypoints)
+    h, direction = 1e-4, gradient / gradient.norm()
+    with torch.no_grad():
+        ahead, behind = (
+            seen.loss(replace(features, keypoints=features.keypoints + step * direction)) for step in (h, -h)
+        )
+    assert float((ahead - behind) / (2 * h)) == pytest.approx(float(gradient.norm()), rel=1e-6)
+
+
+def test_in_one_call_or_in_turn_the_gradients_are_the_same(seen: Seen) -> None:
+    features = [seen.moved(seed) for seed in (FEW, MANY)]
+    truths = torch.stack([seen.truth, seen.truth])
+    together = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)
+    clip_loss(together, truths, relative_ate).loss.backward()
+    for each in features:
+        (alone,) = torch.autograd.grad(seen.loss(each) / 2, each.keypoints)
+        assert each.keypoints.grad is not None
+        assert (each.keypoints.grad - alone).norm() < 1e-6 * alone.norm()
+
+
+def test_what_does_not_get_there_is_no_success_and_says_so(
+    seen: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clips, "_ITERATIONS", 40)
+    features = [seen.moved(seed) for seed in (FEW, MANY)]
+    poses = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)
+    assert poses.success.tolist() == [True, False]
+    assert poses.posed.all()  # there are poses, and nearly the right ones
+    assert poses.reason == ("", "its poses are no minimum after 40 iterations: their gradient would be wrong")
+    truths = torch.stack([seen.truth, seen.truth])
+    loss, failures = clip_loss(poses, truths, relative_ate, on_failure=1.0)
+    assert failures == 0.5
+    loss.backward()
+    assert (features[0].keypoints.grad != 0).any()
+    assert (features[1].keypoints.grad == 0).all()
+    assert seen.pose(features[0]).success
