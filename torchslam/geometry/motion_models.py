@@ -48,9 +48,7 @@ _PARAMETERS = (5, 8, 3)  # of the three models
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
 _IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
-_EXACT = (
-    1 / 16
-)  # units of the noise, which only exact matches are far below: what is left of them is rounding
+_EXACT = 1 / 16  # units of the noise; only exact matches are far below, and what is left of them is rounding
 
 
 @dataclass(frozen=True)
