@@ -163,8 +163,7 @@ def main() -> None:
         "milliseconds per clip; a step is pose and backward, and needs neither the front end nor another look. The "
         "columns after them pose all clips of a row in one call, each with a camera of its own, in turn with one after "
         "the other, and say by what share of its length the gradient to a camera differs between the two: median, "
-        "and the most. Where iterations end before the minimum, or matches hardly determine it, that depends on the "
-        "way there.\n\n"
+        "and the most.\n\n"
         f"    python -m experiments.benchmarks.clips\n\n{table(header, rows)}"
     )
     print(text)
