@@ -52,6 +52,16 @@ def row_of(name: str, *apart: str, overrides: Iterable[str] = (), **more: Any) -
     return Row(label, place, overrides=tuple(overrides), **more)
 
 
+def parser_of(description: str | None, output: Path | None = None) -> argparse.ArgumentParser:
+    """A parser of an experiment that its module describes, with the file that its table goes to, if it has one."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if output is not None:
+        parser.add_argument("--output", type=Path, default=output)
+    return parser
+
+
 def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
     """Where the runs of an experiment go, and who does them; what is there already is not done again."""
     parser.add_argument("--output", type=Path, default=Path("results") / experiment, metavar="DIR")

@@ -8,7 +8,6 @@ writes them to FILE.
 
 from __future__ import annotations
 
-import argparse
 import math
 import resource
 import time
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, milliseconds, rmse
-from experiments.common import table
+from experiments.common import parser_of, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust
 
@@ -194,10 +193,7 @@ def windows() -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=HERE / "bundle.md")
+    parser = parser_of(__doc__, HERE / "bundle.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = [

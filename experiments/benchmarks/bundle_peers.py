@@ -12,7 +12,6 @@ FILE. With --peer and --problem: one solver alone, in this process; its result a
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -34,7 +33,7 @@ from experiments.benchmarks import bundle_formulations
 from experiments.benchmarks.bundle import FRAMES, POINTS, ring, window
 from experiments.benchmarks.bundle_formulations import Stated
 from experiments.benchmarks.solvers import rmse
-from experiments.common import table
+from experiments.common import parser_of, table
 from torchslam.solvers import BundleProblem
 
 HERE = Path(__file__).parent
@@ -210,10 +209,7 @@ def section(title: str, problem: str, peers: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=HERE / "bundle_peers.md")
+    parser = parser_of(__doc__, HERE / "bundle_peers.md")
     parser.add_argument("--peer", choices=PEERS)
     parser.add_argument("--problem", default="ring")
     arguments = parser.parse_args()

@@ -8,7 +8,6 @@ pixel at random, as learning would move them. Prints a table and writes it to FI
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,7 +17,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from experiments.common import sequences, table
+from experiments.common import parser_of, sequences, table
 from torchslam import ORB, ClipGraph, ClipSLAM, Features, clip_loss
 from torchslam.learning.clips import Clip, Clips
 from torchslam.learning.losses import relative_ate
@@ -121,10 +120,7 @@ def timed(call: Callable[[], T]) -> tuple[T, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=HERE / "clips.md")
+    parser = parser_of(__doc__, HERE / "clips.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []

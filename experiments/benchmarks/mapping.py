@@ -8,7 +8,6 @@ among the places seen before, in maps of different sizes by turns. Prints a tabl
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.common import table
+from experiments.common import parser_of, table
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.loops.memory import Memory
@@ -133,10 +132,7 @@ class Walk:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=HERE / "mapping.md")
+    parser = parser_of(__doc__, HERE / "mapping.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     with torch.inference_mode():

@@ -8,7 +8,6 @@ Prints a table and writes it to FILE.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.solvers import gradient_error, milliseconds
-from experiments.common import table
+from experiments.common import parser_of, table
 from torchslam.geometry import rigid, sim3_exp, sim3_inverse, sim3_log, sim3_scale, so3_exp
 from torchslam.solvers import PoseGraph, pose_graph_optimize
 
@@ -158,10 +157,7 @@ def gradient() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=HERE / "pose_graph.md")
+    parser = parser_of(__doc__, HERE / "pose_graph.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     header = [

@@ -7,12 +7,11 @@ Writes docs/images/history.png and docs/history.md.
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.common import table
+from experiments.common import parser_of, table
 from experiments.report.record import HISTORY, ROOT, Record, is_quiet, read_history
 from torchslam.output.plots.style import ACCENT, ESTIMATE, house_style, new_figure, save
 
@@ -152,9 +151,7 @@ def write(history: list[Record], docs: Path = DOCS) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--history", type=Path, default=HISTORY)
     write(read_history(parser.parse_args().history))
 
