@@ -18,6 +18,7 @@ from torchslam.tracking.matcher import max_distance
 from torchslam.values import View
 
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
+_SAMPLE = 8  # every so many-th keypoint is asked first whether the camera moved far enough to tell
 
 
 @dataclass(frozen=True)
@@ -25,18 +26,21 @@ class _Look:
     """A frame to compare later ones with.
 
     view:     what it saw; T_wc: (4, 4) where it was
-    points_c: (d, n, 3) where the points of its n keypoints may be, by their depth
+    pixels:   (n, 2) of its keypoints
+    points_c: (d, n, 3) where the points of these may be, by their depth
     """
 
     view: View
     T_wc: Tensor
+    pixels: Tensor
     points_c: Tensor
 
     @classmethod
     def of(cls, view: View, T_cw: Tensor, depth: float, camera: Camera) -> _Look:
-        rays = camera.unproject(view.keypoints[view.mask])
+        pixels = view.keypoints[view.mask]
+        rays = camera.unproject(pixels)
         depths = depth * rays.new_tensor(_DEPTHS)
-        return cls(view, se3_inverse(T_cw), rays / rays[:, 2:] * depths[:, None, None])
+        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None])
 
 
 class Stillness:
@@ -71,10 +75,13 @@ class Stillness:
         if last is None or view.session != last.view.session:
             self._last = _Look.of(view, T_cw, depth, self.camera)
             return 0
+        if not self._is_far(self._must_move(last, T_cw, _SAMPLE)):
+            return 0
+        moving = self._must_move(last, T_cw)
+        if not self._is_far(moving):
+            return 0
         must_move = view.mask.new_zeros(len(last.view.mask))
-        must_move[last.view.mask] = self._least_motion(last, T_cw) > self.settings.min_motion_px
-        if int(must_move.sum()) < self.settings.min_moving_share * int(last.view.mask.sum()):
-            return 0  # not far enough yet to tell
+        must_move[last.view.mask] = moving
         self._last = _Look.of(view, T_cw, depth, self.camera)
         stayed = self._stayed(last.view, view, must_move)
         before = int((self.evidence >= self.settings.min_evidence).sum())
@@ -89,12 +96,15 @@ class Stillness:
         if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
             self._add(pixels)
 
-    def _least_motion(self, last: _Look, T_cw: Tensor) -> Tensor:
-        """(n,) pixels by which a point of the scene seen at each keypoint moved at least, whatever its depth."""
-        pixels = last.view.keypoints[last.view.mask]
-        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c))
-        distance = distances_to_segments(pixels, moved[:-1], moved[1:])
-        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0)
+    def _must_move(self, last: _Look, T_cw: Tensor, step: int = 1) -> Tensor:
+        """(n,) whether a point of the scene seen at a keypoint, every `step`-th of them, moved, whatever its depth."""
+        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
+        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
+
+    def _is_far(self, must_move: Tensor) -> bool:
+        """Whether the camera moved far enough to tell: enough of some keypoints (n,) bool had to move."""
+        return int(must_move.sum()) >= self.settings.min_moving_share * len(must_move)
 
     def forget_last(self) -> None:
         """The next frame cannot be compared with the ones before: its pose is in another world."""
