@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config, LoopsConfig
-from torchslam.geometry import Camera, se3_inverse, sim3_scale, so3_log
+from torchslam.geometry import Camera, se3_inverse, sim3_scale
+from torchslam.geometry.motion import rotation_angle
 from torchslam.loops.places import Places
 from torchslam.loops.relation import Relation, confirms, neighbourhood, relate
 from torchslam.world.map import Map
@@ -134,7 +135,7 @@ def may_have_drifted(
     S = relation.S_21
     scale = float(sim3_scale(S))
     moved = float(torch.linalg.vector_norm(S[:3, :3] @ here + S[:3, 3] - here))
-    turned = float(torch.rad2deg(torch.linalg.vector_norm(so3_log(S[:3, :3] / scale))))
+    turned = float(torch.rad2deg(rotation_angle(S[:3, :3] / scale)))
     return (
         moved <= settings.max_drift * length
         and turned <= settings.max_drift_deg
@@ -148,7 +149,7 @@ def agree(one: Recognition, other: Recognition) -> bool:
         return True
     S, Z = one.relation.S_21, other.relation.S_21
     scale, second = sim3_scale(S), sim3_scale(Z)
-    turned = torch.rad2deg(torch.linalg.vector_norm(so3_log(S[:3, :3] / scale @ (Z[:3, :3] / second).mT)))
+    turned = torch.rad2deg(rotation_angle(S[:3, :3] / scale @ (Z[:3, :3] / second).mT))
     camera_1 = se3_inverse(one.world.map.T_cw[one.keyframe])[:3, 3]
     apart = torch.linalg.vector_norm((S - Z)[:3, :3] @ camera_1 + (S - Z)[:3, 3])
     seen = one.other.map.points_seen_by(one.other.map.ids(one.place))

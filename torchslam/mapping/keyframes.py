@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from torchslam.config import KeyframesConfig
-from torchslam.geometry import transform
 from torchslam.geometry.motion import apart
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
@@ -23,8 +22,7 @@ def why_keyframe(view: View, tracked: Tracked, world: World, settings: Keyframes
     if age < max(1, settings.min_interval):
         return ""
     around = torch.cat([track.local_keyframes, track.local_keyframes.new_tensor([newest])])
-    depth = transform(tracked.T_cw, slam_map.positions_w[tracked.point_ids])[:, 2].median()
-    translation, rotation = apart(tracked.T_cw, slam_map.T_cw[around], depth)
+    translation, rotation = apart(tracked.T_cw, slam_map.T_cw[around], tracked.depth)
     has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
     overlap = tracked.inliers / max(track.reference_size, 1)
     if bool((has_moved | has_turned).all()):

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchslam.config import JudgeConfig
-from torchslam.geometry import se3_inverse, so3_log
+from torchslam.geometry import se3_inverse
+from torchslam.geometry.motion import rotation_angle
 from torchslam.values import Tracked
 from torchslam.world.track import Track
 
@@ -53,13 +54,13 @@ def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> str:
 
 def deviations(tracked: Tracked) -> tuple[float, float]:
     """Standard deviations of the position, as a share of the depth of the scene, and of the rotation, in degrees."""
-    variances = tracked.covariance.diagonal()
-    position = float(variances[:3].sum().clamp(min=0).sqrt()) / max(tracked.depth, 1e-12)
-    return position, math.degrees(float(variances[3:].sum().clamp(min=0).sqrt()))
+    variances = tracked.covariance.diagonal().tolist()
+    position = max(sum(variances[:3]), 0.0) ** 0.5 / max(tracked.depth, 1e-12)
+    return position, math.degrees(max(sum(variances[3:]), 0.0) ** 0.5)
 
 
 def jump(tracked: Tracked, predicted_T_cw: Tensor) -> tuple[float, float]:
     """How far a pose is from where it was expected: in shares of the depth of the scene, and in degrees."""
     motion = tracked.T_cw @ se3_inverse(predicted_T_cw)
     moved = float(torch.linalg.vector_norm(motion[:3, 3])) / max(tracked.depth, 1e-12)
-    return moved, math.degrees(float(torch.linalg.vector_norm(so3_log(motion[:3, :3]))))
+    return moved, math.degrees(float(rotation_angle(motion[:3, :3])))
