@@ -213,6 +213,7 @@ def finish(
         for world in slam.session.worlds:
             if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
                 adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
+                world.history.forget_strays(world.map, slam.camera)
                 graph = world.history.graph(world.map, slam.camera)
                 world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
     except KeyboardInterrupt:

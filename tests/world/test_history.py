@@ -120,3 +120,60 @@ def test_units_change_around_each_keyframe() -> None:
     torch.testing.assert_close(after[2:, :3, 3], 3 * before[2:, :3, 3])
     torch.testing.assert_close(after[:, :3, :3], before[:, :3, :3])
     assert float(before[2:, :3, 3].norm()) == pytest.approx(float(after[2:, :3, 3].norm()) / 3)
+
+
+def stray(world: World, frame: int, count: int, shift: float = 60.0) -> None:
+    """The first `count` things that a frame saw were seen elsewhere, by pixels of their scales."""
+    seen = world.history.observations
+    rows = torch.nonzero(seen["row"] == frame)[:count, 0]
+    seen["pixels"][rows, 0] += shift * seen["scales"][rows]
+
+
+def of_frames(world: World) -> list[int]:
+    """How many observations each frame has."""
+    return torch.bincount(world.history.observations["row"]).tolist()
+
+
+def test_what_is_far_astray_is_forgotten() -> None:
+    world = walked()
+    before, ids = of_frames(world), world.history.observations["point_ids"].clone()
+    at = torch.nonzero(world.history.observations["row"] == 3)[:, 0]
+    stray(world, 3, 5)
+    world.history.forget_strays(world.map, CAMERA)
+    assert [was - now for was, now in zip(before, of_frames(world), strict=True)] == [0, 0, 0, 5, 0]
+    seen = world.history.observations
+    assert torch.equal(seen["point_ids"][seen["row"] == 3], ids[at[5:]])
+
+
+@pytest.mark.parametrize(("off", "forgotten"), [(4.85, 0), (4.95, 5)])
+def test_astray_is_twice_as_far_as_agrees(off: float, forgotten: int) -> None:
+    """sqrt(4 x 5.991) = 4.895"""
+    world = walked()
+    count = len(world.history.observations)
+    stray(world, 3, 5, off)
+    world.history.forget_strays(world.map, CAMERA)
+    assert count - len(world.history.observations) == forgotten
+
+
+def test_a_frame_that_agrees_with_little_keeps_all() -> None:
+    world = walked()
+    before = of_frames(world)
+    stray(world, 3, before[3] // 4 + 1)
+    world.history.forget_strays(world.map, CAMERA)
+    assert of_frames(world) == before
+
+
+def test_a_stray_does_not_pull_its_frame() -> None:
+    world = walked()
+    truth = world.history.T_cw(world.map)[3].clone()
+    stray(world, 3, 3)
+
+    def off() -> float:
+        graph = world.history.graph(world.map, CAMERA)
+        row = int(torch.nonzero(graph.frame_ids == 11)[0])
+        T_cw = solve(graph, backward="detached").T_cw[row]
+        return float((T_cw @ se3_inverse(truth))[:3, 3].norm())
+
+    assert off() > 1e-3
+    world.history.forget_strays(world.map, CAMERA)
+    assert off() < 1e-9

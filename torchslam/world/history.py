@@ -8,12 +8,18 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, Noise, se3_inverse
+from torchslam.geometry import CHI_SQUARE_95, Camera, Noise, fits, se3_inverse, transform
 from torchslam.solvers.graph import GraphSolution, ObservationGraph, Schema
 from torchslam.values import Tracked, Trajectory, View
 from torchslam.world.map import NO_KEYPOINT, Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
+
+_ASTRAY = (
+    4.0 * CHI_SQUARE_95
+)  # twice as far off as what agrees may be: the final adjustment moves frames by less
+_MOST = 0.75  # of what a frame saw, which must agree before the rest is forgotten
+_AT_ONCE = 1 << 16  # observations: a pose for each takes memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +181,33 @@ class History:
         self.observations["point_ids"][:] = renamed
         if bool((renamed < 0).any()):
             self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
+
+    def forget_strays(self, slam_map: Map, camera: Camera) -> None:
+        """Forget what frames saw far from where the map has it by now: its point was merged with another, or moved.
+
+        One such observation would pull a frame off its place that few points hold. Where many of a frame's do not
+        agree, they stay: it may be the frame that is off its place.
+        """
+        seen, T_cw = self.observations.columns(), self.T_cw(slam_map)
+        points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
+        agrees = torch.cat(
+            [
+                fits(
+                    Noise(seen["scales"][some], seen["information"][some]).squared_reprojection(
+                        transform(T_cw[seen["row"][some]], points_w[some, None])[:, 0],
+                        seen["pixels"][some],
+                        camera,
+                    ),
+                    _ASTRAY,
+                )
+                for some in torch.arange(len(points_w), device=T_cw.device).split(_AT_ONCE)
+            ]
+        )
+        count = torch.bincount(seen["row"], minlength=len(self))
+        is_right = torch.bincount(seen["row"][agrees], minlength=len(self)) >= _MOST * count
+        kept = agrees | ~is_right[seen["row"]]
+        if not bool(kept.all()):
+            self.observations.keep(torch.nonzero(kept)[:, 0])
 
     def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
