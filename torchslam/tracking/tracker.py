@@ -1,4 +1,4 @@
-"""Where is the camera now? Predict, match the local map, PnP RANSAC, robust refinement."""
+"""Where is the camera now? Predict, match the local map, PnP near the prediction or by RANSAC, robust refinement."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from torchslam.geometry import (
     start_pose,
     transform,
 )
+from torchslam.geometry.motion import reorthonormalized
 from torchslam.geometry.robust import Kernel
 from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.solvers.frame_pose import FramePose, FrameProblem, RobustKernel
+from torchslam.solvers.nearby_pose import nearby_pose
 from torchslam.tracking.correspondences import Projected, match_near, match_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, matcher_of
 from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
@@ -98,23 +100,24 @@ class Tracker:
         """(4, 4) where the next frame should be: constant velocity."""
         if world.track.velocity is None or not self.settings.predict:
             return world.T_cw
-        return world.track.velocity @ world.T_cw
+        return reorthonormalized(world.track.velocity @ world.T_cw)
 
     # --- one frame -------------------------------------------------------------------------------------------
 
     def track(self, world: World, view: View) -> Tracked | None:
         """Locate the frame that comes after the last one; None when it cannot be located."""
-        tracked = self.locate(world.map, view, self._candidates(world, view), world.track.local_points)
+        expected = self.predict(world)
+        candidates = self._candidates(world, view, expected)
+        tracked = self.locate(world.map, view, candidates, world.track.local_points, expected)
         if tracked is None:
             world.track.velocity = None
             return None
         self.accept(world, view, tracked)
         return tracked
 
-    def _candidates(self, world: World, view: View) -> Iterator[Pairs]:
+    def _candidates(self, world: World, view: View, T_cw: Tensor) -> Iterator[Pairs]:
         """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
         slam_map, track, settings = world.map, world.track, self.settings
-        T_cw = self.predict(world)
         if settings.guided:
             alive = track.seen_last[slam_map.points["alive"][track.seen_last]]
             near = self._project(slam_map, alive, T_cw, view)
@@ -128,36 +131,45 @@ class Tracker:
         yield match_points(slam_map, track.local_points, view, self.matching)
 
     def locate(
-        self, slam_map: Map, view: View, candidates: Iterator[Pairs], local_points: Tensor
+        self,
+        slam_map: Map,
+        view: View,
+        candidates: Iterator[Pairs],
+        local_points: Tensor,
+        expected_T_cw: Tensor | None = None,
     ) -> Tracked | None:
         """The pose by the first of several sets of matches that gives one, refined against the local points (n,).
+
+        expected_T_cw: (4, 4) where it is looked for first; None where nobody knows
 
         Where too few of the matches agree with a pose, the next sets are heard too, and most inliers win.
         """
         best: Tracked | None = None
         for pairs in candidates:
-            tracked = self._locate(slam_map, view, pairs, local_points)
+            tracked = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
             if tracked is not None and (best is None or tracked.inliers > best.inliers):
                 best = tracked
             if best is not None and best.inliers >= self.least_share * best.matches:
                 break
         return best
 
-    def _locate(self, slam_map: Map, view: View, pairs: Pairs, local_points: Tensor) -> Tracked | None:
-        """PnP RANSAC over matches, then all local points near their projection, then robust refinement."""
+    def _locate(
+        self,
+        slam_map: Map,
+        view: View,
+        pairs: Pairs,
+        local_points: Tensor,
+        expected_T_cw: Tensor | None,
+    ) -> Tracked | None:
+        """PnP over matches, then all local points near their projection, then robust refinement."""
         settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
         if len(point_ids) < settings.min_matches:
             return None
         chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
         chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
         undistorted = self.undistorted(view.keypoints)
-        T_cw = start_pose(
-            slam_map.positions_w[point_ids[chosen]],
-            undistorted[keypoints[chosen]],
-            self.camera.size,
-            threshold=settings.threshold_px,
-            seed=self.seed,
-        )
+        points_w, heard = slam_map.positions_w[point_ids[chosen]], undistorted[keypoints[chosen]]
+        T_cw = self._start(points_w, heard, expected_T_cw)
         if T_cw is None:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
@@ -187,6 +199,12 @@ class Tracker:
             weights=None if weights is None else weights[inliers],
             expected=near.ids,
         )
+
+    def _start(self, points_w: Tensor, seen: Undistorted, expected_T_cw: Tensor | None) -> Tensor | None:
+        """The pose (4, 4) that most matches agree with: the one next to the expected one, or else by RANSAC."""
+        threshold = self.settings.threshold_px
+        T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
+        return start_pose(points_w, seen, self.camera.size, threshold, self.seed) if T_cw is None else T_cw
 
     def _project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
         max_angle = self.settings.max_view_angle_deg
