@@ -19,6 +19,7 @@ LOGO_CELLS, LOGO_SEED = (12, 20), 5  # rows and columns of the random squares
 LOGO_AT, LOGO_SIZE = 8, (64, 32)  # pixels from the upper left corner; width and height
 BLUR_TURN_DEG = 13  # from frame to frame
 WAVE_FRAMES = 9  # in which the shear of a rolling shutter comes back
+CORNER_LIGHT = 0.1  # share that is left of it in the corners, as with a cheap wide lens
 SPOTS, SPOT_SEED, SPOT_SIGMA, SPOT_GREY = 40, 3, 6, 60
 
 
@@ -142,6 +143,14 @@ def lens_dirt(size: tuple[int, int]) -> Edit:
         cv2.circle(cover, place, int(rng.integers(5, 40)), float(rng.uniform(0.3, 0.9)), cv2.FILLED)
     cover = cv2.GaussianBlur(cover, (0, 0), SPOT_SIGMA)
     return lambda grey, _: (grey * (1 - cover) + SPOT_GREY * cover).astype(np.uint8)
+
+
+def vignette(grey: np.ndarray, _: int) -> np.ndarray:
+    """Light falls off with the square of the distance from the middle, to little in the corners."""
+    height, width = grey.shape
+    x, y = _grid(width, height)
+    from_middle = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
+    return np.rint(grey * (1 - (1 - CORNER_LIGHT) * from_middle**2)).astype(np.uint8)
 
 
 def turned(camera: Camera, angle: float) -> Edit:

@@ -79,6 +79,7 @@ FAULTS: dict[str, Fault] = {
     "occluder50": covered(0.5, 4),
     "rolling6px": everywhere(lambda *_: edits.rolling(6.0)),
     "lensdirt": everywhere(lambda whole, _: edits.lens_dirt(whole.size)),
+    "vignette": everywhere(lambda *_: edits.vignette),
     "blur9": everywhere(lambda *_: edits.motion_blur(9)),
     "noise25": everywhere(lambda *_: edits.noise(25.0)),
     "pale20": everywhere(lambda *_: edits.pale(0.2)),

@@ -33,8 +33,14 @@ STARTS = {
     "fr2_desk_20": (0, 20),
 }
 LOOKALIKE_CAMERA = "460.8,460.8,255.5,191.5"  # a guess: the focal length is 0.9 widths
-CUTS = {"redkitchen": (20, 190), "machine_hall": (0, 130), "shelf_bin": (0, 50)}
-LENDERS = {"redkitchen": "machine_hall", "machine_hall": "redkitchen", "shelf_bin": "machine_hall"}
+CUTS = {"redkitchen": (20, 190), "machine_hall": (0, 130), "shelf_bin": (0, 50), "kitti07": (0, 160)}
+ON_THE_ROAD = ("vignette", "halfres")  # faults that make a start in a turn of the road harder
+LENDERS = {
+    "redkitchen": "machine_hall",
+    "machine_hall": "redkitchen",
+    "shelf_bin": "machine_hall",
+    "kitti07": "machine_hall",
+}
 HARD_LOOP = "synthetic:loop?noise=12&blur=1.5"
 STOREY = "synthetic:storey?noise=6&blur=1"
 SEEDS = (1, 2, 3)  # of textures, furniture and noise of the hard loop, beside 0
@@ -156,7 +162,7 @@ TRIALS: dict[str, Trial] = {
     **{
         f"{fault}/{name}": Trial(partial(faulty, name, FAULTS[fault]))
         for name in CUTS
-        for fault in FAULTS
+        for fault in (ON_THE_ROAD if name == "kitti07" else FAULTS)
         if (name, fault) != ("shelf_bin", "none")  # plain/shelf_bin is the same
     },
     "localise/redkitchen": Trial(

@@ -217,6 +217,10 @@ def test_light_noise_and_blur() -> None:
     flat = np.full((200, 200), 128, np.uint8)
     assert edits.noise(25.0)(flat, 3).std() == pytest.approx(25.0, rel=0.03)
     assert (edits.noise(25.0)(flat, 3) != edits.noise(25.0)(flat, 4)).mean() > 0.9
+    darkened = edits.vignette(np.full((60, 80), 200, np.uint8), 0)
+    assert darkened[30, 40] == 200
+    assert darkened[0, 0] == 20
+    assert darkened[30, 0] == round(200 * (1 - 0.9 * 0.64))  # 40 of 50 pixels from the middle
     dot = np.zeros((21, 21), np.uint8)
     dot[10, 10] = 180
     expected = np.zeros_like(dot)

@@ -201,6 +201,21 @@ def test_a_plane_is_believed_after_a_while() -> None:
             assert "looks planar" in reason
 
 
+def test_planes_seen_with_an_earlier_reference_do_not_count() -> None:
+    """A camera that turns while it moves on looks a while as if before a plane: so do the first frames after a turn."""
+    poses = torch.stack([pose(), *[TURNED] * 3, pose(), TURNED])
+    start, reason = tried(
+        poses,
+        "initialization.planar_patience=4",
+        "initialization.max_reference_age=4",
+        "initialization.min_points=30",
+        scene=WALL,
+        noise=0.2,
+    )
+    assert start is None
+    assert "looks planar" in reason
+
+
 def test_a_step_too_small_leaves_depths_uncertain() -> None:
     # sigma / (f a): one to three pixels of scale; at 200 px and a tenth a parallax of 0.05 to 0.15 is needed
     start, reason = tried(pair(pose(-0.1)), noise=0.1)

@@ -39,7 +39,7 @@ class Initializer:
         self.views: list[View] = []  # the reference and what came after it
         # pixels (n, 2) that the last view showed not to move with the scene
         self.still = camera.params.new_zeros(0, 2)
-        self.planar_views = 0  # in which a plane explained the matches
+        self.planar_views = 0  # in which a plane explained the matches with the reference
 
     @property
     def reference(self) -> View:
@@ -49,7 +49,7 @@ class Initializer:
         """A start, or None and the reason in words."""
         self.still = self.still[:0]
         if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
-            self.views = [view]
+            self._refer_to(view)
             return None, "took a reference frame"
         self.views.append(view)
         pairs = matched(self.matcher, self.reference, view)
@@ -57,9 +57,14 @@ class Initializer:
         view = view.weighed(second, pairs.weights)
         least = self.config.initialization.min_matches
         if len(first) < least:
-            self.views = [view]
+            self._refer_to(view)
             return None, f"too few matches with the reference frame: {len(first)}, {least} are needed"
         return self._relate(view, first, second)
+
+    def _refer_to(self, view: View) -> None:
+        """Begin anew with another reference frame: what an earlier one said of planes is no reason to believe one."""
+        self.views = [view]
+        self.planar_views = 0
 
     def _relate(self, view: View, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
         """The relative pose of the two views, unless the image stands still."""
@@ -73,7 +78,7 @@ class Initializer:
             return self._relate_moving(view, first[scene], second[scene], scene_only=False)
         if len(first) < GONE_SHARE * int(self.reference.mask.sum()):
             self.still = view.keypoints[second[motion < settings.still_px]]
-            self.views = [view]
+            self._refer_to(view)
             return None, "what still matches stays in place, the rest has gone: took a new reference frame"
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
         moving = motion >= settings.min_motion_px
