@@ -48,9 +48,7 @@ _CERTAIN, _NOTABLE = 4.0, 1 / 3
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
-_TELLS_MOTIONS = (
-    3.0  # deviations by which one of two motions before a plane has to explain the matches better
-)
+_TELLS_MOTIONS = 3.0  # deviations by which one of two motions before a plane has to explain more
 _IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
 _EXACT = (
     1 / 16
