@@ -8,6 +8,7 @@ from torchslam.geometry.lie import so3_exp
 from torchslam.geometry.local_optimization import minimize, small_rotation
 from torchslam.geometry.ransac import (
     is_significant,
+    is_unlikely,
     pad_groups,
     sample_minimal,
     sample_minimal_of_all,
@@ -147,3 +148,20 @@ def test_implicit_step_without_a_minimum_has_zero_gradient() -> None:
     )
     step.sum().backward()
     assert torch.isfinite(data.grad).all()
+
+
+@pytest.mark.parametrize(("count", "expected"), [(4, False), (8, False), (12, True), (30, True)])
+def test_what_is_unlikely(count: int, expected: bool) -> None:
+    """Of 30 rows of a chance of 0.05 each, two of which make the sample."""
+    found = is_unlikely(torch.tensor([count]), torch.tensor([30]), 2, torch.tensor([0.05]))
+    assert found.tolist() == [expected]
+
+
+def test_alarms_are_more_than_the_binomial_tail() -> None:
+    for count in range(5, 30):
+        tail = sum(math.comb(28, k) * 0.2**k * 0.8 ** (28 - k) for k in range(count - 2, 29))
+        alarms = 435 * tail
+        if is_unlikely(torch.tensor([count]), torch.tensor([30]), 2, torch.tensor([0.2])).item():
+            assert alarms < 0.1
+        elif alarms < 0.01:
+            pytest.fail(f"{count} of 30 are expected {alarms:.4f} times")

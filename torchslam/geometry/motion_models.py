@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.homography import decompose_homography
-from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant
+from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, is_unlikely
 from torchslam.geometry.two_view import (
     TRANSFER_WIDTH,
     TwoViews,
@@ -17,6 +18,7 @@ from torchslam.geometry.two_view import (
     best_of,
     fit_homography,
     fit_rotation,
+    noise_variance,
     propose_homography,
     propose_rotation,
     sampson_squared,
@@ -29,7 +31,6 @@ ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
 
 FINAL_ITERATIONS = 12
 FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
-NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
 _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
@@ -39,14 +40,15 @@ _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for
 # an essential matrix finds many by accident.
 _HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
-# How much larger the variance of the noise has to be under the simpler model: by so many deviations of Fisher's z
-# (1 %), and by a half, since the noise of keypoints has a long tail, and wrong matches lie near epipolar lines, too.
-_CERTAIN, _NOTABLE = 2.33, 1.5
-_PARAMETERS = (5, 8, 3)  # of the three models
+# How far the matches have to lean towards their epipolar lines: by so many deviations, two more than a direction needs
+# that was not chosen to fit; and on average as where the variance along the lines is twice that across, since the noise
+# of keypoints on edges has a direction of its own.
+_CERTAIN, _NOTABLE = 4.0, 1 / 3
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
+_TELLS_MOTIONS = 3.0  # deviations by which one of two motions before a plane has to explain more
 _IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
 _EXACT = 1 / 16  # units of the noise; only exact matches are far below, and what is left of them is rounding
 
@@ -107,16 +109,11 @@ def fit_models(
     return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
 
 
-def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
-    """(B,) variance of the noise, in squared thresholds, by the squared Sampson errors (B, N) of a pose."""
-    near = (squared < NOISE_WIDTH**2) & mask
-    return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
+def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> tuple[Tensor, Tensor]:
+    """The index of the simplest model that no significant number of matches contradicts, and if a plane is one. (B,)
 
-
-def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> Tensor:
-    """The index of the simplest model that no significant number of matches contradicts. (B,)
-
-    by_noise: nor the noise that it leaves of all matches together
+    by_noise: nor all matches together, by where beside it they lie. The noise of keypoints has a long tail, and most of
+    those off a pure rotation are so by a few pixels: had it moved them in any direction, some would be on their lines
     """
     essential, homography, rotation = fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
@@ -124,44 +121,48 @@ def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> 
     variance = noise_variance(essential, mask)
     noise = variance.clamp_min(1.0)[:, None]
     explained = (torch.minimum(essential, homography) < noise) & mask
+    chance = chance * noise[:, 0].sqrt()
 
     def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
         off = (simple > _CLEARLY_OFF**2 * noise) & mask
-        against = (off & (rich < noise)).sum(-1)
-        accident = ~is_significant(against, off.sum(-1), 2, chance * noise[:, 0].sqrt(), 1)
-        return ~accident & (against > _LEAST_SHARE * explained.sum(-1))
+        against, count = (off & (rich < noise)).sum(-1), off.sum(-1)
+        if by_noise:
+            size = 2 if rich is essential else 3  # matches that fix what the richer model has more
+            nearby = (noise / simple).nan_to_num().clamp_max(1.0)  # the share of a disc as wide as the error
+            if rich is essential:
+                nearby = 2 / math.pi * (nearby.sqrt() / TRANSFER_WIDTH).asin()  # of its directions
+            nearby = torch.where(off, nearby, 0.0).sum(-1) / count.clamp_min(1)
+            certain = is_unlikely(against, count, size, nearby.maximum(chance ** (size - 1)))
+        else:
+            certain = is_significant(against, count, 2, chance, 1)
+        return certain & (against > _LEAST_SHARE * explained.sum(-1))
 
     off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
     if by_noise:
-        off = off | _noisier(fits.squared, mask, variance)
+        off = off | _leans(fits.squared, mask, variance)
+        off[1] |= off[0] | contradicted(rotation, homography)  # it is the homography of a plane at infinity
     plane, still = ~off
-    return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL))
+    return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL)), plane
 
 
-def _noisier(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
-    """(2, B) whether homography and rotation need significantly more noise than the essential matrix does.
+def _leans(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
+    """(2, B) whether the matches lie beside homography and rotation along their epipolar lines, rather than anywhere.
 
-    Little parallax is spread over all matches, none of which is clearly off: what counts is the ratio of the variances
-    per degree of freedom, over the matches on their epipolar lines. Its logarithm is close to a Gaussian (Fisher, "On a
-    distribution yielding the error functions of several well known statistics", 1924).
+    Little parallax is spread over all matches, none of which is clearly off. Noise, of whatever size and tail, has no
+    direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
+    their squared distance, which tells most where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
 
     squared: (3, B, N) as of `Fits`; variance: (B,) of the noise by the essential matrix
     """
-    variance = variance.clamp_min(_EXACT**2)
-    near = mask & (squared[ESSENTIAL] < (FINAL_WIDTH**2 * variance)[:, None])
-    count = near.sum(-1).to(variance.dtype)
-    k_E, k_H, k_R = _PARAMETERS
-    freedom = count - k_E
-    freedoms = 2 * count - variance.new_tensor((k_H, k_R))[:, None]
-    enough = freedom > 0
-    unit = variance * count.clamp_min(1.0) / freedom.where(enough, 1.0)
-    # Transfer errors have two dimensions, and thresholds of their own.
-    far = (squared[1:] * (TRANSFER_WIDTH**2 / unit)[:, None]).clamp_max(_FARTHEST**2)
-    freedom, freedoms = freedom.clamp_min(1.0), freedoms.clamp_min(1.0)
-    ratio = torch.where(near, far, 0.0).sum(-1) / freedoms
-    z = 0.5 * ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
-    mean, deviation = 0.5 * (1 / freedom - 1 / freedoms), (0.5 * (1 / freedom + 1 / freedoms)).sqrt()
-    return enough & (ratio > _NOTABLE) & (z > mean + _CERTAIN * deviation)
+    variance = variance.clamp_min(_EXACT**2)[:, None]
+    across, both = squared[ESSENTIAL], squared[1:] * TRANSFER_WIDTH**2
+    near = mask & (both < (2 * _FARTHEST) ** 2 * variance)
+    weight = torch.where(near, (both / variance).clamp_max(_FARTHEST**2), 0.0)
+    cosine = 1 - 2 * (across / both.clamp_min(torch.finfo(both.dtype).tiny)).clamp_max(1.0)
+    lean = torch.where(near, weight * cosine, 0.0).sum(-1)
+    # One more, that matches far below the noise, whose errors are rounding, are not enough.
+    deviation = (0.5 * weight.square().sum(-1) + 1).sqrt()
+    return (lean > _NOTABLE * weight.sum(-1)) & (lean > _CERTAIN * deviation)
 
 
 class PlaneMotions(NamedTuple):
@@ -215,16 +216,22 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
 
 
 def pose_of(
-    views: TwoViews, fits: Fits, model: Tensor, plane: PlaneMotions
+    views: TwoViews, fits: Fits, model: Tensor, plane: PlaneMotions, by_noise: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """R (B, 3, 3), t (B, 3), plane normal (B, 3), and whether a plane leaves two motions (B,)."""
+    """R (B, 3, 3), t (B, 3), plane normal (B, 3), and whether a plane leaves two motions (B,).
+
+    by_noise: also where noise may be why one of them explains the matches better
+    """
     R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
     R_H, direction, normal, squared, possible = plane
-    support = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-    support = torch.where(possible, support, -1.0)
+    of_match = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0)
+    support = torch.where(possible, of_match.sum(-1), -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
     ambiguous = second > 0.8 * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
+    if by_noise:
+        deviation = (of_match[index, order[0]] - of_match[index, order[1]]).norm(dim=-1)
+        ambiguous |= (second >= 0) & (first - second < _TELLS_MOTIONS * deviation)
     best = order[0]
     flat = model == HOMOGRAPHY
     apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > 1e-3
@@ -249,19 +256,25 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
     return spread
 
 
-def is_no_accident(views: TwoViews, squared: Tensor, noise: Tensor, chance: Tensor, by_noise: bool) -> Tensor:
+def is_no_accident(
+    views: TwoViews, squared: Tensor, model: Tensor, noise: Tensor, chance: Tensor, by_noise: bool
+) -> Tensor:
     """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
     what the noise explains, which often is much less. That both are tried, the test allows for.
 
-    views, squared: in units of the noise (B,), thresholds; squared (B, N) of one model; chance: (B,) that a wrong match
-    is within the threshold
+    views, squared: in units of the noise (B,), thresholds; squared (B, N) of the model (B,); chance: (B,) that a wrong
+    match is within the threshold of an epipolar line. `by_noise`, a rotation is known by two matches, not five, and a
+    wrong one is as near by less than the square of that chance
     """
+    still = (model == ROTATION) & by_noise
     in_thresholds = views.in_units(1 / noise[:, None])
-    found = torch.zeros_like(noise, dtype=torch.bool)
+    found = torch.zeros_like(still)
     for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
         inliers = (squared < width.square()[:, None]) & views.mask
-        count, chances = inliers.sum(-1), chance * width * noise
-        counted = is_significant(count, views.mask.sum(-1), 5, chances, 10)
+        count, available, chances = inliers.sum(-1), views.mask.sum(-1), chance * width * noise
+        counted = is_significant(count, available, 5, chances, 10)
+        if bool(still.any()):
+            counted |= still & is_significant(count, available, 2, chances.square(), 1)
         found = found | (counted & is_spread(in_thresholds, inliers))
         if bool(found.all()):
             break

@@ -113,7 +113,7 @@ def search(
     """The best model of each problem over rounds of samples, until its support calls for no more of them.
 
     propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores (R,)
-    as from `truncated_score`, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
+    the higher the better, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
     rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before, or,
     `as_needed`, no more than the support calls for, but as many as the first one.
     """
@@ -168,6 +168,30 @@ def _log_false_alarms(inliers: int, available: int, size: int, chance: float, so
     choices = math.lgamma(available + 1) - math.lgamma(rest + 1) - math.lgamma(others + 1)
     alarms = choices - math.lgamma(size + 1) + others * math.log(min(max(chance, 1e-12), 1.0))
     return alarms + math.log(solutions * max(available - size, 1))
+
+
+def is_unlikely(count: Tensor, available: Tensor, size: int, chance: Tensor) -> Tensor:
+    """Whether so many rows tell for a richer model, and against a simpler one: fewer than 0.1 false alarms expected.
+
+    As `is_significant`, but for chances that need not be small: the tail of the binomial distribution over the rows
+    beyond a sample is bounded by Chernoff's inequality.
+    """
+    problems = zip(count.tolist(), available.tolist(), chance.tolist(), strict=True)
+    logs = [_log_tail_alarms(k, n, size, p) for k, n, p in problems]
+    return torch.tensor([log < math.log(0.1) for log in logs], dtype=torch.bool, device=count.device)
+
+
+def _log_tail_alarms(count: int, available: int, size: int, chance: float) -> float:
+    """For one problem: the samples there are, times the chance of so many among the other rows."""
+    rest = available - size
+    share = (count - size) / rest if rest > 0 else 0.0
+    chance = max(chance, 1e-12)
+    if share <= chance:
+        return math.inf
+    divergence = share * math.log(share / chance)
+    if share < 1:
+        divergence += (1 - share) * math.log((1 - share) / (1 - chance))
+    return math.log(math.comb(available, size)) - rest * divergence
 
 
 def valid_first(valid: Tensor) -> Tensor:

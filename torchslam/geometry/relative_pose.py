@@ -86,13 +86,15 @@ def estimate_relative_pose(
     mask:      (B, N), rows outside it, or with NaN, are ignored
     model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
                that it explains contradict the simpler one, more of them than accident would bring; or, but with the
-               kernel "truncated", all together by the noise that it leaves, or because what it explains is an accident,
-               or because no motion before the plane explains the matches as the essential matrix does.
+               kernel "truncated", all together, by lying beside it along their epipolar lines, or because what it
+               explains is an accident, or because no motion before the plane explains the matches as the essential
+               matrix does. Noise of any size has no direction: where the matches do not tell, the simpler one stays.
                A pure rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
-               what contradicts a model, then go by the noise that the matches show, so that the threshold only has to
-               tell wrong ones from right ones; in the search, matches behind a camera count as wrong. "truncated":
-               both go by the threshold, and the search does not ask where matches lie
+               what contradicts a model, then go by the noise that the matches show, and so does the search from its
+               best samples on: the threshold only has to tell wrong ones from right ones. In the search, matches
+               behind a camera count as wrong. "truncated": all of that goes by the threshold, and the search does not
+               ask where matches lie
     weights:   (B, N) information of the matches, in which squared errors count; the threshold of a match is
                `threshold / sqrt(weight)`. Zero, infinity or NaN is no match
     min_samples, max_samples: of five matches, that are tried at least and at most

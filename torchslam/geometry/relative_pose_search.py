@@ -18,20 +18,26 @@ from torchslam.geometry.motion_models import (
     FINAL_WIDTH,
     HOMOGRAPHY,
     MODELS,
-    NOISE_WIDTH,
+    ROTATION,
     Fits,
     PlaneMotions,
     choose,
     fit_models,
     in_front,
     is_no_accident,
-    noise_variance,
     plane_holds,
     pose_of,
 )
 from torchslam.geometry.ransac import search
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import TwoViews, fit_essential, propose_essential, sampson_squared
+from torchslam.geometry.two_view import (
+    NOISE_WIDTH,
+    TwoViews,
+    fit_essential,
+    noise_variance,
+    propose_essential,
+    sampson_squared,
+)
 
 Model = Literal["auto", "essential"]
 
@@ -134,7 +140,7 @@ def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effo
     squared = chosen.squared[model, torch.arange(len(mask), device=mask.device)]
     in_thresholds = chosen.squared * noise[:, None].square()
     inliers = (squared * noise[:, None].square() < 1) & mask
-    significant = is_no_accident(views, squared, noise, chance, by_noise)
+    significant = is_no_accident(views, squared, model, noise, chance, by_noise)
     used = torch.where((model == ESSENTIAL)[:, None], near, (squared < _width(by_noise) ** 2) & mask)
     scores = torch.where(mask, (1 - in_thresholds).clamp_min(0.0), 0.0).sum(-1)
     found, eye = (mask.sum(-1) > 5)[:, None, None], torch.eye(4, dtype=R.dtype, device=R.device)
@@ -168,7 +174,7 @@ def _essential(views: TwoViews, R: Tensor, t: Tensor) -> _Chosen:
 def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise: bool) -> _Chosen:
     """The model that the matches call for, and its pose. views: in units of the noise (B,), thresholds"""
     mask = views.mask
-    model = choose(fits, mask, chance * noise, by_noise)
+    model, flat = choose(fits, mask, chance * noise, by_noise)
     simple, plane = model != ESSENTIAL, None
     if bool(simple.any()):
         rough, fits = fits.squared, fits.finished(views, _width(by_noise))
@@ -176,9 +182,17 @@ def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise
         if by_noise:
             # As alone, whoever else is in the batch.
             fits = replace(fits, squared=torch.where(simple[:, None], fits.squared, rough))
+
+            def is_certain(model: Tensor) -> Tensor:
+                of_model = fits.squared[model, torch.arange(len(mask), device=mask.device)]
+                return is_no_accident(views, of_model, model, noise, chance, by_noise)
+
             # One that explains no more than accident does is the simplest of all, and hides what can be used.
-            of_model = fits.squared[model, torch.arange(len(mask), device=mask.device)]
-            certain = is_no_accident(views, of_model, noise, chance, by_noise)
+            certain = is_certain(model)
+            richer = ~certain & (model == ROTATION) & flat
+            if bool(richer.any()):
+                model = torch.where(richer, HOMOGRAPHY, model)
+                certain = is_certain(model)
             certain &= (model != HOMOGRAPHY) | plane_holds(views, fits, plane)
             model = torch.where(certain, model, ESSENTIAL)
     R_E, t_E = in_front(views, fits.R, fits.t, mask & (fits.squared[ESSENTIAL] < FINAL_WIDTH**2))
@@ -186,7 +200,7 @@ def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise
         zero = torch.zeros_like(t_E)
         return _Chosen(R_E, t_E, zero, model, torch.zeros_like(mask[:, 0]), R_E, t_E, fits.squared)
     plane = PlaneMotions.of(views, fits) if plane is None else plane
-    R, t, normal, ambiguous = pose_of(views, fits, model, plane)
+    R, t, normal, ambiguous = pose_of(views, fits, model, plane, by_noise)
     if by_noise:  # as alone, whoever else is in the batch
         is_essential = (model == ESSENTIAL)[:, None]
         R, t = torch.where(is_essential[..., None], R_E, R), torch.where(is_essential, t_E, t)

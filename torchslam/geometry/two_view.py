@@ -34,9 +34,14 @@ from torchslam.geometry.ransac import (
 from torchslam.geometry.robust import Kernel, robustify
 
 _CANDIDATES = 4  # essential matrices of each round that are optimised
-_MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras
+_MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras,
+_CHECKED_CANDIDATES = 24  # of so many
 _FEW_CANDIDATES = 2  # homographies and rotations
 _ITERATIONS = 4  # of their local optimisation
+# Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
+# far from the noise ranks the samples all the same, but tells less between those that come close.
+_SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
+NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 TRANSFER_WIDTH = (
     1.5  # thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one
 )
@@ -243,30 +248,44 @@ def _fit_essential_part(
     return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
 
 
-def score_essential(views: TwoViews, E: Tensor) -> Tensor:
-    """Truncated scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M)."""
+def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
+    """(B,) variance of the noise, in squared thresholds, by the squared Sampson errors (B, N) of a pose."""
+    near = (squared < NOISE_WIDTH**2) & mask
+    return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
+
+
+def score_essential(views: TwoViews, E: Tensor, soft: bool = False) -> Tensor:
+    """Scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M).
+
+    soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of `truncated_score`
+    """
     constraint, variance = views.epipolar_float
     squared = (E.flatten(-2).float() @ constraint).square_()
     spread = (_variance_form(E).float() @ variance).clamp_min_(1e-20)
-    return truncated_score(squared.div_(spread), views.mask)
+    if not soft:
+        return truncated_score(squared.div_(spread), views.mask)
+    support = spread.div_(squared.add_(spread)).nan_to_num_(0.0)
+    return (support @ views.mask.to(support.dtype)[..., None]).squeeze(-1)
 
 
 def propose_essential(
-    views: TwoViews, count: int, generator: torch.Generator, in_front: bool
+    views: TwoViews, count: int, generator: torch.Generator, by_noise: bool
 ) -> tuple[State, Tensor, Tensor]:
     """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support.
 
-    in_front: matches that lie behind a camera count as wrong
+    by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
+    lie behind a camera count as wrong
     """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)
     x_1, x_2 = gather_rows(views.x_1, sample), gather_rows(views.x_2, sample)
     E, row = five_point(x_1.flatten(0, 1), x_2.flatten(0, 1))
-    candidates = _MORE_CANDIDATES if in_front else _CANDIDATES
+    candidates = _CHECKED_CANDIDATES if by_noise else _CANDIDATES
     E, valid = pad_groups(E.flatten(1), row // count, B, candidates)
 
     def score(E: Tensor, rows: Tensor | None) -> Tensor:
-        return score_essential(views if rows is None else views.rows(rows), E.unflatten(-1, (3, 3)))
+        some = views if rows is None else views.rows(rows)
+        return score_essential(some, E.unflatten(-1, (3, 3)), by_noise)
 
     best = best_models(score, E, valid, views.mask, candidates, generator)
     R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
@@ -275,12 +294,29 @@ def propose_essential(
         valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
     )
     t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
-    R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(B))
-    if in_front:
-        R, t, cost = best_in_front(views, R, t)
-    (R, t), cost = best_of((R, t), cost)
+    R, t, cost = _optimized(views, R, t, by_noise)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
+
+
+def _optimized(views: TwoViews, R: Tensor, t: Tensor, by_noise: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The best of candidates (B, K), the first of which scored best, locally optimised: R, t, cost (B,)."""
+    if not by_noise:
+        R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(len(t)))
+        (R, t), cost = best_of((R, t), cost)
+        return R, t, cost
+    R, t, cost = best_in_front(views, R, t)
+    best = cost.topk(_MORE_CANDIDATES, dim=1, largest=False).indices
+    R, t = gather_rows(R.flatten(2), best).unflatten(-1, (3, 3)), gather_rows(t, best)
+    noise = noise_variance(sampson_squared(views, R[:, :1], t[:, :1])[:, 0], views.mask).sqrt()
+    unit = (_SUPPORT_DEVIATIONS * noise).clamp(_LEAST_UNIT, _LARGEST_UNIT)
+    in_units = views.in_units(unit[:, None])
+    R, t, _ = fit_essential(in_units, R, t, _ITERATIONS, t.new_ones(len(t)))
+    R, t, cost = best_in_front(in_units, R, t)
+    (R, t), _ = best_of((R, t), cost)
+    # Rounds are compared in thresholds, which are the same for all of them.
+    _, _, cost = best_in_front(views, R[:, None], t[:, None])
+    return R, t, cost[:, 0]
 
 
 def twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -302,20 +338,34 @@ def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, T
 
 
 def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the four poses of each essential matrix (B, K) the one of least truncated cost, and that cost (B, K).
+    """Of the four poses of each essential matrix (B, K) the one of least cost, and that cost (B, K).
 
-    Matches behind a camera count as wrong, but where their parallax is within the threshold.
+    The cost of a match is r^2 / (1 + r^2), by Geman and McClure. Matches behind a camera count as wrong, but where
+    their parallax is within the threshold.
     """
-    B, K = t.shape[:2]
-    squared = sampson_squared(views, R, t)
-    R, t = (x.unflatten(0, (B, K)).flatten(1, 2) for x in twisted(R.flatten(0, 1), t.flatten(0, 1)))
-    ahead, parallax = ahead_and_parallax(views, R, t)
-    possible = (ahead | (parallax < 1)).unflatten(1, (K, 4)) & views.mask[:, None, None]
-    score = torch.where(possible, (1 - squared[:, :, None]).clamp_min(0.0), 0.0).sum(-1)
+    support = torch.where(views.mask[:, None], 1 / (1 + sampson_squared(views, R, t)), 0.0)
+    score = torch.where(possible_matches(views, R, t), support[:, :, None], 0.0).sum(-1)
     score, best = score.max(dim=-1)
-    rows = 4 * torch.arange(K, device=best.device) + best
-    R, t = gather_rows(R.flatten(2), rows).unflatten(-1, (3, 3)), gather_rows(t, rows)
-    return R, t, views.mask.sum(-1, keepdim=True) - score
+    four = (x.unflatten(0, best.shape) for x in twisted(R.flatten(0, 1), t.flatten(0, 1)))
+    R, t = (x.flatten(3).take_along_dim(best[..., None, None], 2)[:, :, 0] for x in four)
+    return R.unflatten(-1, (3, 3)), t, views.mask.sum(-1, keepdim=True) - score
+
+
+def possible_matches(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
+    """(B, K, 4, N): by which of the `twisted` poses of (B, K) matches lie before both cameras, or too far to tell.
+
+    As `ahead_and_parallax`, but from the products of the rays r_1, r_2 and t alone, which the four poses share.
+    """
+    t_1, t_2 = (t[:, :, None] @ R).squeeze(2) @ views.h_1.mT, t @ views.h_2.mT
+    r_12 = R.flatten(2) @ views.epipolar[0]
+    r_12 = torch.stack((r_12, 2 * t_1 * t_2 - r_12), dim=2)
+    t_1, t_2 = t_1[:, :, None], t_2[:, :, None]
+    r_11, r_22 = (h.square().sum(-1)[:, None, None] for h in (views.h_1, views.h_2))
+    depth_1, depth_2 = t_2 * r_12 - t_1 * r_22, t_2 * r_11 - t_1 * r_12
+    scale = torch.minimum(views.scale_1, views.scale_2)[:, None, None]
+    far = (r_11 * r_22 - r_12.square()) * scale.square() < 1
+    ahead = torch.stack(((depth_1 > 0) & (depth_2 > 0), (depth_1 < 0) & (depth_2 < 0)), dim=3)
+    return (ahead | far[:, :, :, None]).flatten(2, 3)
 
 
 # --- homography and pure rotation ---
