@@ -128,16 +128,26 @@ def test_few_that_stay_are_chance() -> None:
 
 
 def test_chance_takes_back_what_is_not_known_yet() -> None:
+    """It stays once and is gone. Five frames later it is back, five later it stayed once more, then twice."""
     by = stillness()
-    T_cw = turning(6)
-    shown = [True, True, False, True, True]  # stays once, is gone, stays once more
+    T_cw = turning(14, step=0.04)
     results = []
-    for index, logo in enumerate(shown):
+    for index in range(14):
         view = SCENE.view(index, T_cw[index])
-        results.append(by.observe(with_logo(view) if logo else view, T_cw[index], 4.0))
-    assert results == [0] * 5
-    last = by.observe(with_logo(SCENE.view(5, T_cw[5])), T_cw[5], 4.0)
-    assert last > LOGO
+        results.append(by.observe(view if index == 2 else with_logo(view), T_cw[index], 4.0))
+    assert results[:13] == [0] * 13
+    assert results[13] > LOGO
+
+
+def test_where_nothing_stayed_it_pauses() -> None:
+    by = stillness()
+    T_cw = turning(8, step=0.04)
+    looked = []
+    for index in range(8):
+        before = by._last
+        by.observe(SCENE.view(index, T_cw[index]), T_cw[index], 4.0)
+        looked.append(by._last is not before)
+    assert looked == [True, True, False, False, False, False, True, False]
 
 
 def test_a_logo_may_wander_a_little() -> None:

@@ -17,6 +17,8 @@ def nearby_pose(
 ) -> Tensor | None:
     """The pose (4, 4) that matches lead to from an expected one; None where too few of them agree with it.
 
+    By all of them, of which those that are far off count little, then by those that agree.
+
     points_w: (N, 3), and where they are seen; threshold: of a match that agrees, pixels
     """
     problem = FrameProblem(points_w, undistorted.xy, undistorted.slope / threshold)

@@ -19,6 +19,7 @@ from torchslam.values import View
 
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
 _SAMPLE = 8  # every so many-th keypoint is asked first whether the camera moved far enough to tell
+_PAUSE = 4  # frames that are not compared after one in which nothing stayed
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class Stillness:
         shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
         self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
         self._last: _Look | None = None
+        self._pause = 0
 
     def clear_of(self, view: View) -> View:
         """The view without the keypoints that are known to stay."""
@@ -75,7 +77,8 @@ class Stillness:
         if last is None or view.session != last.view.session:
             self._last = _Look.of(view, T_cw, depth, self.camera)
             return 0
-        if not self._is_far(self._must_move(last, T_cw, _SAMPLE)):
+        self._pause -= 1
+        if self._pause >= 0 or not self._is_far(self._must_move(last, T_cw, _SAMPLE)):
             return 0
         moving = self._must_move(last, T_cw)
         if not self._is_far(moving):
@@ -87,6 +90,7 @@ class Stillness:
         before = int((self.evidence >= self.settings.min_evidence).sum())
         if len(stayed) < self.settings.min_keypoints:
             self.evidence[self.evidence < self.settings.min_evidence] = 0
+            self._pause = _PAUSE
             return 0
         self._add(stayed)
         return int((self.evidence >= self.settings.min_evidence).sum()) - before
