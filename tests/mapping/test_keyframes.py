@@ -24,7 +24,7 @@ def why(world: World, T_cw: Tensor, *, index: int = 50, share: float = 1.0, **ch
     settings = load_config(None, [f"keyframes.{name}={value}" for name, value in changes.items()]).keyframes
     seen = world.map.points_seen_by(torch.tensor([0]))
     world.track.reference_size = round(len(seen) / share)
-    tracked = tracked_at(T_cw, seen, torch.arange(len(seen)))
+    tracked = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(world, T_cw))
     return why_keyframe(SCENE.view(index, T_cw), tracked, world, settings)
 
 
