@@ -565,3 +565,17 @@ def test_a_track_of_a_moved_world_is_the_same_track() -> None:
     assert two.error == pytest.approx(one.error, rel=1e-4)
     units = torch.tensor([2.5] * 3 + [1.0] * 3, dtype=torch.float64)
     torch.testing.assert_close(two.covariance, units[:, None] * one.covariance * units, rtol=1e-3, atol=1e-12)
+
+
+def test_where_the_last_frames_are_in_doubt_the_pose_is_not_looked_for_next_to_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[bool] = []
+    follower, here, view = tracker(), world(), SCENE.view(50, sideways(1, start=0.7)[0])
+    monkeypatch.setattr(
+        "torchslam.tracking.tracker.nearby_pose", lambda *_: asked.append(True)
+    )  # and RANSAC finds it
+    for is_sure, wanted in ((False, []), (True, [True])):
+        aside = here.aside()
+        assert follower.track(aside, view, is_sure) is not None
+        assert asked == wanted

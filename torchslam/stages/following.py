@@ -55,7 +55,7 @@ class Following:
             if T_cw is not None:
                 world.track.velocity = T_cw @ se3_inverse(world.T_cw)
             expected = None if world.track.velocity is None else parts.tracker.predict(world)
-            tracked = parts.tracker.track(world, view)
+            tracked = parts.tracker.track(world, view, is_sure=not parts.probation)
         if tracked is None:
             return self._lose(world, view)
         unsound = why_unsound(tracked, expected, parts.config.judge)

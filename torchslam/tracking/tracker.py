@@ -104,11 +104,16 @@ class Tracker:
 
     # --- one frame -------------------------------------------------------------------------------------------
 
-    def track(self, world: World, view: View) -> Tracked | None:
-        """Locate the frame that comes after the last one; None when it cannot be located."""
+    def track(self, world: World, view: View, is_sure: bool = True) -> Tracked | None:
+        """Locate the frame that comes after the last one; None when it cannot be located.
+
+        is_sure: the last frames are believed, so that the pose is looked for next to where they lead
+        """
         expected = self.predict(world)
         candidates = self._candidates(world, view, expected)
-        tracked = self.locate(world.map, view, candidates, world.track.local_points, expected)
+        tracked = self.locate(
+            world.map, view, candidates, world.track.local_points, expected if is_sure else None
+        )
         if tracked is None:
             world.track.velocity = None
             return None
