@@ -6,6 +6,7 @@ while this one tracks and maps.
 
 from __future__ import annotations
 
+import os
 import pickle
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -19,8 +20,10 @@ from torchslam.stopwatch import Stopwatch
 from torchslam.values import Frame
 from torchslam.worker import Worker, attempt, outcome, questions, reply, task
 
-AHEAD = 4
-"""Frames that a process is asked for before their turn: about as many as it reads while a keyframe is mapped."""
+AHEAD = 8
+"""Frames that a process is asked for before their turn: while a keyframe is mapped and adjusted it may be held up."""
+GIVES_WAY = 5
+"""By how much nicer a process that reads ahead is than this one, and than the one whose adjustment is waited for."""
 
 
 class Ahead:
@@ -79,6 +82,8 @@ class Ahead:
 
 def _work(connection: Connection, sequence: Sequence, camera: Camera, config: Config) -> None:
     """Read the frames that are asked for, by their index, and find their features."""
+    if hasattr(os, "nice"):  # not on every system
+        os.nice(GIVES_WAY)
     extract = image_extractor(config)
 
     def read(index: int) -> Arrays:
