@@ -154,15 +154,6 @@ class SLAM:
         return self._following.beginning.youth
 
     @property
-    def looks_known(self) -> tuple[int, bool] | None:
-        """A keyframe and whether its place does, see `LoopClosing.look_ahead`: part of what a checkpoint keeps."""
-        return self._following.loop_closing.looks_known
-
-    @looks_known.setter
-    def looks_known(self, looks_known: tuple[int, bool] | None) -> None:
-        self._following.loop_closing.looks_known = looks_known
-
-    @property
     def is_settled(self) -> bool:
         """Whether a world is followed that has proved itself, and no frame is held back."""
         return self.world is not None and self.youth is None and not self._probation
