@@ -21,7 +21,7 @@ from torchslam.geometry import Noise, se3_inverse, se3_log, transform
 from torchslam.mapping.founding import Founder
 from torchslam.stages.finding import FOUND_AGAIN
 from torchslam.stages.following import STARTED_ANEW
-from torchslam.tracking.tracker import Tracker
+from torchslam.tracking.localizer import Localizer
 from torchslam.values import Start, View
 from torchslam.world.map import Map
 from torchslam.world.world import World
@@ -416,17 +416,17 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "measurement.gate=mahalanobis")
     assert len(run.trajectory) == 16
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
-    tracker = Tracker(run.camera, run.config)
+    localizer = Localizer(run.camera, run.config)
     ids = run.map.points_seen_by(torch.tensor([1]))
     T_cw, noise = run.map.T_cw[1], Noise.of(torch.ones(len(ids), dtype=torch.float64), None)
     pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
-    assert tracker.agrees(run.map, T_cw, ids, pixels, noise).all()
+    assert localizer.agrees(run.map, T_cw, ids, pixels, noise).all()
     run.map.points["covariances_w"][ids] = 0
-    assert not tracker.agrees(run.map, T_cw, ids, pixels + 4.0, noise).any()
+    assert not localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).any()
     depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
     spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
     run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
-    assert tracker.agrees(run.map, T_cw, ids, pixels + 4.0, noise).all()
+    assert localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).all()
 
 
 # --- adjustments that wait -----------------------------------------------------------------------------------

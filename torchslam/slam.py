@@ -72,7 +72,8 @@ class SLAM:
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
         self.matcher = matcher_of(scaled.matching, matcher)
         self.tracker = Tracker(self.camera, scaled, self.matcher)
-        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, self.tracker.undistorted)
+        undistorted = self.tracker.localizer.undistorted
+        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, undistorted)
         self.reset()
 
     def reset(self) -> None:
