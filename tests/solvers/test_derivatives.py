@@ -17,7 +17,7 @@ from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
 from torchslam.solvers import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
 from torchslam.solvers.graph import solve
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 EXACT = {"rtol": 0.0, "atol": 1e-10}
 Problem = tuple[Callable[[Tensor], Tensor], Tensor]
 
