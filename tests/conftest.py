@@ -50,3 +50,9 @@ def data_dir() -> Path:
     if not DATA_DIR.is_dir():
         pytest.skip(f"no real sequences at {DATA_DIR}; set TORCHSLAM_DATA to the folder that has them")
     return DATA_DIR
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`torchslam run` draws nothing: that takes as long as a short run."""
+    monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])

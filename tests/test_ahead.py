@@ -177,11 +177,8 @@ def test_other_errors_are_raised_at_their_frame_and_the_process_ends(sequence: S
     assert multiprocessing.active_children() == []
 
 
-@pytest.mark.usefixtures("patient")
-def test_same_bytes_with_one_process_or_two(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])
+@pytest.mark.usefixtures("patient", "without_pictures")
+def test_same_bytes_with_one_process_or_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outputs, folder = [tmp_path / "one", tmp_path / "two"], write_tum_folder(tmp_path / "room", frames=16)
     for processes, output in enumerate(outputs, start=1):
         assert main(["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]) == 0

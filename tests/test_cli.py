@@ -88,6 +88,7 @@ def test_resolved_configuration_reads_back(finished: Path) -> None:
     assert config.features.kind == "opencv-orb"
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_same_input_and_seed_give_same_bytes(finished: Path, tmp_path: Path) -> None:
     assert main(["run", ROOM, "--output", str(tmp_path), *FAST, "--seed", "7"]) == 0
     for name in ("trajectory.txt", "keyframes.txt", "map.safetensors", "map.ply"):
@@ -142,6 +143,7 @@ def test_demo_shares_the_way_of_run(
     assert (tmp_path / "demo" / "plots" / "scene.png").exists()
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
     arguments = [
         "--features",

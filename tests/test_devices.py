@@ -41,7 +41,7 @@ def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
 
 
 def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
-    walk = Walk(arc(10))
+    walk = Walk(arc(8))
     expected = gradients(walk, CPU)
     for name, found in gradients(walk, device).items():
         torch.testing.assert_close(found, expected[name], **TOLERANCE)
@@ -49,10 +49,10 @@ def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
 
 @pytest.mark.parametrize("front_end", ["orb", "opencv-orb"])
 def test_images(device: torch.device, front_end: str) -> None:
-    sequence = open_sequence("synthetic:room").part(0, 18, 2)
+    sequence = open_sequence("synthetic:room").part(0, 12, 2)
     config = load_config(None, [f"features.kind={front_end}", "features.num_keypoints=300"])
     expected, found = (SLAM(sequence.camera.to(d), config).run(sequence).trajectory for d in (CPU, device))
-    assert len(expected) == 9
+    assert len(expected) == 6
     torch.testing.assert_close(found.T_wc.cpu(), expected.T_wc, rtol=1e-2, atol=1e-2)
 
 
@@ -73,7 +73,7 @@ def test_results_of_a_run_elsewhere_are_written(device: torch.device, tmp_path: 
         "run",
         "synthetic:room",
         "--limit",
-        "10",
+        "7",
         "--features",
         "simulated",
         "--set",

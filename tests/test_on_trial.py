@@ -149,7 +149,7 @@ def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: py
     for index in range(len(walk)):
         slam.step(frames[index])
         newest = slam.map.num_keyframes - 1
-        if slam.mapper.adjusting and slam.looks_known == (slam.map.key(newest), False):
+        if slam.mapper.adjusting and slam.memory.looks_known == (slam.map.key(newest), False):
             break
     else:
         pytest.fail("no keyframe was asked about")
@@ -159,6 +159,6 @@ def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: py
     monkeypatch.setattr(recognizer, "recognize", lambda _, keyframe: asked.append(keyframe))
     slam._following.loop_closing.look_back(world)
     assert not asked  # it is known already
-    slam.looks_known = -1, False
+    slam.memory.looks_known = -1, False
     slam._following.loop_closing.look_back(world)
     assert asked == [newest]

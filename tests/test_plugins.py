@@ -54,6 +54,7 @@ class Failing:
 number = 7
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_example_is_a_screen_long_and_runs(tmp_path: Path) -> None:
     """From the command line, both parts its own."""
     body = EXAMPLE.read_text().split('"""', 2)[2].splitlines()
@@ -213,6 +214,7 @@ def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
         LightGlue(tmp_path / "other.pt")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_optical_flow_brings_its_own_samples_to_a_whole_run(tmp_path: Path) -> None:
     """A dense matcher from end to end, as the example's docstring has it."""
     names = ["--features", "examples.optical_flow:Samples", "--matcher", "examples.optical_flow:same"]

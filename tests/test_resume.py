@@ -199,10 +199,9 @@ class Cut(Walk):
 
 
 @pytest.fixture
-def cut(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Cut]]:
+def cut(monkeypatch: pytest.MonkeyPatch, without_pictures: None) -> Iterator[type[Cut]]:
     """The sequence that every command gets, and what it does in the middle."""
     monkeypatch.setattr(arguments, "sequence", lambda options: Cut(PATH))
-    monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])
     yield Cut
     Cut.do = staticmethod(lambda: None)
     Cut.at = STOP

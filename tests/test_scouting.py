@@ -37,7 +37,7 @@ CONFIG = load_config(
         "initialization.min_frames=3",
     ],
 )
-START, FRAMES = 0, 45
+START, FRAMES = 0, 38
 BAD = 26
 PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
 

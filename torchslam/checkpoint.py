@@ -56,7 +56,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
         "adjusting": slam.mapper.adjusting.due,
-        "looks_known": slam.looks_known,
+        "looks_known": slam.memory.looks_known,
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
@@ -138,7 +138,7 @@ def _go_on(
         slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, int(run["adjusting"]))
     if run["looks_known"] is not None:
         key, looks_known = run["looks_known"]
-        slam.looks_known = int(key), bool(looks_known)
+        slam.memory.looks_known = int(key), bool(looks_known)
 
 
 def _check_track(track: Track) -> None:

@@ -72,7 +72,8 @@ class SLAM:
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
         self.matcher = matcher_of(scaled.matching, matcher)
         self.tracker = Tracker(self.camera, scaled, self.matcher)
-        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, self.tracker.undistorted)
+        undistorted = self.tracker.localizer.undistorted
+        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, undistorted)
         self.reset()
 
     def reset(self) -> None:
@@ -152,15 +153,6 @@ class SLAM:
     def youth(self) -> Youth | None:
         """Of the world that is followed, while it is on trial."""
         return self._following.beginning.youth
-
-    @property
-    def looks_known(self) -> tuple[int, bool] | None:
-        """A keyframe and whether its place does, see `LoopClosing.look_ahead`: part of what a checkpoint keeps."""
-        return self._following.loop_closing.looks_known
-
-    @looks_known.setter
-    def looks_known(self, looks_known: tuple[int, bool] | None) -> None:
-        self._following.loop_closing.looks_known = looks_known
 
     @property
     def is_settled(self) -> bool:

@@ -76,8 +76,8 @@ def test_times_are_in_files_of_their_own(whole: Path) -> None:
     assert "fps" not in json.loads((whole / RUNS / "one" / "metrics.json").read_text())
 
 
-def test_the_results_are_those_of_a_run(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchslam.commands.run.draw", lambda results, output: [])
+@pytest.mark.usefixtures("without_pictures")
+def test_the_results_are_those_of_a_run(whole: Path, tmp_path: Path) -> None:
     settings = [part for setting in SETTINGS for part in ("--set", setting)]
     assert main(["run", ROOM, "--output", str(tmp_path), *settings]) == 0
     for name in (

@@ -50,6 +50,7 @@ def test_info_without_a_camera(
     assert "no calibration here: as with --camera auto" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_run_under_a_mask(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mask = np.full((480, 640), 255, np.uint8)
     mask[:, :200] = 0

@@ -32,7 +32,9 @@ WORDS = st.one_of(
 )
 LINES = st.lists(WORDS, max_size=10).map(" ".join)
 FILES = st.lists(LINES, max_size=5).map("\n".join)
-SAME_FOLDER = settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SAME_FOLDER = settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 @given(FILES)

@@ -43,6 +43,13 @@ def easy() -> Graphs:
     return simulate(ring, 40, (0.4, 0.4), 3, seed=1, noise=EASY)
 
 
+@pytest.fixture(scope="module")
+def bounds(easy: Graphs) -> tuple[Tensor, Tensor]:
+    """Errors where the true loops alone are heard, and where all are."""
+    best, all_heard = (ate(nodes_of(method, easy), easy.S_cw_true) for method in (Oracle(), Everything()))
+    return best, all_heard
+
+
 @pytest.mark.parametrize("name", sorted(TRAINING | UNSEEN))
 def test_walks_come_back_and_false_loops_are_false(name: str) -> None:
     graphs = simulate((TRAINING | UNSEEN)[name], 60, (0.5, 0.5), 2, seed=0, noise=EASY)
@@ -87,10 +94,12 @@ def test_pairwise_distance_is_that_of_the_cycle(easy: Graphs) -> None:
     ],
     ids=str,
 )
-def test_the_competitors_recover_an_easy_graph(easy: Graphs, method: Method) -> None:
-    errors, best = (ate(nodes_of(m, easy), easy.S_cw_true) for m in (method, Oracle()))
-    assert bool((errors < 2 * best).all())
-    assert bool((ate(nodes_of(Everything(), easy), easy.S_cw_true) > 4 * best).all())
+def test_the_competitors_recover_an_easy_graph(
+    easy: Graphs, bounds: tuple[Tensor, Tensor], method: Method
+) -> None:
+    best, all_heard = bounds
+    assert bool((ate(nodes_of(method, easy), easy.S_cw_true) < 2 * best).all())
+    assert bool((all_heard > 4 * best).all())
 
 
 def test_weights_of_gnc_end_at_zero_or_one_for_the_truncated_cost() -> None:

@@ -117,7 +117,7 @@ def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
 def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
     anywhere = match_points(slam.map, slam.map.living_points(), view, CONFIG.matching)
-    tracked = slam.tracker.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
+    tracked = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
     slam.tracker.start_at(slam.world, view, tracked)

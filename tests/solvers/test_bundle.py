@@ -6,7 +6,7 @@ import torch
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, umeyama
 from torchslam.solvers import bundle_adjust, schur
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
 
 def test_exact_data_gives_the_exact_map(bundle_scene, model):

@@ -17,7 +17,7 @@ from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
 from torchslam.solvers import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
 from torchslam.solvers.graph import solve
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 EXACT = {"rtol": 0.0, "atol": 1e-10}
 Problem = tuple[Callable[[Tensor], Tensor], Tensor]
 
@@ -131,6 +131,16 @@ def penalty(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     return of
 
 
+def mixed(function: Callable[[Tensor], Tensor], count: int = 6) -> Callable[[Tensor], Tensor]:
+    """A few sums over all of the output, each with weights of its own, as a Jacobian row by row takes long."""
+
+    def of(x: Tensor) -> Tensor:
+        value = function(x).flatten()
+        return torch.cos(torch.arange(count * len(value), dtype=value.dtype)).view(count, -1) @ value
+
+    return of
+
+
 def test_a_gradient_of_a_gradient(problem):
     function, x = problem
     x = x.clone().requires_grad_()
@@ -155,7 +165,7 @@ def test_a_gradient_penalty_is_that_of_finite_differences(problem):
 
 
 def test_both_directions_are_the_same(problem):
-    function, x = problem
+    function, x = mixed(problem[0]), problem[1]
     expected = torch.autograd.functional.jacobian(function, x)
     for found in (jacrev(function)(x), jacfwd(function)(x)):
         torch.testing.assert_close(found, expected, **EXACT)
@@ -168,7 +178,7 @@ def test_both_directions_are_the_same(problem):
 
 def test_vmap_is_the_loop(problem):
     function, x = problem
-    batch = torch.stack((x, x.flip(0), 0.5 * x))
+    batch = torch.stack((x, 0.5 * x.flip(0)))
     for mapped in (function, jacrev(function), jacfwd(function)):
         torch.testing.assert_close(vmap(mapped)(batch), torch.stack([mapped(x) for x in batch]), **EXACT)
     torch.testing.assert_close(

@@ -11,7 +11,7 @@ from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform,
 from torchslam.solvers.graph import ObservationGraph, join, solve
 from torchslam.world.history import RunGraph
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
 
 def simulated(noise=0.5, frames=10, points=50, seed=0):

@@ -12,7 +12,7 @@ from torchslam.errors import TorchslamError
 from torchslam.solvers import bundle_adjust, refine_pose
 from torchslam.solvers.graph import ObservationGraph, solve
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
 
 def matrices(generator, *shape):

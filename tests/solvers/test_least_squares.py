@@ -153,7 +153,8 @@ def problem():
             mask=torch.tensor([[True] * 6, [True] * 5 + [False]]),
             kernel="cauchy",
             scale=1 + p[3],
-            **CONVERGED,
+            iterations=25,
+            tolerance=0.0,
         )
         T_found, scale_found = solution.unknowns
         return torch.cat((T_found[:, :3].flatten(1), scale_found), dim=1)

@@ -6,7 +6,7 @@ import torch
 from torchslam.geometry import se3_exp, se3_inverse, se3_log
 from torchslam.solvers import PosePrior, refine_pose
 
-CONVERGED = {"iterations": 60, "tolerance": 0.0}
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
 
 def errors(T_cw, truth):

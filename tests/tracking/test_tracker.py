@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
-from tests.world.simulated import tracked_at
 from torchslam.config import load_config
-from torchslam.geometry import Noise, Undistorted, se3_exp, se3_inverse, transform
+from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.tracking.correspondences import Projected, project_points
-from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.spread import (
     CELLS,
     CROWD,
@@ -200,34 +198,6 @@ def test_a_frame_that_is_believed_speaks_for_what_it_saw_and_should_have_seen() 
     assert int((points["times_visible"] - visible).max()) == 2
 
 
-@pytest.mark.parametrize(
-    ("poses", "chosen", "heard"),
-    [
-        ([(50, 100), (90, 100)], 0, 1),  # half agree: nobody else is heard
-        ([(49, 100), None, (60, 61), (90, 90)], 2, 3),
-        ([None, (40, 100), (45, 100), (20, 60)], 2, 4),
-        ([None, None], None, 2),
-    ],
-)
-def test_where_few_of_the_matches_agree_others_are_heard(
-    poses: list[tuple[int, int] | None], chosen: int | None, heard: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, follower = world(), tracker()
-    answers = [
-        None
-        if found is None
-        else tracked_at(pose(), torch.arange(found[0]), torch.arange(found[0]), matches=found[1])
-        for found in poses
-    ]
-    asked = iter(answers)
-    monkeypatch.setattr(follower, "_locate", lambda *_: next(asked))
-    nobody = Pairs(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
-    view = SCENE.view(50, pose())
-    tracked = follower.locate(here.map, view, iter([nobody] * len(poses)), here.track.local_points)
-    assert tracked is (None if chosen is None else answers[chosen])
-    assert len(list(asked)) == len(poses) - heard
-
-
 def test_the_error_is_in_units_of_the_noise() -> None:
     medians = [followed(world(), SCENE.view(50 + n, se3_exp(n * STEP), noise=0.7)).error for n in range(6)]
     # The median of a chi-square of two degrees of freedom is 1.386; six parameters of 400 residuals are fitted.
@@ -303,108 +273,6 @@ def test_points_that_died_are_not_looked_for() -> None:
     here.map.kill(dead)
     tracked = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]))
     assert not torch.isin(tracked.point_ids, dead).any()
-
-
-def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
-    here, follower = world_in(SCENE, sideways(12, step=0.6)), tracker("tracking.local_keyframes=1")
-    follower.follow(here, 11)
-    T_cw = sideways(1, start=0.05)[0]
-    view = SCENE.view(50, T_cw)
-    at = torch.nonzero(view.mask)[:, 0]
-    there = ROWS[SCENE.shows(50)[at]]
-    alive = here.map.points["alive"][there]
-    matches = iter([Pairs(there[alive][:30], at[alive][:30])])
-    tracked = follower.locate(here.map, view, matches, here.track.local_points)
-    assert tracked is not None
-    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
-    near = follower.around(here.map, there[alive][:30])
-    assert near.tolist() == [0, 1]
-    assert set(tracked.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
-    assert tracked.inliers > 60
-
-
-@pytest.mark.parametrize(("offset", "agrees"), [(2.44, True), (2.46, False)])
-@pytest.mark.parametrize("scale", [0.5, 3.0])
-def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
-    offset: float, agrees: bool, scale: float
-) -> None:
-    here = world()
-    seen = here.map.points_seen_by(torch.tensor([0]))
-    T_cw = here.map.T_cw[0]
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
-    scales = torch.full((len(seen),), scale, dtype=torch.float64)
-    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None)).all()) is agrees
-    assert bool(tracker().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None)).any()) is agrees
-    wide = tracker("measurement.chi_square=24")
-    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, Noise.of(scales, None)).all()
-
-
-@pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
-def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
-    here = world()
-    seen = here.map.points_seen_by(torch.tensor([0]))
-    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
-    T_cw = roll @ here.map.T_cw[0]
-    points_c = transform(T_cw, here.map.positions_w[seen])
-    pixels, depth = CAMERA.project(points_c)[0], points_c[:, 2]
-    deviation = 3.0 * depth / 200.0  # three pixels
-    here.map.points["covariances_w"][seen] = torch.diag_embed(
-        torch.stack([deviation**2, 0 * depth, 0 * depth], -1)
-    )
-    gate = tracker("measurement.gate=mahalanobis")
-    scales = torch.full((len(seen),), 2.0, dtype=torch.float64)
-    for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
-        off = torch.zeros(2, dtype=torch.float64)
-        off[axis] = offset * sigma * math.sqrt(5.991)
-        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
-        assert agreeing.all() if agrees else not agreeing.any()
-
-
-def test_points_behind_the_camera_agree_with_nothing() -> None:
-    here = world()
-    seen = here.map.points_seen_by(torch.tensor([0]))
-    T_cw = pose(0, 0, 0, 0, math.pi)
-    middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
-    here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
-    for gate in ("chi_square", "mahalanobis"):
-        by = tracker(f"measurement.gate={gate}")
-        assert not by.agrees(
-            here.map, T_cw, seen, middle, Noise.of(torch.ones(len(seen), dtype=torch.float64), None)
-        ).any()
-
-
-def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
-    """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
-    here = world()
-    T_cw = here.map.T_cw[0]
-    seen = here.map.points_seen_by(torch.tensor([0]))
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    coarse = torch.arange(len(seen)) % 2 == 1
-    scales = torch.where(coarse, 4.0, 1.0).double()
-    shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-    noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
-    refined, errors, agrees = tracker()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
-    assert agrees.all()
-    fitted = CAMERA.project(transform(refined.T_cw, here.map.positions_w[seen]))[0]
-    assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
-    wanted = ((fitted - shifted) ** 2).sum(-1) / scales**2
-    torch.testing.assert_close(errors, wanted)
-
-
-def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
-    here = world()
-    T_cw = here.map.T_cw[0]
-    seen = here.map.points_seen_by(torch.tensor([0]))
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    scales = torch.ones(len(seen), dtype=torch.float64)
-    wrong = torch.arange(len(seen)) < len(seen) // 4
-    for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
-        shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-        noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
-        refined, _, agrees = tracker()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
-        assert torch.equal(agrees, ~wrong)
-        torch.testing.assert_close(refined.T_cw, T_cw, atol=exact, rtol=0)
 
 
 # --- the parts --------------------------------------------------------------------------------------------------
@@ -573,7 +441,7 @@ def test_where_the_last_frames_are_in_doubt_the_pose_is_not_looked_for_next_to_t
     asked: list[bool] = []
     follower, here, view = tracker(), world(), SCENE.view(50, sideways(1, start=0.7)[0])
     monkeypatch.setattr(
-        "torchslam.tracking.tracker.nearby_pose", lambda *_: asked.append(True)
+        "torchslam.tracking.localizer.nearby_pose", lambda *_: asked.append(True)
     )  # and RANSAC finds it
     for is_sure, wanted in ((False, []), (True, [True])):
         aside = here.aside()

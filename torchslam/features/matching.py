@@ -7,37 +7,21 @@ the lower index wins, so results do not depend on the device.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchslam.features.bits import hamming, hamming_pairs, sign_products
+from torchslam.features.bits import hamming, hamming_pairs
 from torchslam.features.contract import NORMALIZE, are_comparable
+from torchslam.features.nearest import dual_softmax, nearest_by_bits, nearest_by_cosine
 from torchslam.features.windows import SAME_SCALE, nearest_bits, window_pairs
 from torchslam.geometry.precision import full_precision
 from torchslam.values import Features, Matches
-
-# Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
-_AMPLITUDE = 64
-_INDEX_BITS = 13
-_MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
 SCALE_TOLERANCE = 1.5
 """Factor between the scale that is expected of a keypoint and the one that it has."""
 _FAR = 1e6  # pixels: no point so far outside of the image is looked for
 _PIECE = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
-
-
-class _Nearest(NamedTuple):
-    """For each of N1 rows its nearest (B, N1) column, the distance to it, whether there is one that may match, whether
-    no other row is nearer to that column, and the distance to the second nearest, where it was asked for."""
-
-    column: Tensor
-    distance: Tensor
-    found: Tensor
-    mutual: Tensor
-    second: Tensor | None
 
 
 @full_precision
@@ -71,12 +55,12 @@ def match(
         return _no_matches(batch, rows, descriptors_1.device)
     similarity, masks = None, (features_1.mask, features_2.mask, allowed)
     if descriptors_1.dtype == torch.uint8:
-        nearest = _nearest_bits(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
+        nearest = nearest_by_bits(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
         if temperature is not None:
             similarity = -hamming(descriptors_1, descriptors_2).float()
     else:
         similarity = descriptors_1 @ descriptors_2.mT
-        nearest = _nearest_floats(similarity, *masks, with_second=ratio is not None)
+        nearest = nearest_by_cosine(similarity, *masks, with_second=ratio is not None)
     mask = nearest.found
     if max_distance is not None:
         mask = mask & (nearest.distance <= max_distance)
@@ -87,7 +71,7 @@ def match(
     mask = _one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
     weights = None
     if temperature is not None and similarity is not None:
-        weights = _dual_softmax(similarity / temperature, nearest.column, *masks) * mask
+        weights = dual_softmax(similarity / temperature, nearest.column, *masks) * mask
     return _matches(nearest.column, nearest.distance, mask, weights)
 
 
@@ -175,70 +159,6 @@ def match_pairs(
     kept = torch.nonzero(found).squeeze(1)
     kept = kept[row[column[kept]] == kept]
     return kept, column[kept]
-
-
-def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
-    """(B, N1, N2) bool, the pairs that may match."""
-    possible = mask_1[:, :, None] & mask_2[:, None, :]
-    return possible if allowed is None else possible & allowed
-
-
-def _nearest_bits(
-    descriptors_1: Tensor,
-    descriptors_2: Tensor,
-    mask_1: Tensor,
-    mask_2: Tensor,
-    allowed: Tensor | None,
-    with_second: bool,
-) -> _Nearest:
-    """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
-    keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
-    bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
-    columns = keys.shape[2]
-    if columns > 1 << _INDEX_BITS:  # more columns than the free bits can number: wider keys
-        index_bits = columns.bit_length()
-        keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
-    highest = (1 << index_bits) - 1
-    masked = _MASKED << (index_bits - _INDEX_BITS)
-    if allowed is not None:
-        keys.masked_fill_(~allowed, masked)
-    numbers = highest - torch.arange(columns, device=keys.device) + masked * ~mask_2
-    keys += numbers.to(keys.dtype)[:, None, :]
-    keys += (masked * ~mask_1).to(keys.dtype)[:, :, None]
-
-    def distance(key: Tensor) -> Tensor:
-        return (bits // 2 - (key.to(torch.int64) >> index_bits)).float()
-
-    best, column_best = keys.amax(2), keys.amax(1)
-    column, nearest, second = highest - (best.to(torch.int64) & highest), distance(best), None
-    if with_second:
-        keys.scatter_(2, column[..., None], 2 * masked)
-        second = distance(keys.amax(2))
-        second = torch.where(second > bits, torch.inf, second)
-    mutual = nearest <= distance(column_best).gather(1, column)
-    return _Nearest(column, nearest, nearest <= bits, mutual, second)
-
-
-def _nearest_floats(
-    similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None, with_second: bool
-) -> _Nearest:
-    """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
-    values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
-    best, column = values.max(2)
-    mutual = best >= values.amax(1).gather(1, column)
-    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2) if with_second else None
-    nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
-    return _Nearest(column, nearest, best > -torch.inf, mutual, second)
-
-
-def _dual_softmax(
-    logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
-) -> Tensor:
-    """Product of the softmax over columns and over rows at (row, column[row]): (B, N1, N2), (B, N1) -> (B, N1)."""
-    low = torch.finfo(logits.dtype).min / 2
-    logits = logits.masked_fill(~_possible(mask_1, mask_2, allowed), low)
-    both = logits.softmax(2) * logits.softmax(1)
-    return both.gather(2, column[..., None])[..., 0]
 
 
 def _take(values: Tensor, rows: Tensor) -> Tensor:

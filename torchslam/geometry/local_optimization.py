@@ -66,6 +66,13 @@ def in_parts(
     return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
 
+def best_of(state: State, cost: Tensor) -> tuple[State, Tensor]:
+    """The candidate of least cost of each problem. (B, K, ...), (B, K) -> (B, ...), (B,)."""
+    cost, best = cost.nan_to_num(torch.inf).min(dim=1)
+    index = torch.arange(len(best), device=best.device)
+    return tuple(x[index, best] for x in state), cost
+
+
 def _select(condition: Tensor, new: State, old: State) -> State:
     """New values where the condition holds. All batched over the first dimension."""
     return tuple(

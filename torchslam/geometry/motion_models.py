@@ -10,20 +10,21 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.homography import decompose_homography
+from torchslam.geometry.local_optimization import best_of
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, is_unlikely
-from torchslam.geometry.two_view import (
-    TRANSFER_WIDTH,
-    TwoViews,
+from torchslam.geometry.two_view import TRANSFER_WIDTH, TwoViews
+from torchslam.geometry.two_view_essential import (
     ahead_and_parallax,
-    best_of,
+    noise_variance,
+    sampson_squared,
+    twisted,
+)
+from torchslam.geometry.two_view_mappings import (
     fit_homography,
     fit_rotation,
-    noise_variance,
     propose_homography,
     propose_rotation,
-    sampson_squared,
     transfer_squared,
-    twisted,
 )
 
 MODELS = ("essential", "homography", "rotation")

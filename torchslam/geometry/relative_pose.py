@@ -24,7 +24,7 @@ from torchslam.geometry.relative_pose_search import (
     views_of,
 )
 from torchslam.geometry.robust import Kernel, robustify
-from torchslam.geometry.two_view import tangent_basis
+from torchslam.geometry.two_view_essential import tangent_basis
 
 # Here, as compiled graphs of older torch cannot look them up.
 _MODELS, _KERNELS = get_args(Model), get_args(Kernel)

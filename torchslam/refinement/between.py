@@ -89,7 +89,7 @@ class Poser:
         slam_map = world.map
         away = (slam_map.keyframes["frame_index"] - view.index).abs()
         nearest = torch.argsort(away, stable=True)[:NEAREST]
-        tracked = self.tracker.locate(
+        tracked = self.tracker.localizer.locate(
             slam_map, view, self._candidates(slam_map, view, nearest), slam_map.points_seen_by(nearest)
         )
         if tracked is not None:

@@ -67,7 +67,9 @@ class TrackingConfig(Settings, section="tracking"):
     refine_radius_px: float = setting(
         5.0, "around the projections by the pose that was found", above=0, high=LONGEST_PX
     )
-    threshold_px: float = setting(3.0, "of the PnP RANSAC", above=0, grows=True, high=LONGEST_PX)
+    threshold_px: float = setting(
+        3.0, "of the PnP, with RANSAC or without", above=0, grows=True, high=LONGEST_PX
+    )
     min_matches: int = setting(20, "fewer: brute force", low=1, high=MOST)
     min_inliers: int = setting(20, "fewer: the frame is lost", low=1, high=MOST)
     local_keyframes: int = setting(12, "whose points are looked for", low=1, high=MOST)

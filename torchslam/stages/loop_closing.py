@@ -13,7 +13,6 @@ class LoopClosing:
 
     def __init__(self, parts: Parts, mapping: LocalMapping, beginning: Beginning) -> None:
         self.parts, self.mapping, self.beginning = parts, mapping, beginning
-        self.looks_known: tuple[int, bool] | None = None  # a keyframe, by key, and whether its place does
 
     @property
     def count(self) -> int:
@@ -29,11 +28,11 @@ class LoopClosing:
 
         Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
         """
-        keyframe = world.map.num_keyframes - 1
-        key = world.map.key(keyframe)
-        if self.mapping.adjusting and (self.looks_known is None or self.looks_known[0] != key):
+        memory, keyframe = self.parts.memory, world.map.num_keyframes - 1
+        was_asked = memory.looks_known is not None and memory.looks_known[0] == world.map.key(keyframe)
+        if self.mapping.adjusting and not was_asked:
             with self.parts.clock("loops"):
-                self.looks_known = key, self.parts.memory.looks_known(world, keyframe)
+                memory.look_ahead(world, keyframe)
 
     def look_back(self, world: World) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.
@@ -51,8 +50,7 @@ class LoopClosing:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
         parts, newest = self.parts, world.map.num_keyframes - 1
         with parts.clock("loops"):
-            looks_new = self.looks_known == (world.map.key(newest), False)
-            found = parts.memory.recognize(world, newest, looks_new)
+            found = parts.memory.recognize(world, newest)
             if found is None:
                 return world
             if not found.is_loop:

@@ -42,7 +42,7 @@ class Relocalizer:
             if any(world is other and bool((near == keyframe).any()) for other, near in tried):
                 continue
             near = self._near(world.map, keyframe)
-            tracked = self.tracker.locate(
+            tracked = self.tracker.localizer.locate(
                 world.map, view, self._matches(world.map, keyframe, view), world.map.points_seen_by(near)
             )
             if tracked is not None and not why_doubt(tracked, None, alone(world.track, tracked), self.judge):

@@ -19,13 +19,13 @@ from torchslam.geometry import Camera, fits, se3_inverse, transform
 from torchslam.geometry.motion import apart
 from torchslam.geometry.robust import Kernel
 from torchslam.geometry.whitening import times
-from torchslam.solvers import RefinedPose
+from torchslam.solvers import RefinedPose, refine_pose
 from torchslam.tracking.spread import voices
-from torchslam.tracking.tracker import refine_one
 from torchslam.values import Anchor, Followed, Frame
 
 ATTEMPTS = 2  # a pose from some of the patches leads to the others
 LEAST = 20  # patches that a pose needs
+NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
 LEAST_ERROR = 0.05  # squared, in units of the variance of a keypoint: what the alignment of a patch adds
 
 
@@ -182,7 +182,7 @@ class Scout:
         if int(mask.sum()) < LEAST:
             mask = good
         for kernel in kernels:
-            refined = refine_one(T_ca, anchor.points_a, pixels, self.camera, weights, mask, kernel)
+            refined = _refine_one(T_ca, anchor.points_a, pixels, self.camera, weights, mask, kernel)
             T_ca = refined.T_cw[0]
             errors = anchor.noise.squared_reprojection(transform(T_ca, anchor.points_a), pixels, self.camera)
             mask = good & fits(errors, self.chi_square) & refined.success
@@ -214,3 +214,28 @@ class Scout:
         if not self._found and overlap < self.settings.overlap_share * self.keyframes.min_overlap:
             return f"sees {overlap:.0%} of the points of its reference keyframe"
         return ""
+
+
+def _refine_one(
+    T_cw: Tensor,
+    points_w: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    weights: Tensor,
+    mask: Tensor,
+    kernel: Kernel,
+) -> RefinedPose:
+    """The pose of one frame (4, 4) by points (n, 3) at pixels (n, 2), as exactly as its noise is worth."""
+    return refine_pose(
+        T_cw[None],
+        points_w[None],
+        pixels[None],
+        camera,
+        weights=weights[None],
+        mask=mask[None],
+        kernel=kernel,
+        scale=2.0,
+        backward="detached",
+        iterations=10,
+        tolerance=NEGLIGIBLE,
+    )

@@ -15,9 +15,7 @@ from torchslam.world.map import NO_KEYPOINT, Map, key_of
 from torchslam.world.schema import FRAMES, OBSERVATIONS
 from torchslam.world.table import Table
 
-_ASTRAY = (
-    4.0 * CHI_SQUARE_95
-)  # twice as far off as what agrees may be: the final adjustment moves frames by less
+_ASTRAY = 4.0 * CHI_SQUARE_95  # twice as far off as a fit may be: the final adjustment moves frames by less
 _MOST = 0.75  # of what a frame saw, which must agree before the rest is forgotten
 _AT_ONCE = 1 << 16  # observations: a pose for each takes memory
 
@@ -188,26 +186,22 @@ class History:
         One such observation would pull a frame off its place that few points hold. Where many of a frame's do not
         agree, they stay: it may be the frame that is off its place.
         """
-        seen, T_cw = self.observations.columns(), self.T_cw(slam_map)
-        points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
-        agrees = torch.cat(
-            [
-                fits(
-                    Noise(seen["scales"][some], seen["information"][some]).squared_reprojection(
-                        transform(T_cw[seen["row"][some]], points_w[some, None])[:, 0],
-                        seen["pixels"][some],
-                        camera,
-                    ),
-                    _ASTRAY,
-                )
-                for some in torch.arange(len(points_w), device=T_cw.device).split(_AT_ONCE)
-            ]
-        )
-        count = torch.bincount(seen["row"], minlength=len(self))
-        is_right = torch.bincount(seen["row"][agrees], minlength=len(self)) >= _MOST * count
-        kept = agrees | ~is_right[seen["row"]]
+        T_cw, seen_by = self.T_cw(slam_map), self.observations["row"]
+        every = torch.arange(len(seen_by), device=T_cw.device)
+        agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_AT_ONCE)])
+        count = torch.bincount(seen_by, minlength=len(self))
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MOST * count
+        kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])
+
+    def _agree(self, rows: Tensor, T_cw: Tensor, slam_map: Map, camera: Camera) -> Tensor:
+        """(n,) whether observations, by row (n,), are not far from where frames at T_cw (F, 4, 4) have their points."""
+        seen = {name: values[rows] for name, values in self.observations.columns().items()}
+        points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
+        points_c = transform(T_cw[seen["row"]], points_w[:, None])[:, 0]
+        noise = Noise(seen["scales"], seen["information"])
+        return fits(noise.squared_reprojection(points_c, seen["pixels"], camera), _ASTRAY)
 
     def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
         """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.

@@ -1,0 +1,158 @@
+"""The localizer on a scene of which every answer is known: whose guess is heard, who agrees, and who has a voice."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from tests.world.simulated import tracked_at
+from torchslam.config import load_config
+from torchslam.geometry import Noise, Undistorted, transform
+from torchslam.tracking.localizer import Localizer
+from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.tracker import Tracker
+from torchslam.world.world import World
+
+SCENE = Scene.of(300)
+ROWS = rows_of(SCENE)
+
+
+def localizer(*overrides: str) -> Localizer:
+    return Localizer(CAMERA, load_config(None, overrides))
+
+
+def world() -> World:
+    return world_in(SCENE, sideways(4))
+
+
+@pytest.mark.parametrize(
+    ("poses", "chosen", "heard"),
+    [
+        ([(50, 100), (90, 100)], 0, 1),  # half agree: nobody else is heard
+        ([(49, 100), None, (60, 61), (90, 90)], 2, 3),
+        ([None, (40, 100), (45, 100), (20, 60)], 2, 4),
+        ([None, None], None, 2),
+    ],
+)
+def test_where_few_of_the_matches_agree_others_are_heard(
+    poses: list[tuple[int, int] | None], chosen: int | None, heard: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, finder = world(), localizer()
+    answers = [
+        None
+        if found is None
+        else tracked_at(pose(), torch.arange(found[0]), torch.arange(found[0]), matches=found[1])
+        for found in poses
+    ]
+    asked = iter(answers)
+    monkeypatch.setattr(finder, "_locate", lambda *_: next(asked))
+    nobody = Pairs(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
+    view = SCENE.view(50, pose())
+    tracked = finder.locate(here.map, view, iter([nobody] * len(poses)), here.track.local_points)
+    assert tracked is (None if chosen is None else answers[chosen])
+    assert len(list(asked)) == len(poses) - heard
+
+
+def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
+    here, finder = world_in(SCENE, sideways(12, step=0.6)), localizer("tracking.local_keyframes=1")
+    Tracker(CAMERA, load_config(None, ["tracking.local_keyframes=1"])).follow(here, 11)
+    T_cw = sideways(1, start=0.05)[0]
+    view = SCENE.view(50, T_cw)
+    at = torch.nonzero(view.mask)[:, 0]
+    there = ROWS[SCENE.shows(50)[at]]
+    alive = here.map.points["alive"][there]
+    matches = iter([Pairs(there[alive][:30], at[alive][:30])])
+    tracked = finder.locate(here.map, view, matches, here.track.local_points)
+    assert tracked is not None
+    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
+    near = finder.around(here.map, there[alive][:30])
+    assert near.tolist() == [0, 1]
+    assert set(tracked.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
+    assert tracked.inliers > 60
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(2.44, True), (2.46, False)])
+@pytest.mark.parametrize("scale", [0.5, 3.0])
+def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
+    offset: float, agrees: bool, scale: float
+) -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    T_cw = here.map.T_cw[0]
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
+    scales = torch.full((len(seen),), scale, dtype=torch.float64)
+    agreeing = localizer().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
+    assert agreeing.all() if agrees else not agreeing.any()
+    wide = localizer("measurement.chi_square=24")
+    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, Noise.of(scales, None)).all()
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
+def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
+    T_cw = roll @ here.map.T_cw[0]
+    points_c = transform(T_cw, here.map.positions_w[seen])
+    pixels, depth = CAMERA.project(points_c)[0], points_c[:, 2]
+    deviation = 3.0 * depth / 200.0  # three pixels
+    here.map.points["covariances_w"][seen] = torch.diag_embed(
+        torch.stack([deviation**2, 0 * depth, 0 * depth], -1)
+    )
+    gate = localizer("measurement.gate=mahalanobis")
+    scales = torch.full((len(seen),), 2.0, dtype=torch.float64)
+    for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
+        off = torch.zeros(2, dtype=torch.float64)
+        off[axis] = offset * sigma * math.sqrt(5.991)
+        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
+        assert agreeing.all() if agrees else not agreeing.any()
+
+
+def test_points_behind_the_camera_agree_with_nothing() -> None:
+    here = world()
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    T_cw = pose(0, 0, 0, 0, math.pi)
+    middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
+    here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
+    for gate in ("chi_square", "mahalanobis"):
+        by = localizer(f"measurement.gate={gate}")
+        assert not by.agrees(
+            here.map, T_cw, seen, middle, Noise.of(torch.ones(len(seen), dtype=torch.float64), None)
+        ).any()
+
+
+def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
+    """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
+    here = world()
+    T_cw = here.map.T_cw[0]
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    coarse = torch.arange(len(seen)) % 2 == 1
+    scales = torch.where(coarse, 4.0, 1.0).double()
+    shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+    noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+    refined, errors, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+    assert agrees.all()
+    fitted = CAMERA.project(transform(refined.T_cw, here.map.positions_w[seen]))[0]
+    assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
+    wanted = ((fitted - shifted) ** 2).sum(-1) / scales**2
+    torch.testing.assert_close(errors, wanted)
+
+
+def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
+    here = world()
+    T_cw = here.map.T_cw[0]
+    seen = here.map.points_seen_by(torch.tensor([0]))
+    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    scales = torch.ones(len(seen), dtype=torch.float64)
+    wrong = torch.arange(len(seen)) < len(seen) // 4
+    for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
+        shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+        noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+        refined, _, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+        assert torch.equal(agrees, ~wrong)
+        torch.testing.assert_close(refined.T_cw, T_cw, atol=exact, rtol=0)
