@@ -10,7 +10,7 @@ from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_
 from torch import Tensor
 
 from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
-from torchslam.geometry.motion_models import Fits, PlaneMotions, plane_holds
+from torchslam.geometry.motion_models import Fits, PlaneMotions, goes_both_ways, plane_holds
 from torchslam.geometry.robust import Kernel
 from torchslam.geometry.two_view import (
     TwoViews,
@@ -98,6 +98,54 @@ def test_noise_with_a_long_tail_is_no_parallax() -> None:
             result = estimate(replace(turned, pixels_2=turned.pixels_2 + tail))
             assert result.model == ("rotation",)
             assert not result.success.any()
+
+
+def along_edges(scene: Scene, seed: int, deviation: float) -> Scene:
+    """The same with more noise along horizontal edges, so many deviations, pixels, of it in either image."""
+    generator = torch.Generator().manual_seed(seed)
+    sides = deviation * torch.randn(2, *scene.mask.shape, generator=generator, dtype=torch.float64)
+    level = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    pixels = (side[..., None] * level for side in sides)
+    return replace(scene, pixels_1=scene.pixels_1 + next(pixels), pixels_2=scene.pixels_2 + next(pixels))
+
+
+def test_noise_along_edges_is_no_parallax() -> None:
+    """It lies along epipolar lines by its size, but on both sides of where a match without parallax is."""
+    for count, deviation in ((400, 1.0), (800, 0.75)):
+        for seed in range(6):
+            turned = two_views(seed, count=count, baseline=0.0, outliers=0.1)
+            result = estimate(along_edges(turned, seed, deviation))
+            assert result.model == ("rotation",)
+            assert not result.success.any()
+
+
+def test_parallax_under_noise_along_edges_counts() -> None:
+    """Where all of it is on one side, as large as the noise or not, it is a motion."""
+    for seed in range(6):
+        scene = two_views(seed, count=400, outliers=0.1, baseline=0.1)
+        result = estimate(along_edges(scene, seed, 1.0))
+        assert result.model == ("essential",)
+        assert result.success.all()
+
+
+@pytest.mark.parametrize(
+    ("moved", "behind", "pixels", "expected"),
+    [(0.4, 0.2, 5.0, True), (0.4, 0.05, 5.0, False), (0.6, 0.2, 5.0, False), (0.4, 0.2, 3.5, False)],
+)
+def test_clear_parallax_on_both_sides_of_a_rotation_is_noise(
+    moved: float, behind: float, pixels: float, expected: bool
+) -> None:
+    """A tenth may lie behind the cameras; all may, where no rotation explains most matches, or within the noise."""
+    generator = torch.Generator().manual_seed(0)
+    pixels_1 = torch.rand(1, 200, 2, generator=generator, dtype=torch.float64) * 160 + 160
+    count = round(200 * moved)
+    side = torch.zeros(200, dtype=torch.float64)
+    side[:count] = torch.where(torch.arange(count) < behind * count, -1.0, 1.0)
+    pixels_2 = pixels_1 + pixels * side[:, None] * torch.tensor([1.0, 0.0], dtype=torch.float64)
+    views = TwoViews.of(pixels_1, pixels_2, CAMERA, CAMERA, 1.0, side.new_ones(1, 200).bool(), None)
+    R, t = torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    fits = Fits(R, t, R, R, side.new_zeros(3, 1, 200)).with_mappings(views)
+    assert bool(goes_both_ways(views, fits, side.new_ones(1))) == expected
 
 
 def test_two_motions_before_a_plane_are_told_apart_by_more_than_noise() -> None:
