@@ -190,7 +190,9 @@ def test_parallax_that_no_match_shows_alone_counts(threshold: float) -> None:
     assert sorted(off)[2] < 12
 
 
-@pytest.mark.parametrize(("turn", "holds"), [(0.0, True), (0.5, True), (1.0, False), (2.0, False)])
+@pytest.mark.parametrize(
+    ("turn", "holds"), [(0.0, True), (0.5, True), (1.0, True), (1.5, False), (2.0, False)]
+)
 def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds: bool) -> None:
     """Sixty matches with half a pixel of noise tell directions that are degrees apart."""
     scene = two_views(0, count=60, outliers=0.0, noise=0.5)
@@ -202,6 +204,22 @@ def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds:
     squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1).expand(3, -1, -1)
     fits = Fits(R, t, R + turned[:, :, None] * normal, R, squared).with_mappings(views)
     assert bool(plane_holds(views, fits, PlaneMotions.of(views, fits))) == holds
+
+
+@pytest.mark.parametrize(("beside", "holds"), [(2, True), (3, False)])
+def test_few_matches_far_beside_the_motions_of_a_plane_contradict_it(beside: int, holds: bool) -> None:
+    """Of forty. Each counts as much as three deviations, so three of them are more than the gain of a fit."""
+    scene = two_views(0, count=40)
+    everything = torch.ones(1, 40, dtype=torch.bool)
+    views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 1.0, everything, None)
+    R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3]
+    # Medians of the squares of Gaussian noise of variance one, in one coordinate and, in units of 1.5, in two.
+    level = torch.tensor([0.6745**2, 1.3863 / 2.25, 100.0], dtype=torch.float64)
+    fits = Fits(R, t, R, R, level[:, None, None].expand(3, 1, 40))
+    of_motion = torch.where(torch.arange(40) < beside, 100.0, level[0]).expand(1, 4, 40)
+    possible = torch.ones(1, 4, dtype=torch.bool)
+    four = R[:, None].expand(1, 4, 3, 3), t[:, None].expand(1, 4, 3), t[:, None].expand(1, 4, 3)
+    assert bool(plane_holds(views, fits, PlaneMotions(*four, of_motion, possible))) == holds
 
 
 def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:

@@ -216,8 +216,8 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
     """(B,) whether a motion before the plane explains the matches about as well as the essential matrix does.
 
     Few matches, most of which lie near some plane, show their depth by too few others to be no accident. But as motions
-    of a scene with depth the two can be compared by all matches: what the plane's leaves beyond the gain of a fit, it
-    does not know.
+    of a scene with depth the two can be compared by all matches, each up to three deviations: what the plane's leaves
+    beyond the gain of a fit, it does not know.
     """
     # The noise as the plane has it, too: an essential matrix that accident chose shows too little.
     across, both = fits.squared[:2]
@@ -226,15 +226,15 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
         _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask),
     )
     variance = variance.clamp_min(_EXACT**2)[:, None]
-    near = (torch.minimum(*fits.squared[:2]) < FINAL_WIDTH**2 * variance) & views.mask
+    near = (torch.minimum(*fits.squared[:2]) < _FARTHEST**2 * variance) & views.mask
 
     def cost(squared: Tensor) -> Tensor:
-        whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(FINAL_WIDTH**2)
+        whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(_FARTHEST**2)
         return torch.where(views.mask[:, None], whitened, 0.0).sum(-1)
 
     costs = cost(plane.squared).where(plane.possible, torch.inf)
     excess = costs.amin(-1) - cost(fits.squared[ESSENTIAL][:, None])[:, 0]
-    return excess <= (FINAL_WIDTH**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
+    return excess <= (_FARTHEST**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
 
 
 def pose_of(
