@@ -10,7 +10,7 @@ from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_
 from torch import Tensor
 
 from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
-from torchslam.geometry.motion_models import Fits, PlaneMotions, plane_holds
+from torchslam.geometry.motion_models import Fits, PlaneMotions, goes_both_ways, plane_holds
 from torchslam.geometry.robust import Kernel
 from torchslam.geometry.two_view import TwoViews
 from torchslam.geometry.two_view_essential import (
@@ -100,6 +100,54 @@ def test_noise_with_a_long_tail_is_no_parallax() -> None:
             assert not result.success.any()
 
 
+def along_edges(scene: Scene, seed: int, deviation: float) -> Scene:
+    """The same with more noise along horizontal edges, so many deviations, pixels, of it in either image."""
+    generator = torch.Generator().manual_seed(seed)
+    sides = deviation * torch.randn(2, *scene.mask.shape, generator=generator, dtype=torch.float64)
+    level = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    pixels = (side[..., None] * level for side in sides)
+    return replace(scene, pixels_1=scene.pixels_1 + next(pixels), pixels_2=scene.pixels_2 + next(pixels))
+
+
+def test_noise_along_edges_is_no_parallax() -> None:
+    """It lies along epipolar lines by its size, but on both sides of where a match without parallax is."""
+    for count, deviation in ((400, 1.0), (800, 0.75)):
+        for seed in range(6):
+            turned = two_views(seed, count=count, baseline=0.0, outliers=0.1)
+            result = estimate(along_edges(turned, seed, deviation))
+            assert result.model == ("rotation",)
+            assert not result.success.any()
+
+
+def test_parallax_under_noise_along_edges_counts() -> None:
+    """Where all of it is on one side, as large as the noise or not, it is a motion."""
+    for seed in range(6):
+        scene = two_views(seed, count=400, outliers=0.1, baseline=0.1)
+        result = estimate(along_edges(scene, seed, 1.0))
+        assert result.model == ("essential",)
+        assert result.success.all()
+
+
+@pytest.mark.parametrize(
+    ("moved", "behind", "pixels", "expected"),
+    [(0.4, 0.2, 5.0, True), (0.4, 0.05, 5.0, False), (0.6, 0.2, 5.0, False), (0.4, 0.2, 3.5, False)],
+)
+def test_clear_parallax_on_both_sides_of_a_rotation_is_noise(
+    moved: float, behind: float, pixels: float, expected: bool
+) -> None:
+    """A tenth may lie behind the cameras; all may, where no rotation explains most matches, or within the noise."""
+    generator = torch.Generator().manual_seed(0)
+    pixels_1 = torch.rand(1, 200, 2, generator=generator, dtype=torch.float64) * 160 + 160
+    count = round(200 * moved)
+    side = torch.zeros(200, dtype=torch.float64)
+    side[:count] = torch.where(torch.arange(count) < behind * count, -1.0, 1.0)
+    pixels_2 = pixels_1 + pixels * side[:, None] * torch.tensor([1.0, 0.0], dtype=torch.float64)
+    views = TwoViews.of(pixels_1, pixels_2, CAMERA, CAMERA, 1.0, side.new_ones(1, 200).bool(), None)
+    R, t = torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    fits = Fits(R, t, R, R, side.new_zeros(3, 1, 200)).with_mappings(views)
+    assert bool(goes_both_ways(views, fits, side.new_ones(1))) == expected
+
+
 def test_two_motions_before_a_plane_are_told_apart_by_more_than_noise() -> None:
     """Of eighty matches: a success is right, but for an essential matrix now and then."""
     right, wrong = 0, 0
@@ -142,7 +190,9 @@ def test_parallax_that_no_match_shows_alone_counts(threshold: float) -> None:
     assert sorted(off)[2] < 12
 
 
-@pytest.mark.parametrize(("turn", "holds"), [(0.0, True), (0.5, True), (1.0, False), (2.0, False)])
+@pytest.mark.parametrize(
+    ("turn", "holds"), [(0.0, True), (0.5, True), (1.0, True), (1.5, False), (2.0, False)]
+)
 def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds: bool) -> None:
     """Sixty matches with half a pixel of noise tell directions that are degrees apart."""
     scene = two_views(0, count=60, outliers=0.0, noise=0.5)
@@ -154,6 +204,22 @@ def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds:
     squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1).expand(3, -1, -1)
     fits = Fits(R, t, R + turned[:, :, None] * normal, R, squared).with_mappings(views)
     assert bool(plane_holds(views, fits, PlaneMotions.of(views, fits))) == holds
+
+
+@pytest.mark.parametrize(("beside", "holds"), [(2, True), (3, False)])
+def test_few_matches_far_beside_the_motions_of_a_plane_contradict_it(beside: int, holds: bool) -> None:
+    """Of forty. Each counts as much as three deviations, so three of them are more than the gain of a fit."""
+    scene = two_views(0, count=40)
+    everything = torch.ones(1, 40, dtype=torch.bool)
+    views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 1.0, everything, None)
+    R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3]
+    # Medians of the squares of Gaussian noise of variance one, in one coordinate and, in units of 1.5, in two.
+    level = torch.tensor([0.6745**2, 1.3863 / 2.25, 100.0], dtype=torch.float64)
+    fits = Fits(R, t, R, R, level[:, None, None].expand(3, 1, 40))
+    of_motion = torch.where(torch.arange(40) < beside, 100.0, level[0]).expand(1, 4, 40)
+    possible = torch.ones(1, 4, dtype=torch.bool)
+    four = R[:, None].expand(1, 4, 3, 3), t[:, None].expand(1, 4, 3), t[:, None].expand(1, 4, 3)
+    assert bool(plane_holds(views, fits, PlaneMotions(*four, of_motion, possible))) == holds
 
 
 def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:

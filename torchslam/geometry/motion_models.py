@@ -50,7 +50,8 @@ _CERTAIN, _NOTABLE = 4.0, 1 / 3
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
 _TELLS_MOTIONS = 3.0  # deviations by which one of two motions before a plane has to explain more
-_IN_FRONT = 0.9  # of the matches on a plane, which noise may turn over where it is seen edge on
+# Of the matches on a plane, which noise may turn over where it is seen edge on; and of those with parallax.
+_IN_FRONT = 0.9
 _EXACT = 1 / 16  # units of the noise; only exact matches are far below, and what is left of them is rounding
 
 
@@ -110,13 +111,14 @@ def fit_models(
     return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
 
 
-def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> tuple[Tensor, Tensor]:
+def choose(views: TwoViews, fits: Fits, chance: Tensor, by_noise: bool = False) -> tuple[Tensor, Tensor]:
     """The index of the simplest model that no significant number of matches contradicts, and if a plane is one. (B,)
 
     by_noise: nor all matches together, by where beside it they lie. The noise of keypoints has a long tail, and most of
-    those off a pure rotation are so by a few pixels: had it moved them in any direction, some would be on their lines
+    those off a pure rotation are so by a few pixels: had it moved them in any direction, some would be on their lines.
+    Noise along edges may look so too, but goes both ways, which no motion does
     """
-    essential, homography, rotation = fits.squared
+    mask, (essential, homography, rotation) = views.mask, fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
     # does not touch, show how large it is.
     variance = noise_variance(essential, mask)
@@ -140,7 +142,7 @@ def choose(fits: Fits, mask: Tensor, chance: Tensor, by_noise: bool = False) -> 
 
     off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
     if by_noise:
-        off = off | _leans(fits.squared, mask, variance)
+        off = (off | _leans(fits.squared, mask, variance)) & ~goes_both_ways(views, fits, variance)
         off[1] |= off[0] | contradicted(rotation, homography)  # it is the homography of a plane at infinity
     plane, still = ~off
     return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL)), plane
@@ -164,6 +166,26 @@ def _leans(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
     # One more, that matches far below the noise, whose errors are rounding, are not enough.
     deviation = (0.5 * weight.square().sum(-1) + 1).sqrt()
     return (lean > _NOTABLE * weight.sum(-1)) & (lean > _CERTAIN * deviation)
+
+
+def goes_both_ways(views: TwoViews, fits: Fits, variance: Tensor) -> Tensor:
+    """(B,) whether a rotation explains most matches, and what parallax the essential matrix makes of them is noise.
+
+    The noise of keypoints on edges lies along lines, and where many edges are parallel, along epipolar lines: parallax
+    by its size. But it puts as many matches behind the cameras as before them.
+
+    variance: (B,) of the noise by the essential matrix
+    """
+    variance = variance.clamp_min(_EXACT**2)[:, None]
+    near = views.mask & (fits.squared[ESSENTIAL] < _FARTHEST**2 * variance)
+    still = near & (fits.squared[ROTATION] * TRANSFER_WIDTH**2 < _FARTHEST**2 * variance)
+    mostly = 2 * still.sum(-1) > near.sum(-1)
+    if not bool(mostly.any()):
+        return mostly
+    ahead, parallax = ahead_and_parallax(views, fits.R[:, None], fits.t[:, None])
+    # The noise of both images is in it.
+    clear = near & (parallax[:, 0] > _FARTHEST * (2 * variance).sqrt())
+    return mostly & ((clear & ahead[:, 0]).sum(-1) < _IN_FRONT * clear.sum(-1))
 
 
 class PlaneMotions(NamedTuple):
@@ -195,8 +217,8 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
     """(B,) whether a motion before the plane explains the matches about as well as the essential matrix does.
 
     Few matches, most of which lie near some plane, show their depth by too few others to be no accident. But as motions
-    of a scene with depth the two can be compared by all matches: what the plane's leaves beyond the gain of a fit, it
-    does not know.
+    of a scene with depth the two can be compared by all matches, each up to three deviations: what the plane's leaves
+    beyond the gain of a fit, it does not know.
     """
     # The noise as the plane has it, too: an essential matrix that accident chose shows too little.
     across, both = fits.squared[:2]
@@ -205,15 +227,15 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
         _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask),
     )
     variance = variance.clamp_min(_EXACT**2)[:, None]
-    near = (torch.minimum(*fits.squared[:2]) < FINAL_WIDTH**2 * variance) & views.mask
+    near = (torch.minimum(*fits.squared[:2]) < _FARTHEST**2 * variance) & views.mask
 
     def cost(squared: Tensor) -> Tensor:
-        whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(FINAL_WIDTH**2)
+        whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(_FARTHEST**2)
         return torch.where(views.mask[:, None], whitened, 0.0).sum(-1)
 
     costs = cost(plane.squared).where(plane.possible, torch.inf)
     excess = costs.amin(-1) - cost(fits.squared[ESSENTIAL][:, None])[:, 0]
-    return excess <= (FINAL_WIDTH**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
+    return excess <= (_FARTHEST**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
 
 
 def pose_of(

@@ -88,8 +88,9 @@ def estimate_relative_pose(
                that it explains contradict the simpler one, more of them than accident would bring; or, but with the
                kernel "truncated", all together, by lying beside it along their epipolar lines, or because what it
                explains is an accident, or because no motion before the plane explains the matches as the essential
-               matrix does. Noise of any size has no direction: where the matches do not tell, the simpler one stays.
-               A pure rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
+               matrix does. Noise of any size has no direction, and where that of edges has one, it goes both ways, so
+               that as much of it is behind the cameras: where the matches do not tell, the simpler one stays. A pure
+               rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
     kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
                what contradicts a model, then go by the noise that the matches show, and so does the search from its
                best samples on: the threshold only has to tell wrong ones from right ones. In the search, matches

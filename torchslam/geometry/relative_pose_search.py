@@ -174,7 +174,9 @@ def _essential(views: TwoViews, R: Tensor, t: Tensor) -> _Chosen:
 def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise: bool) -> _Chosen:
     """The model that the matches call for, and its pose. views: in units of the noise (B,), thresholds"""
     mask = views.mask
-    model, flat = choose(fits, mask, chance * noise, by_noise)
+    R_E, t_E = in_front(views, fits.R, fits.t, mask & (fits.squared[ESSENTIAL] < FINAL_WIDTH**2))
+    facing = replace(fits, R=R_E, t=t_E) if by_noise else fits
+    model, flat = choose(views, facing, chance * noise, by_noise)
     simple, plane = model != ESSENTIAL, None
     if bool(simple.any()):
         rough, fits = fits.squared, fits.finished(views, _width(by_noise))
@@ -195,7 +197,6 @@ def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise
                 certain = is_certain(model)
             certain &= (model != HOMOGRAPHY) | plane_holds(views, fits, plane)
             model = torch.where(certain, model, ESSENTIAL)
-    R_E, t_E = in_front(views, fits.R, fits.t, mask & (fits.squared[ESSENTIAL] < FINAL_WIDTH**2))
     if by_noise and not bool((model != ESSENTIAL).any()):
         zero = torch.zeros_like(t_E)
         return _Chosen(R_E, t_E, zero, model, torch.zeros_like(mask[:, 0]), R_E, t_E, fits.squared)
