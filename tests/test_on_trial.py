@@ -15,11 +15,12 @@ from torchslam import SLAM, Frame, State, evaluate, load_config
 from torchslam.front_end import Simulated
 from torchslam.stages import following
 from torchslam.stages.on_trial import OnTrial
-from torchslam.tracking import probation
+from torchslam.tracking import backwards, probation
 from torchslam.tracking.independent_motion import NOTHING
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 DOUBTED = range(22, 34)
+LATE = 15  # the first frame that may begin a world, where one starts late
 SEEN = 46  # frames, until as many were certain as were doubtful
 
 
@@ -127,6 +128,63 @@ def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyP
     assert slam.map.num_keyframes == before
     assert walk.groundtruth is not None
     assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
+
+
+def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
+    """No world may begin before frame `LATE`: what comes before waits for the way back."""
+    beginning = slam._following.beginning
+    step = beginning.step
+    monkeypatch.setattr(beginning, "step", lambda view: "wait" if view.index < LATE else step(view))
+
+
+def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
+    starting_late(monkeypatch, slam)
+    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    shown(slam, walk)
+    assert len(slam.trajectory()) == len(walk)
+    assert int(slam.map.keyframes["frame_index"].min()) < LATE
+    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert walk.groundtruth is not None
+    assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
+
+
+def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
+    starting_late(monkeypatch, slam)
+    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    grown: list[int] = []
+
+    def why_unsound(*_: object) -> str:
+        grown.append(slam.map.num_keyframes)
+        return "off" if len(grown) > LATE // 2 else ""
+
+    monkeypatch.setattr(backwards, "why_unsound", why_unsound)
+    shown(slam, walk)
+    assert grown[-1] > grown[0]
+    first = int(slam.map.keyframes["frame_index"][0])
+    assert first >= LATE
+    assert int(slam.map.keyframes["frame_index"].min()) == first
+    assert int(slam.history.frames["frame_index"].min()) == first
+    assert len(slam.memory.places) == slam.map.num_keyframes
+
+
+def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What was mapped on trial is kept before the way back adds to the map."""
+    walk = Walk(arc(60)[:36])
+    slam = doubting(monkeypatch, range(22, 60))
+    starting_late(monkeypatch, slam)
+    shown(slam, walk)
+    assert slam.youth is not None
+    assert slam.map.num_keyframes > len(slam.memory.places)
+    slam.conclude()
+    assert len(slam.trajectory()) == len(walk)
+    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert int(slam.map.keyframes["frame_index"].min()) < LATE
 
 
 def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,6 +34,15 @@ def exposure_step(grey: np.ndarray, frame: int) -> np.ndarray:
     return (gain * grey).astype(np.uint8)
 
 
+def brighter(gain: float) -> Edit:
+    """Too long an exposure: so many times the light, and what is brighter than white is white."""
+
+    def edit(grey: np.ndarray, _: int) -> np.ndarray:
+        return np.rint(gain * grey.astype(np.float64)).clip(0, WHITE).astype(np.uint8)
+
+    return edit
+
+
 def noise(sigma: float) -> Edit:
     """Gaussian, new in every frame."""
 

@@ -34,7 +34,7 @@ STARTS = {
 }
 LOOKALIKE_CAMERA = "460.8,460.8,255.5,191.5"  # a guess: the focal length is 0.9 widths
 CUTS = {"redkitchen": (20, 190), "machine_hall": (0, 130), "shelf_bin": (0, 50), "kitti07": (0, 160)}
-ON_THE_ROAD = ("vignette", "halfres")  # faults that make a start in a turn of the road harder
+ON_THE_ROAD = ("vignette", "halfres", "blur15", "overexposed")  # faults that make a start on a road harder
 LENDERS = {
     "redkitchen": "machine_hall",
     "machine_hall": "redkitchen",

@@ -214,6 +214,8 @@ def test_light_noise_and_blur() -> None:
     assert (edits.exposure_step(GREY, 40) == GREY // 4).all()
     assert (edits.exposure_step(GREY, 80) == GREY).all()
     assert not edits.black(GREY, 0).any()
+    levels = np.array([0, 20, 85, 86, 255], np.uint8)
+    assert edits.brighter(3.0)(levels, 0).tolist() == [0, 60, 255, 255, 255]
     flat = np.full((200, 200), 128, np.uint8)
     assert edits.noise(25.0)(flat, 3).std() == pytest.approx(25.0, rel=0.03)
     assert (edits.noise(25.0)(flat, 3) != edits.noise(25.0)(flat, 4)).mean() > 0.9

@@ -70,9 +70,9 @@ class Following:
     def conclude(self, frame: int | None) -> None:
         """The last frame has come: what is held back keeps its pose, uncertain as it is."""
         here = self.parts.here
-        self.beginning.settle()
         if here.world is not None:
             self._keep_uncertain(here.world)
+        self.beginning.settle()
         if here.world is not None and frame is not None:
             self.loop_closing.catch_up(here.world, frame, now=True)
 

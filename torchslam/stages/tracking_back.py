@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from torchslam.stages.local_mapping import LocalMapping
+from torchslam.stages.on_trial import OnTrial
 from torchslam.stages.parts import Parts
 from torchslam.tracking.backwards import track_back
+from torchslam.tracking.probation import Held
 from torchslam.tracking.waiting import Waiting
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
@@ -15,6 +17,7 @@ class TrackingBack:
 
     def __init__(self, parts: Parts, mapping: LocalMapping) -> None:
         self.parts, self.mapping = parts, mapping
+        self.on_trial = OnTrial(parts, mapping)
         self.waiting = Waiting(parts.config.initialization.max_waiting)
 
     def from_start(self, world: World) -> None:
@@ -29,12 +32,31 @@ class TrackingBack:
         self.parts.tracker.start_at(behind, view, tracked)
         self._pose(behind, before=view.index)
 
+    def take(self, world: World, view: View, tracked: Tracked) -> None:
+        """A frame on the way is believed."""
+        self.mapping.take(world, view, tracked)
+
+    def try_out(self, world: World, view: View, tracked: Tracked) -> bool:
+        """A frame on the way is held back; whether anything is mapped on trial."""
+        self.on_trial.take(world, view, tracked)
+        return bool(self.on_trial)
+
+    def keep(self, world: World, held: list[Held]) -> None:
+        """What was held back is believed after all."""
+        self.on_trial.keep(world)
+        for view, tracked, T_cr, reference in held:
+            self.parts.tracker.expect(world.map, tracked)
+            self.parts.tracker.vouch(world.map, tracked)
+            world.history.add(view, tracked, T_cr, reference)
+
+    def drop(self, world: World) -> None:
+        """What was held back is not believed."""
+        self.on_trial.take_back(world)
+
     def _pose(self, behind: World, before: int) -> None:
         """Follow the camera back through the frames that wait from before a frame."""
         parts = self.parts
         with parts.clock("backwards"):
             earlier = [view for view in self.waiting if view.index < before]
-            posed = track_back(
-                parts.tracker, behind, reversed(earlier), parts.config.judge, self.mapping.take
-            )
+            posed = track_back(parts.tracker, behind, reversed(earlier), parts.config, self)
         self.waiting.remove(posed)
