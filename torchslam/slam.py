@@ -228,7 +228,7 @@ class SLAM:
     @torch.inference_mode()
     def settle(self) -> None:
         """Believe a young world as it is: the frames from before its start get their poses."""
-        self._following.beginning.settle()
+        self._following.settle()
 
     @torch.inference_mode()
     def conclude(self) -> None:

@@ -76,6 +76,13 @@ class Following:
         if here.world is not None and frame is not None:
             self.loop_closing.catch_up(here.world, frame, now=True)
 
+    def settle(self) -> None:
+        """Believe a young world as it is, with what was mapped on trial: the way back adds to the same map."""
+        world = self.parts.here.world
+        if world is not None and self.beginning.youth is not None:
+            self.on_trial.keep(world)
+        self.beginning.settle()
+
     def _build(self, world: World, view: View, tracked: Tracked, moves: str) -> Outcome:
         """A frame that is believed: map it, look back, let a young world grow, follow the next ones from here.
 
