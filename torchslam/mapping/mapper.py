@@ -88,6 +88,10 @@ class Mapper:
                 self.take_over(slam_map)
         return keyframe
 
+    def may_wait(self, slam_map: Map) -> bool:
+        """Whether the adjustment around a keyframe may be found later: not while each of them moves the whole map."""
+        return self.config.bundle.delay > 0 and slam_map.num_keyframes >= self.config.bundle.window
+
     def take_over(self, slam_map: Map) -> None:
         """Put the map to where the adjustment that was asked for has it."""
         with self.clock("bundle"):

@@ -91,8 +91,7 @@ class Following:
         parts, mapping, closing = self.parts, self.mapping, self.loop_closing
         parts.here.state, recalls = State.TRACKING, closing.count
         is_young = self.beginning.youth is not None
-        # A young map has few keyframes: each adjustment moves all of it, and each frame may be needed as another one.
-        is_later = not is_young and parts.config.bundle.delay > 0
+        is_later = not is_young and parts.mapper.may_wait(world.map)
         why = mapping.take(world, view, tracked, is_later)
         is_keyframe = bool(why)
         if is_keyframe and not mapping.adjusting:
