@@ -120,6 +120,7 @@ def test_eval_prints_a_table_or_json(finished: Path, capsys: pytest.CaptureFixtu
     status, out, _ = run_and_read(capsys, "eval", *files, "--json")
     figures = json.loads((finished / "metrics.json").read_text())
     assert json.loads(out)["ate_m"] == pytest.approx(figures["ate_m"], abs=1e-6)
+    assert run_and_read(capsys, "eval", str(finished), files[1], "--json")[:2] == (0, out)
 
 
 def test_info_says_what_would_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

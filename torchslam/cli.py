@@ -35,7 +35,7 @@ COMMANDS = {
         "demo",
         "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",
     ),
-    "eval": ("evaluate", "compare two trajectory files in TUM format: absolute and relative errors"),
+    "eval": ("evaluate", "compare two trajectories in TUM format: absolute and relative errors"),
     "plot": (
         "plot",
         "draw the pictures of a run and make its view.html again, from the files in its folder of results",

@@ -1,4 +1,4 @@
-"""Compare two trajectory files in TUM format: absolute and relative errors."""
+"""Compare two trajectories in TUM format: absolute and relative errors."""
 
 from __future__ import annotations
 
@@ -9,16 +9,24 @@ from pathlib import Path
 from torchslam.data.trajectory_file import read_trajectory
 from torchslam.evaluation import evaluate
 from torchslam.output.report import accuracy, table
+from torchslam.output.results import TRAJECTORY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("estimate", type=Path, metavar="ESTIMATE", help="estimated trajectory")
+    parser.add_argument(
+        "estimate",
+        type=Path,
+        metavar="ESTIMATE",
+        help="estimated trajectory, or folder that `torchslam run` wrote",
+    )
     parser.add_argument("groundtruth", type=Path, metavar="GROUNDTRUTH", help="true trajectory")
     parser.add_argument("--json", action="store_true", help="print all figures as JSON instead of a table")
 
 
 def execute(options: argparse.Namespace) -> int:
-    estimate, groundtruth = read_trajectory(options.estimate), read_trajectory(options.groundtruth)
+    results: Path = options.estimate
+    estimate = read_trajectory(results / TRAJECTORY if results.is_dir() else results)
+    groundtruth = read_trajectory(options.groundtruth)
     figures = evaluate(estimate, groundtruth).as_dict()
     print(json.dumps(figures, indent=2) if options.json else table(accuracy(figures)))
     return 0

@@ -175,7 +175,7 @@ def _stacked(axes: Axes, frames: list[int], milliseconds: np.ndarray, colors: li
 
 def _stage_bars(axes: Axes, stages: list[str], milliseconds: np.ndarray, colors: list[str]) -> None:
     """A bar per stage: its mean over the frames in which it ran, with the share of frames in words."""
-    axes.set_title("Mean per stage, over the frames in which it ran")
+    axes.set_title("Mean of a stage, where it ran")
     axes.set_xlabel("time (ms)")
     axes.grid(axis="y", visible=False)
     means, labels = [], []
