@@ -115,7 +115,7 @@ class SLAM:
         self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
         self.last_frame = last_frame
         self.tracker.counts = session.mapping
-        self.mapper.adjusting.drop()
+        self.mapper.drop()
         self.memory = Memory(self.camera, self.scaled, self.worlds)
         self.foreign = Foreign(self.camera, self.scaled)
         self.patches = PatchTracking(self.camera, self.scaled)
@@ -233,7 +233,7 @@ class SLAM:
     @torch.inference_mode()
     def conclude(self) -> None:
         """The last frame has come: what is held back keeps its pose, uncertain as it is."""
-        self._following.conclude(None if self.last_frame is None else self.last_frame[0])
+        self._following.conclude()
 
     def _scouts(self, frame: Frame) -> bool:
         """Whether the scout goes before this frame: not where something is known of it already."""

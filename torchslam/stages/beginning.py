@@ -35,6 +35,11 @@ class Beginning:
             self.parts.foreign.stillness.add(self.initializer.still)
             return reason if start is None else self._begin(start, self.initializer.views)
 
+    @property
+    def is_almost_settled(self) -> bool:
+        """Whether the young world that is followed has proved itself with the next frame."""
+        return self.youth is not None and self.youth.age + 1 >= self.settings.min_frames
+
     def grow(self, view: View) -> bool:
         """The world that is followed tracked another frame; whether that shows that it has to be begun anew."""
         if self.youth is None:
@@ -82,6 +87,7 @@ class Beginning:
     def _take_back(self, youth: Youth) -> None:
         """A start that later frames contradict: its frames wait for another one."""
         self.back.waiting.add(*youth.views)
+        self.parts.mapper.drop()
         self.parts.memory.remove(youth.world.map.keys)
         self.worlds.forget(youth.world)
         self.youth = None

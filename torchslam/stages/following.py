@@ -35,7 +35,7 @@ class Following:
     def go_along(self, world: World, frame: Frame, followed: Followed) -> tuple[View, Outcome]:
         """Take over where patches were followed to; nothing is mapped."""
         parts = self.parts
-        self.mapping.begin_adjusting()
+        world = self.loop_closing.go_on(world, frame.index)
         with parts.clock("patches"):
             view, tracked = parts.patches.place(world, frame, parts.session.number, followed)
             parts.tracker.expect(world.map, tracked)
@@ -49,7 +49,7 @@ class Following:
         followed: what its patches said, which is where it is looked for
         """
         parts = self.parts
-        self.mapping.begin_adjusting()
+        world = self.loop_closing.go_on(world, view.index)
         with parts.clock("tracking"):
             T_cw = parts.patches.pose(world, followed)
             if T_cw is not None:
@@ -67,20 +67,20 @@ class Following:
             return self._hold(world, view, tracked, doubt or moves.words * moves.is_doubt)
         return self._build(world, view, tracked, moves.words)
 
-    def conclude(self, frame: int | None) -> None:
+    def conclude(self) -> None:
         """The last frame has come: what is held back keeps its pose, uncertain as it is."""
         here = self.parts.here
         if here.world is not None:
             self._keep_uncertain(here.world)
+            self.loop_closing.catch_up(here.world)
         self.beginning.settle()
-        if here.world is not None and frame is not None:
-            self.loop_closing.catch_up(here.world, frame, now=True)
 
     def settle(self) -> None:
         """Believe a young world as it is, with what was mapped on trial: the way back adds to the same map."""
         world = self.parts.here.world
         if world is not None and self.beginning.youth is not None:
             self.on_trial.keep(world)
+            self.mapping.finish(world)
         self.beginning.settle()
 
     def _build(self, world: World, view: View, tracked: Tracked, moves: str) -> Outcome:
@@ -90,26 +90,33 @@ class Following:
         """
         parts, mapping, closing = self.parts, self.mapping, self.loop_closing
         parts.here.state, recalls = State.TRACKING, closing.count
-        is_young = self.beginning.youth is not None
-        is_later = not is_young and parts.mapper.may_wait(world.map)
-        why = mapping.take(world, view, tracked, is_later)
+        why = mapping.take(world, view, tracked, self._delay(world))
         is_keyframe = bool(why)
-        if is_keyframe and not mapping.adjusting:
+        if is_keyframe and not mapping.is_growing:
             world = closing.look_back(world)
         stays = parts.session.mapping and parts.foreign.stays(world.T_cw, tracked.depth)
         if stays:
-            world = closing.catch_up(world, view.index, now=True)
+            world = closing.catch_up(world)
             drop_covered(world, parts.foreign.stillness.covers)
+        if self.beginning.is_almost_settled:
+            world = closing.catch_up(world)
         if self.beginning.grow(view):
             return Outcome(STARTED_ANEW, parts.here.world, is_keyframe=True)
         is_settled = self.beginning.youth is None and closing.count == recalls
         if parts.patches.is_enabled and is_settled and not stays:
             parts.patches.add(world, view, tracked)
-        if not is_keyframe and not mapping.is_due(view.index):
-            closing.look_ahead(world)
-        world = closing.catch_up(world, view.index)
+        if not is_keyframe:
+            world = closing.catch_up(world, view.index)
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)
+
+    def _delay(self, world: World) -> int | None:
+        """Frames after which a keyframe's adjustment is taken over: before the next one, while the map is small."""
+        parts = self.parts
+        if parts.config.bundle.delay == 0:
+            return None
+        is_small = world.map.num_keyframes < parts.config.bundle.window
+        return 0 if is_small or self.beginning.youth is not None else parts.config.bundle.delay
 
     def _wants_map(self, doubt: str) -> bool:
         """Whether frames that are held back are to be mapped: not what came back and is certain so far."""
@@ -144,7 +151,7 @@ class Following:
 
     def _lose(self, world: World, view: View) -> Outcome:
         """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
-        self.loop_closing.catch_up(world, view.index, now=True)
+        self.loop_closing.catch_up(world)
         self.on_trial.take_back(world)
         self.back.waiting.add(*self.parts.probation.views(), view)
         taken_back = self.beginning.lose()

@@ -1,4 +1,4 @@
-"""A frame that is believed enters its world; a keyframe grows the map."""
+"""A frame that is believed enters its world; a keyframe grows the map, at once or while the next frames are tracked."""
 
 from __future__ import annotations
 
@@ -9,48 +9,52 @@ from torchslam.world.world import World
 
 
 class LocalMapping:
-    """Remembers frames and maps keyframes; what is around one may be adjusted while the next frames are tracked."""
+    """Remembers frames and maps keyframes, one at a time."""
 
     def __init__(self, parts: Parts) -> None:
-        self.parts, self.adjusting = parts, parts.mapper.adjusting
+        self.parts = parts
 
-    def take(self, world: World, view: View, tracked: Tracked, is_later: bool = False) -> str:
+    @property
+    def is_growing(self) -> bool:
+        """Whether something is left to be done for the newest keyframe: there is no other one until it is finished."""
+        return self.parts.mapper.growth is not None
+
+    def take(self, world: World, view: View, tracked: Tracked, delay: int | None = None) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing.
 
-        is_later: what is around a keyframe is adjusted while the next frames are tracked; there is no other until then
+        delay: a keyframe brings new points; what else is left to be done for it is so before the next frame, but for
+               the adjustment, which is taken over so many frames later. None: all is done at once
         """
-        parts, adjusting = self.parts, self.adjusting
+        parts = self.parts
         parts.tracker.expect(world.map, tracked)
         why = why_keyframe(view, tracked, world, parts.config.keyframes) if parts.session.mapping else ""
-        if why and adjusting:
-            adjusting.hurry(view.index)
+        if why and self.is_growing:
+            parts.mapper.hurry(view.index)
             why = ""
         if why:
-            keyframe = parts.mapper.insert(world.map, view, tracked, is_later)
+            keyframe = parts.mapper.insert(world.map, view, tracked, delay or 0)
+            if delay is None:
+                parts.mapper.finish(world.map)
             parts.memory.add(world.map, keyframe)
             parts.tracker.follow(world, keyframe)
         parts.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
-    def begin_adjusting(self) -> None:
-        """What was asked for with the last frame begins: that one was long enough."""
-        if self.adjusting:
-            with self.parts.clock("bundle"):
-                self.adjusting.begin()
+    def go_on(self, world: World, frame: int) -> bool:
+        """Take the next step for the newest keyframe, before a frame is tracked; whether that was the last one."""
+        mapper, growth = self.parts.mapper, self.parts.mapper.growth
+        if growth is None or growth.is_fused:
+            return False
+        mapper.go_on(world.map)
+        is_last = mapper.is_due(frame - 1) and mapper.finish(world.map)
+        self.parts.tracker.follow(world, growth.keyframe)
+        return is_last
 
     def is_due(self, frame: int) -> bool:
-        """Whether what was adjusted is taken over with this frame."""
-        return self.adjusting.is_due(frame)
+        """Whether what is left for the newest keyframe is to be done after this frame."""
+        return self.parts.mapper.is_due(frame)
 
-    def take_over(self, world: World, frame: int, now: bool = False) -> bool:
-        """If it is time, put the map to where the adjustment around the newest keyframe has it; whether it was.
-
-        now: before its time: the map is to change, or the world is left
-        """
-        if now:
-            self.adjusting.hurry(frame)
-        if not self.is_due(frame):
-            return False
-        self.parts.mapper.take_over(world.map)
-        return True
+    def finish(self, world: World) -> bool:
+        """Do all that is left for the newest keyframe: the map is to change. Whether there was anything."""
+        return self.parts.mapper.finish(world.map)

@@ -19,38 +19,40 @@ class LoopClosing:
         """How many places were recognised so far."""
         return len(self.parts.memory.recalls)
 
-    def catch_up(self, world: World, frame: int, now: bool = False) -> World:
-        """Take over the adjustment around the newest keyframe when it is due, or `now`, and look back from there."""
-        return self.look_back(world) if self.mapping.take_over(world, frame, now) else world
+    def go_on(self, world: World, frame: int) -> World:
+        """Take the next step for the newest keyframe, before a frame is tracked; look back if that was the last one."""
+        return self.look_back(world) if self.mapping.go_on(world, frame) else world
 
-    def look_ahead(self, world: World) -> None:
-        """Ask whether the newest keyframe's place looks known while the adjustment around it is waited for.
-
-        Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
-        """
-        memory, keyframe = self.parts.memory, world.map.num_keyframes - 1
-        was_asked = memory.looks_known is not None and memory.looks_known[0] == world.map.key(keyframe)
-        if self.mapping.adjusting and not was_asked:
+    def catch_up(self, world: World, frame: int | None = None) -> World:
+        """Finish the newest keyframe if that is due after a frame, or, without one, now; and look back from there."""
+        looks_new = False
+        if frame is not None:
+            if not self.mapping.is_due(frame):
+                return world
+            # Nearly always it does, and nobody has to ask when the adjustment, which is waited for, is taken over.
             with self.parts.clock("loops"):
-                memory.look_ahead(world, keyframe)
+                looks_new = not self.parts.memory.looks_known(world, world.map.num_keyframes - 1)
+        return self.look_back(world, looks_new) if self.mapping.finish(world) else world
 
-    def look_back(self, world: World) -> World:
+    def look_back(self, world: World, looks_new: bool = False) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.
+
+        looks_new: the place is known not to look like another one
 
         Returns the world that is followed from now on: another one where two were joined.
         """
         recalls = self.count
-        world = self._recall(world)
+        world = self._recall(world, looks_new)
         self._tidy(world)
         if self.count > recalls:
             self.parts.patches.leave()
         return world
 
-    def _recall(self, world: World) -> World:
+    def _recall(self, world: World, looks_new: bool) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
         parts, newest = self.parts, world.map.num_keyframes - 1
         with parts.clock("loops"):
-            found = parts.memory.recognize(world, newest)
+            found = parts.memory.recognize(world, newest, looks_new)
             if found is None:
                 return world
             if not found.is_loop:
