@@ -58,6 +58,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
         "growth": _of_growth(slam.mapper.growth),
+        "looks_known": slam.memory.looks_known,
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
     write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
@@ -137,6 +138,9 @@ def _go_on(
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["growth"] is not None:
         slam.mapper.take_up(world.map, _growth(run["growth"], world.map))
+    if run["looks_known"] is not None:
+        key, looks_known = run["looks_known"]
+        slam.memory.looks_known = int(key), bool(looks_known)
 
 
 def _of_growth(growth: Growth | None) -> dict[str, Any] | None:

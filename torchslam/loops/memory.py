@@ -26,6 +26,7 @@ class Memory:
         self.places = Places()
         self.recognizer = Recognizer(camera, config, worlds, self.places)
         self.recalls: list[Recall] = []  # what was recognised so far, for the record
+        self.looks_known: tuple[int, bool] | None = None  # a keyframe, by key, and what `look_ahead` saw
         for world in worlds:
             for keyframe in range(world.map.num_keyframes):
                 self.add(world.map, keyframe)
@@ -45,19 +46,20 @@ class Memory:
         found = (self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.tries].tolist())
         return [candidate for candidate in found if candidate is not None]
 
-    def looks_known(self, world: World, keyframe: int) -> bool:
-        """Whether a keyframe shows a place that was seen before, by the map as it is; the map is not changed."""
-        return self.config.loops.enabled and self.recognizer.recognize(world, keyframe) is not None
+    def look_ahead(self, world: World, keyframe: int) -> None:
+        """Note whether a keyframe shows a place that was seen before, by the map as it is; the map is not changed."""
+        is_known = self.config.loops.enabled and self.recognizer.recognize(world, keyframe) is not None
+        self.looks_known = world.map.key(keyframe), is_known
 
-    def recognize(self, world: World, keyframe: int, looks_new: bool = False) -> Recognition | None:
+    def recognize(self, world: World, keyframe: int) -> Recognition | None:
         """The place that a keyframe shows, if it was seen before and that is certain.
 
-        Where none is found, what the map knows already of earlier visits is tied to the keyframe.
-
-        looks_new: it was asked before, and none was found
+        Where none is found, or `look_ahead` saw none, what the map knows already of earlier visits is tied to the
+        keyframe.
         """
         if not self.config.loops.enabled:
             return None
+        looks_new = self.looks_known == (world.map.key(keyframe), False)
         found = None if looks_new else self.recognizer.recognize(world, keyframe)
         if found is None:
             sew_on(world, keyframe, self.camera, self.config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,7 @@ from torchslam.geometry import (
     sim3_scale,
     transform,
 )
+from torchslam.geometry.ransac import samples_needed
 from torchslam.solvers import refine_pose
 from torchslam.tracking.correspondences import match_near, match_views, project_points
 from torchslam.tracking.matcher import DescriptorMatcher
@@ -26,6 +28,7 @@ from torchslam.world.map import Map
 _RADIUS_PX = 8.0  # around the projection by a first similarity
 _AROUND = 10  # keyframes whose points are looked for in the other map
 _NEEDED = 12  # inliers of the first similarity that are worth a closer look
+_CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
 _KERNEL_SCALE = 2.0
 WIDER = 2.0  # times the noise: a similarity has its own
 
@@ -149,6 +152,8 @@ def _first_guess(
     if len(rows_1) < _NEEDED:
         return None
     T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
+    # Where this many samples show no similarity that so few matches agree with, there is none.
+    samples = samples_needed(torch.tensor([_NEEDED]), torch.tensor([len(rows_1)]), 3, _CONFIDENCE)
     found = estimate_similarity(
         transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
         transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
@@ -159,6 +164,8 @@ def _first_guess(
         view_1.noise[rows_1].tolerance[None],
         view_2.noise[rows_2].tolerance[None],
         seed=config.seed,
+        confidence=_CONFIDENCE,
+        max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
     )
     if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
         return None

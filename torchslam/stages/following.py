@@ -107,6 +107,8 @@ class Following:
             parts.patches.add(world, view, tracked)
         if not is_keyframe:
             world = closing.catch_up(world, view.index)
+        elif mapping.is_growing:
+            closing.look_ahead(world)
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)
 

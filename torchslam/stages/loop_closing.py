@@ -23,36 +23,37 @@ class LoopClosing:
         """Take the next step for the newest keyframe, before a frame is tracked; look back if that was the last one."""
         return self.look_back(world) if self.mapping.go_on(world, frame) else world
 
+    def look_ahead(self, world: World) -> None:
+        """Ask whether the newest keyframe's place looks known before all is done for it.
+
+        Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
+        """
+        with self.parts.clock("loops"):
+            self.parts.memory.look_ahead(world, world.map.num_keyframes - 1)
+
     def catch_up(self, world: World, frame: int | None = None) -> World:
         """Finish the newest keyframe if that is due after a frame, or, without one, now; and look back from there."""
-        looks_new = False
-        if frame is not None:
-            if not self.mapping.is_due(frame):
-                return world
-            # Nearly always it does, and nobody has to ask when the adjustment, which is waited for, is taken over.
-            with self.parts.clock("loops"):
-                looks_new = not self.parts.memory.looks_known(world, world.map.num_keyframes - 1)
-        return self.look_back(world, looks_new) if self.mapping.finish(world) else world
+        if frame is not None and not self.mapping.is_due(frame):
+            return world
+        return self.look_back(world) if self.mapping.finish(world) else world
 
-    def look_back(self, world: World, looks_new: bool = False) -> World:
+    def look_back(self, world: World) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.
-
-        looks_new: the place is known not to look like another one
 
         Returns the world that is followed from now on: another one where two were joined.
         """
         recalls = self.count
-        world = self._recall(world, looks_new)
+        world = self._recall(world)
         self._tidy(world)
         if self.count > recalls:
             self.parts.patches.leave()
         return world
 
-    def _recall(self, world: World, looks_new: bool) -> World:
+    def _recall(self, world: World) -> World:
         """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
         parts, newest = self.parts, world.map.num_keyframes - 1
         with parts.clock("loops"):
-            found = parts.memory.recognize(world, newest, looks_new)
+            found = parts.memory.recognize(world, newest)
             if found is None:
                 return world
             if not found.is_loop:
