@@ -156,7 +156,8 @@ def _growth(of: dict[str, Any], slam_map: Map) -> Growth:
     neighbours = slam_map.ids(*map(int, of["neighbours"]))
     if len(neighbours) and not 0 <= int(neighbours.min()) <= int(neighbours.max()) < newest:
         raise ValueError(f"the newest keyframe has neighbours beyond {newest}")
-    return Growth(newest, neighbours.long(), int(of["due"]), bool(of["is_fused"]))
+    due = None if of["due"] is None else int(of["due"])
+    return Growth(newest, neighbours.long(), due, bool(of["is_fused"]))
 
 
 def _check_track(track: Track) -> None:

@@ -13,11 +13,11 @@ class Growth:
 
     keyframe:   its row
     neighbours: (k,) rows of the keyframes that shared most points with it when it came, best first
-    due:        the last frame that is tracked before the adjustment around it is taken over
+    due:        the last frame that is tracked before the adjustment around it is taken over; None: the next one is not
     is_fused:   whether its points are merged with those of its neighbours, and the adjustment was begun
     """
 
     keyframe: int
     neighbours: Tensor
-    due: int
+    due: int | None
     is_fused: bool = False

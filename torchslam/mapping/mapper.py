@@ -66,7 +66,7 @@ class Mapper:
     def insert(self, slam_map: Map, view: View, tracked: Tracked, delay: int = 0) -> int:
         """Make a tracked frame a keyframe, with new points; returns its index. `go_on` and `finish` do the rest.
 
-        delay: frames that are tracked before it is due
+        delay: frames that are tracked before the rest is due
         """
         assert self.growth is None  # the map was to stay as it is
         settings = self.config.mapping
@@ -84,7 +84,7 @@ class Mapper:
                 slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
             )
             slam_map.refresh(slam_map.ids(keyframe))
-        self.growth = Growth(keyframe, neighbours, view.index + delay)
+        self.growth = Growth(keyframe, neighbours, view.index + delay if delay else None)
         return keyframe
 
     def go_on(self, slam_map: Map) -> bool:
@@ -103,7 +103,8 @@ class Mapper:
 
     def is_due(self, frame: int) -> bool:
         """Whether the rest is to be done after a frame."""
-        return self.growth is not None and frame >= self.growth.due
+        growth = self.growth
+        return growth is not None and growth.due is not None and frame >= growth.due
 
     def hurry(self, frame: int) -> None:
         """Do the rest after this frame already: the map is to change."""

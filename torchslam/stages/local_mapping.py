@@ -22,8 +22,8 @@ class LocalMapping:
     def take(self, world: World, view: View, tracked: Tracked, delay: int | None = None) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing.
 
-        delay: a keyframe brings new points; what else is left to be done for it is so before the next frame, but for
-               the adjustment, which is taken over so many frames later. None: all is done at once
+        delay: frames that are tracked before the adjustment around a keyframe is taken over; its points are merged with
+               others before the first of them, or, without any, at once. None: all is done at once
         """
         parts = self.parts
         parts.tracker.expect(world.map, tracked)
@@ -35,19 +35,21 @@ class LocalMapping:
             keyframe = parts.mapper.insert(world.map, view, tracked, delay or 0)
             if delay is None:
                 parts.mapper.finish(world.map)
+            elif delay == 0:
+                parts.mapper.go_on(world.map)
             parts.memory.add(world.map, keyframe)
             parts.tracker.follow(world, keyframe)
         parts.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
-    def go_on(self, world: World, frame: int) -> bool:
+    def go_on(self, world: World) -> bool:
         """Take the next step for the newest keyframe, before a frame is tracked; whether that was the last one."""
         mapper, growth = self.parts.mapper, self.parts.mapper.growth
-        if growth is None or growth.is_fused:
+        if growth is None or (growth.is_fused and growth.due is not None):
             return False
         mapper.go_on(world.map)
-        is_last = mapper.is_due(frame - 1) and mapper.finish(world.map)
+        is_last = growth.due is None and mapper.finish(world.map)
         self.parts.tracker.follow(world, growth.keyframe)
         return is_last
 

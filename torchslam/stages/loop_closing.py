@@ -19,9 +19,9 @@ class LoopClosing:
         """How many places were recognised so far."""
         return len(self.parts.memory.recalls)
 
-    def go_on(self, world: World, frame: int) -> World:
+    def go_on(self, world: World) -> World:
         """Take the next step for the newest keyframe, before a frame is tracked; look back if that was the last one."""
-        return self.look_back(world) if self.mapping.go_on(world, frame) else world
+        return self.look_back(world) if self.mapping.go_on(world) else world
 
     def look_ahead(self, world: World) -> None:
         """Ask whether the newest keyframe's place looks known before all is done for it.
