@@ -23,12 +23,10 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.front_end import FrontEnd
 from torchslam.loops.recognition import Recall
-from torchslam.mapping.growth import Growth
 from torchslam.run import Progressed
 from torchslam.session import Session
 from torchslam.slam import SLAM
 from torchslam.values import State, StepResult
-from torchslam.world.map import Map
 from torchslam.world.map_file import Saved, pack, read_tensors, unpack, write_tensors
 from torchslam.world.track import Track
 
@@ -57,7 +55,8 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence:
         "world": world.number,
         "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
         "asked": [each.asked for each in slam.worlds],
-        "growth": _of_growth(slam.mapper.growth),
+        "adjusting": bool(slam.mapper.adjusting),
+        "due": slam.mapper.adjusting.due,
         "looks_known": slam.memory.looks_known,
         "recalls": [astuple(recall) for recall in slam.memory.recalls],
     }
@@ -136,28 +135,11 @@ def _go_on(
     slam.enter(session, world, (int(index), float(timestamp)))
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
-    if run["growth"] is not None:
-        slam.mapper.take_up(world.map, _growth(run["growth"], world.map))
+    if run["adjusting"]:  # of the newest keyframe, around which the map is as it was then
+        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, run["due"] and int(run["due"]))
     if run["looks_known"] is not None:
         key, looks_known = run["looks_known"]
         slam.memory.looks_known = int(key), bool(looks_known)
-
-
-def _of_growth(growth: Growth | None) -> dict[str, Any] | None:
-    """What is left to be done for the newest keyframe."""
-    if growth is None:
-        return None
-    return {"neighbours": growth.neighbours.tolist(), "due": growth.due, "is_fused": growth.is_fused}
-
-
-def _growth(of: dict[str, Any], slam_map: Map) -> Growth:
-    """What `_of_growth` was made of."""
-    newest = slam_map.num_keyframes - 1
-    neighbours = slam_map.ids(*map(int, of["neighbours"]))
-    if len(neighbours) and not 0 <= int(neighbours.min()) <= int(neighbours.max()) < newest:
-        raise ValueError(f"the newest keyframe has neighbours beyond {newest}")
-    due = None if of["due"] is None else int(of["due"])
-    return Growth(newest, neighbours.long(), due, bool(of["is_fused"]))
 
 
 def _check_track(track: Track) -> None:

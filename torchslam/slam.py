@@ -115,7 +115,7 @@ class SLAM:
         self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
         self.last_frame = last_frame
         self.tracker.counts = session.mapping
-        self.mapper.drop()
+        self.mapper.adjusting.drop()
         self.memory = Memory(self.camera, self.scaled, self.worlds)
         self.foreign = Foreign(self.camera, self.scaled)
         self.patches = PatchTracking(self.camera, self.scaled)

@@ -1,9 +1,9 @@
-"""The adjustment around the newest keyframe, while frames go on being tracked: begun now, taken over later."""
+"""The adjustment around the newest keyframe, while frames go on being tracked: asked for now, taken over later."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from torchslam.config import BundleConfig
@@ -28,11 +28,20 @@ def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> An
 
 
 @dataclass(frozen=True)
-class Begun:
-    """What is adjusted, and what waits for the outcome."""
+class Asked:
+    """An adjustment around a keyframe, to be taken over after frame `due`, or, without one, before the next frame."""
 
-    part: Part
-    answer: Answer
+    due: int | None
+    slam_map: Map
+    keyframe: int
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What is adjusted, and what waits for the outcome; neither where there is nothing to adjust."""
+
+    part: Part | None
+    answer: Answer | None
 
 
 class Adjusting:
@@ -45,22 +54,53 @@ class Adjusting:
 
     def __init__(self, camera: Camera, settings: BundleConfig, covariances: bool) -> None:
         self.camera, self.settings, self.covariances = camera, settings, covariances
+        self._asked: Asked | None = None
         self._begun: Begun | None = None
 
-    def begin(self, slam_map: Map, keyframe: int) -> None:
-        """Have the solver begin with what is around a keyframe, if there is anything to adjust."""
-        assert self._begun is None  # the map was to stay as it is
-        part = around(slam_map, keyframe, self.camera, self.settings)
-        if part is not None:
-            find = self.solver
-            self._begun = Begun(part, find(part.problem, self.settings.iterations, self.covariances))
+    def __bool__(self) -> bool:
+        """Whether there is one to be taken over."""
+        return self._asked is not None
+
+    @property
+    def is_due_first(self) -> bool:
+        """Whether the outcome is to be taken over before the next frame is tracked."""
+        return self._asked is not None and self._asked.due is None
+
+    @property
+    def due(self) -> int | None:
+        """The last frame that is tracked before the outcome is taken over; None where no other one is."""
+        return None if self._asked is None else self._asked.due
+
+    def is_due(self, frame: int) -> bool:
+        """Whether the outcome is to be taken over after a frame."""
+        return self.due is not None and frame >= self.due
+
+    def hurry(self, frame: int) -> None:
+        """Take the outcome over after this frame already: the map is to change."""
+        if self._asked is not None:
+            self._asked = replace(self._asked, due=frame)
+
+    def ask(self, slam_map: Map, keyframe: int, due: int | None) -> None:
+        """Have what is around a keyframe adjusted, to be taken over after frame `due`; None: before the next one."""
+        assert self._asked is None  # the map was to stay as it is
+        self._asked = Asked(due, slam_map, keyframe)
+
+    def begin(self) -> None:
+        """Have the solver begin with what was asked for, if it has not: it is all the same when, as the map stays."""
+        if self._asked is None or self._begun is not None:
+            return
+        part = around(self._asked.slam_map, self._asked.keyframe, self.camera, self.settings)
+        find = self.solver
+        answer = None if part is None else find(part.problem, self.settings.iterations, self.covariances)
+        self._begun = Begun(part, answer)
 
     def take_over(self, slam_map: Map) -> None:
-        """Put the map to where it belongs, if an adjustment was begun."""
-        begun, self._begun = self._begun, None
-        if begun is not None:
+        """Put the map to where it belongs, if that was asked for."""
+        self.begin()
+        begun, self._asked, self._begun = self._begun, None, None
+        if begun is not None and begun.part is not None and begun.answer is not None:
             take(slam_map, begun.part, begun.answer(), self.camera)
 
     def drop(self) -> None:
         """The map is gone: nothing is to be taken over."""
-        self._begun = None
+        self._asked = self._begun = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 
 from torchslam.config import Config
@@ -12,7 +10,6 @@ from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_
 from torchslam.mapping.adjusting import Adjusting
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
-from torchslam.mapping.growth import Growth
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.matcher import Matcher
@@ -40,7 +37,6 @@ class Mapper:
         self.config = config
         self.clock = clock
         self.adjusting = Adjusting(camera, config.bundle, config.measurement.gate == "mahalanobis")
-        self.growth: Growth | None = None
         self.matcher = matcher
         self.undistortion = undistortion or Undistortion(camera)
 
@@ -63,12 +59,12 @@ class Mapper:
         slam_map.refresh(slam_map.ids(first, second))
         return first, second
 
-    def insert(self, slam_map: Map, view: View, tracked: Tracked, delay: int = 0) -> int:
-        """Make a tracked frame a keyframe, with new points; returns its index. `go_on` and `finish` do the rest.
+    def insert(self, slam_map: Map, view: View, tracked: Tracked, delay: int | None = None) -> int:
+        """Make a tracked frame a keyframe; returns its index.
 
-        delay: frames that are tracked before the rest is due
+        delay: frames that are tracked before the adjustment around it is taken over, which has to be before the map
+               changes; None: it is at once
         """
-        assert self.growth is None  # the map was to stay as it is
         settings = self.config.mapping
         with self.clock("mapping"):
             keyframe = slam_map.add_keyframe(view.weighed(tracked.keypoints, tracked.weights), tracked.T_cw)
@@ -84,53 +80,21 @@ class Mapper:
                 slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
             )
             slam_map.refresh(slam_map.ids(keyframe))
-        self.growth = Growth(keyframe, neighbours, view.index + delay if delay else None)
-        return keyframe
-
-    def go_on(self, slam_map: Map) -> bool:
-        """Merge what is one point, and have the adjustment begin, if that is left to be done; whether it was."""
-        growth = self.growth
-        if growth is None or growth.is_fused:
-            return False
-        if self.config.mapping.fuse:
-            with self.clock("mapping"):
-                fuse(slam_map, growth.keyframe, growth.neighbours, self.camera, self.config)
+            if settings.fuse:
+                fuse(slam_map, keyframe, neighbours, self.camera, self.config)
         if self.config.bundle.enabled:
             with self.clock("bundle"):
-                self.adjusting.begin(slam_map, growth.keyframe)
-        self.growth = replace(growth, is_fused=True)
-        return True
+                self.adjusting.ask(slam_map, keyframe, view.index + delay if delay else None)
+                if not delay:
+                    self.adjusting.begin()
+            if delay is None:
+                self.take_over(slam_map)
+        return keyframe
 
-    def is_due(self, frame: int) -> bool:
-        """Whether the rest is to be done after a frame."""
-        growth = self.growth
-        return growth is not None and growth.due is not None and frame >= growth.due
-
-    def hurry(self, frame: int) -> None:
-        """Do the rest after this frame already: the map is to change."""
-        if self.growth is not None:
-            self.growth = replace(self.growth, due=frame)
-
-    def finish(self, slam_map: Map) -> bool:
-        """Do what is left for the newest keyframe; whether there was anything."""
-        if self.growth is None:
-            return False
-        self.go_on(slam_map)
+    def take_over(self, slam_map: Map) -> None:
+        """Put the map to where the adjustment that was asked for has it."""
         with self.clock("bundle"):
             self.adjusting.take_over(slam_map)
-        self.growth = None
-        return True
-
-    def take_up(self, slam_map: Map, growth: Growth) -> None:
-        """Go on where another mapper was: around its newest keyframe the map is as that one left it."""
-        self.growth = growth
-        if growth.is_fused and self.config.bundle.enabled:
-            self.adjusting.begin(slam_map, growth.keyframe)
-
-    def drop(self) -> None:
-        """The map is gone: nothing is left to be done for it."""
-        self.growth = None
-        self.adjusting.drop()
 
     def tidy(self, world: World) -> Renumbering | None:
         """Take out what the world can do without: redundant keyframes, rows of dead points; returns where rows went.

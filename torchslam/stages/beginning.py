@@ -37,7 +37,7 @@ class Beginning:
 
     @property
     def is_almost_settled(self) -> bool:
-        """Whether the young world that is followed has proved itself with the next frame."""
+        """Whether the young world that is followed has proved itself with one more frame."""
         return self.youth is not None and self.youth.age + 1 >= self.settings.min_frames
 
     def grow(self, view: View) -> bool:
@@ -87,7 +87,7 @@ class Beginning:
     def _take_back(self, youth: Youth) -> None:
         """A start that later frames contradict: its frames wait for another one."""
         self.back.waiting.add(*youth.views)
-        self.parts.mapper.drop()
+        self.parts.mapper.adjusting.drop()
         self.parts.memory.remove(youth.world.map.keys)
         self.worlds.forget(youth.world)
         self.youth = None

@@ -35,7 +35,7 @@ class Following:
     def go_along(self, world: World, frame: Frame, followed: Followed) -> tuple[View, Outcome]:
         """Take over where patches were followed to; nothing is mapped."""
         parts = self.parts
-        world = self.loop_closing.go_on(world)
+        world = self.loop_closing.begin_adjusting(world)
         with parts.clock("patches"):
             view, tracked = parts.patches.place(world, frame, parts.session.number, followed)
             parts.tracker.expect(world.map, tracked)
@@ -49,7 +49,7 @@ class Following:
         followed: what its patches said, which is where it is looked for
         """
         parts = self.parts
-        world = self.loop_closing.go_on(world)
+        world = self.loop_closing.begin_adjusting(world)
         with parts.clock("tracking"):
             T_cw = parts.patches.pose(world, followed)
             if T_cw is not None:
@@ -80,7 +80,7 @@ class Following:
         world = self.parts.here.world
         if world is not None and self.beginning.youth is not None:
             self.on_trial.keep(world)
-            self.mapping.finish(world)
+            self.mapping.take_over(world)
         self.beginning.settle()
 
     def _build(self, world: World, view: View, tracked: Tracked, moves: str) -> Outcome:
@@ -92,7 +92,7 @@ class Following:
         parts.here.state, recalls = State.TRACKING, closing.count
         why = mapping.take(world, view, tracked, self._delay(world))
         is_keyframe = bool(why)
-        if is_keyframe and not mapping.is_growing:
+        if is_keyframe and not mapping.adjusting:
             world = closing.look_back(world)
         stays = parts.session.mapping and parts.foreign.stays(world.T_cw, tracked.depth)
         if stays:
@@ -105,20 +105,20 @@ class Following:
         is_settled = self.beginning.youth is None and closing.count == recalls
         if parts.patches.is_enabled and is_settled and not stays:
             parts.patches.add(world, view, tracked)
+        if not is_keyframe and not mapping.is_due(view.index):
+            closing.look_ahead(world)
         if not is_keyframe:
             world = closing.catch_up(world, view.index)
-        elif mapping.is_growing:
-            closing.look_ahead(world)
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)
 
     def _delay(self, world: World) -> int | None:
-        """Frames after which a keyframe's adjustment is taken over: before the next one, while the map is small."""
-        parts = self.parts
-        if parts.config.bundle.delay == 0:
+        """Frames that are tracked before a keyframe's adjustment is taken over: none while each moves the whole map."""
+        settings = self.parts.config.bundle
+        if settings.delay == 0:
             return None
-        is_small = world.map.num_keyframes < parts.config.bundle.window
-        return 0 if is_small or self.beginning.youth is not None else parts.config.bundle.delay
+        is_small = world.map.num_keyframes < settings.window
+        return 0 if is_small or self.beginning.youth is not None else settings.delay
 
     def _wants_map(self, doubt: str) -> bool:
         """Whether frames that are held back are to be mapped: not what came back and is certain so far."""

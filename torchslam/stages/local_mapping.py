@@ -1,4 +1,4 @@
-"""A frame that is believed enters its world; a keyframe grows the map, at once or while the next frames are tracked."""
+"""A frame that is believed enters its world; a keyframe grows the map."""
 
 from __future__ import annotations
 
@@ -9,54 +9,52 @@ from torchslam.world.world import World
 
 
 class LocalMapping:
-    """Remembers frames and maps keyframes, one at a time."""
+    """Remembers frames and maps keyframes; what is around one may be adjusted while the next frames are tracked."""
 
     def __init__(self, parts: Parts) -> None:
-        self.parts = parts
-
-    @property
-    def is_growing(self) -> bool:
-        """Whether something is left to be done for the newest keyframe: there is no other one until it is finished."""
-        return self.parts.mapper.growth is not None
+        self.parts, self.adjusting = parts, parts.mapper.adjusting
 
     def take(self, world: World, view: View, tracked: Tracked, delay: int | None = None) -> str:
         """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing.
 
-        delay: frames that are tracked before the adjustment around a keyframe is taken over; its points are merged with
-               others before the first of them, or, without any, at once. None: all is done at once
+        delay: frames that are tracked before the adjustment around a keyframe is taken over, or None as in `insert`;
+               there is no other keyframe until then
         """
-        parts = self.parts
+        parts, adjusting = self.parts, self.adjusting
         parts.tracker.expect(world.map, tracked)
         why = why_keyframe(view, tracked, world, parts.config.keyframes) if parts.session.mapping else ""
-        if why and self.is_growing:
-            parts.mapper.hurry(view.index)
+        if why and adjusting:
+            adjusting.hurry(view.index)
             why = ""
         if why:
-            keyframe = parts.mapper.insert(world.map, view, tracked, delay or 0)
-            if delay is None:
-                parts.mapper.finish(world.map)
-            elif delay == 0:
-                parts.mapper.go_on(world.map)
+            keyframe = parts.mapper.insert(world.map, view, tracked, delay)
             parts.memory.add(world.map, keyframe)
             parts.tracker.follow(world, keyframe)
         parts.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
-    def go_on(self, world: World) -> bool:
-        """Take the next step for the newest keyframe, before a frame is tracked; whether that was the last one."""
-        mapper, growth = self.parts.mapper, self.parts.mapper.growth
-        if growth is None or (growth.is_fused and growth.due is not None):
-            return False
-        mapper.go_on(world.map)
-        is_last = growth.due is None and mapper.finish(world.map)
-        self.parts.tracker.follow(world, growth.keyframe)
-        return is_last
+    def begin_adjusting(self, world: World) -> bool:
+        """Before a frame: what was asked for with the last one begins, or is taken over if due; whether it was."""
+        if self.adjusting.is_due_first:
+            self.parts.mapper.take_over(world.map)
+            self.parts.tracker.follow(world, world.map.num_keyframes - 1)
+            return True
+        if self.adjusting:
+            with self.parts.clock("bundle"):
+                self.adjusting.begin()
+        return False
 
     def is_due(self, frame: int) -> bool:
-        """Whether what is left for the newest keyframe is to be done after this frame."""
-        return self.parts.mapper.is_due(frame)
+        """Whether what was adjusted is taken over with this frame."""
+        return self.adjusting.is_due(frame)
 
-    def finish(self, world: World) -> bool:
-        """Do all that is left for the newest keyframe: the map is to change. Whether there was anything."""
-        return self.parts.mapper.finish(world.map)
+    def take_over(self, world: World, frame: int | None = None) -> bool:
+        """Put the map to where the adjustment around the newest keyframe has it, if it is time; whether it was.
+
+        frame: the one that was tracked; None: before its time, as the map is to change or the world is left
+        """
+        if not self.adjusting or (frame is not None and not self.is_due(frame)):
+            return False
+        self.parts.mapper.take_over(world.map)
+        return True

@@ -19,23 +19,27 @@ class LoopClosing:
         """How many places were recognised so far."""
         return len(self.parts.memory.recalls)
 
-    def go_on(self, world: World) -> World:
-        """Take the next step for the newest keyframe, before a frame is tracked; look back if that was the last one."""
-        return self.look_back(world) if self.mapping.go_on(world) else world
+    def begin_adjusting(self, world: World) -> World:
+        """Before a frame: see to what was asked for with the last one, and look back if that is done."""
+        return self.look_back(world) if self.mapping.begin_adjusting(world) else world
+
+    def catch_up(self, world: World, frame: int | None = None) -> World:
+        """Take over the adjustment around the newest keyframe when it is due after a frame, or, without one, now.
+
+        Then look back from there.
+        """
+        return self.look_back(world) if self.mapping.take_over(world, frame) else world
 
     def look_ahead(self, world: World) -> None:
-        """Ask whether the newest keyframe's place looks known before all is done for it.
+        """Ask whether the newest keyframe's place looks known while the adjustment around it is waited for.
 
         Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
         """
-        with self.parts.clock("loops"):
-            self.parts.memory.look_ahead(world, world.map.num_keyframes - 1)
-
-    def catch_up(self, world: World, frame: int | None = None) -> World:
-        """Finish the newest keyframe if that is due after a frame, or, without one, now; and look back from there."""
-        if frame is not None and not self.mapping.is_due(frame):
-            return world
-        return self.look_back(world) if self.mapping.finish(world) else world
+        memory, keyframe = self.parts.memory, world.map.num_keyframes - 1
+        was_asked = memory.looks_known is not None and memory.looks_known[0] == world.map.key(keyframe)
+        if self.mapping.adjusting and not was_asked:
+            with self.parts.clock("loops"):
+                memory.look_ahead(world, keyframe)
 
     def look_back(self, world: World) -> World:
         """Recognise the newest keyframe's place, and let go of what the map can do without.

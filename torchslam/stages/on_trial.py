@@ -33,10 +33,9 @@ class OnTrial:
         if not parts.session.mapping or not why_keyframe(view, tracked, world, parts.config.keyframes):
             return
         if self._before is None:
-            self.mapping.finish(world)
+            self.mapping.take_over(world)
             self._before = Bookmark.of(world.map), replace(world.track)
         keyframe = parts.mapper.insert(world.map, view, tracked)
-        parts.mapper.finish(world.map)
         parts.tracker.follow(world, keyframe)
 
     def keep(self, world: World) -> None:
