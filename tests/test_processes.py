@@ -140,3 +140,25 @@ def test_a_run_with_more_processes_is_the_same() -> None:
     several = SLAM(sequence.camera, config).run(sequence, processes=3)
     assert [result.reason for result in several.results] == [result.reason for result in alone.results]
     assert torch.equal(several.trajectory.T_wc, alone.trajectory.T_wc)
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]))
+    extract, seen = slam.extractor, []
+    assert extract is not None
+    slam.extractor = lambda frame: (seen.append(frame.image), extract(frame))[1]
+    with helped(sequence, slam, 1):
+        (image,) = seen
+        assert image.shape[-2:] == (sequence.camera.height, sequence.camera.width)
+        assert not image.any()
+    other = SLAM(sequence.camera, CONFIG)
+    other.extractor = None  # would be called
+    with helped(sequence, other, 1):
+        pass
+    own = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]), extractor=OpenCVORB(100))
+    own.extractor = lambda frame: pytest.fail("what somebody else made is shown frames alone")
+    with helped(sequence, own, 1):
+        pass
+    assert slam.last_frame is None

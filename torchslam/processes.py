@@ -52,6 +52,7 @@ def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0
                cannot be; with 3 one adjusts and the others read ahead.
     """
     wanted = best_number(sequence, start) if processes is None else processes
+    slam.warm_up()
     if slam.camera.params.device.type != "cpu":
         if processes is not None and processes > 1:
             print(f"torchslam: one process: the {slam.camera.params.device} does it all", file=sys.stderr)

@@ -226,6 +226,13 @@ class SLAM:
         return History() if world is None else world.history
 
     @torch.inference_mode()
+    def warm_up(self) -> None:
+        """Look at an image without anything in it, so that no frame waits for what ORB and torch make on first use."""
+        if self.extractor is not None and self.config.features.kind == "orb" and not self.has_own_parts:
+            width, height = self.camera.size
+            self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
+
+    @torch.inference_mode()
     def settle(self) -> None:
         """Believe a young world as it is: the frames from before its start get their poses."""
         self._following.settle()
