@@ -73,7 +73,7 @@ class Adjusting:
 
     def is_due(self, frame: int) -> bool:
         """Whether the outcome is to be taken over after a frame."""
-        return self.due is not None and frame >= self.due
+        return self._asked is not None and (self._asked.due is None or frame >= self._asked.due)
 
     def hurry(self, frame: int) -> None:
         """Take the outcome over after this frame already: the map is to change."""

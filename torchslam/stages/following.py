@@ -35,7 +35,7 @@ class Following:
     def go_along(self, world: World, frame: Frame, followed: Followed) -> tuple[View, Outcome]:
         """Take over where patches were followed to; nothing is mapped."""
         parts = self.parts
-        world = self.loop_closing.begin_adjusting(world)
+        self.mapping.begin_adjusting()
         with parts.clock("patches"):
             view, tracked = parts.patches.place(world, frame, parts.session.number, followed)
             parts.tracker.expect(world.map, tracked)
@@ -49,7 +49,8 @@ class Following:
         followed: what its patches said, which is where it is looked for
         """
         parts = self.parts
-        world = self.loop_closing.begin_adjusting(world)
+        self.mapping.begin_adjusting()
+        world = self.loop_closing.catch_up_first(world)
         with parts.clock("tracking"):
             T_cw = parts.patches.pose(world, followed)
             if T_cw is not None:

@@ -34,16 +34,19 @@ class LocalMapping:
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
 
-    def begin_adjusting(self, world: World) -> bool:
-        """Before a frame: what was asked for with the last one begins, or is taken over if due; whether it was."""
-        if self.adjusting.is_due_first:
-            self.parts.mapper.take_over(world.map)
-            self.parts.tracker.follow(world, world.map.num_keyframes - 1)
-            return True
+    def begin_adjusting(self) -> None:
+        """What was asked for with the last frame begins: that one was long enough."""
         if self.adjusting:
             with self.parts.clock("bundle"):
                 self.adjusting.begin()
-        return False
+
+    def take_over_first(self, world: World) -> bool:
+        """Take over what is due before the next frame, from the newest keyframe on; whether there was any."""
+        if not self.adjusting.is_due_first:
+            return False
+        self.parts.mapper.take_over(world.map)
+        self.parts.tracker.follow(world, world.map.num_keyframes - 1)
+        return True
 
     def is_due(self, frame: int) -> bool:
         """Whether what was adjusted is taken over with this frame."""

@@ -19,9 +19,9 @@ class LoopClosing:
         """How many places were recognised so far."""
         return len(self.parts.memory.recalls)
 
-    def begin_adjusting(self, world: World) -> World:
-        """Before a frame: see to what was asked for with the last one, and look back if that is done."""
-        return self.look_back(world) if self.mapping.begin_adjusting(world) else world
+    def catch_up_first(self, world: World) -> World:
+        """As `catch_up`, before a frame is tracked."""
+        return self.look_back(world) if self.mapping.take_over_first(world) else world
 
     def catch_up(self, world: World, frame: int | None = None) -> World:
         """Take over the adjustment around the newest keyframe when it is due after a frame, or, without one, now.
