@@ -18,6 +18,7 @@ from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
 from torchslam.front_end import Simulated
 from torchslam.geometry import Noise, se3_inverse, se3_log, transform
+from torchslam.mapping.adjusting import Adjusting
 from torchslam.mapping.founding import Founder
 from torchslam.stages.finding import FOUND_AGAIN
 from torchslam.stages.following import STARTED_ANEW
@@ -438,7 +439,7 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides]))
     ask, take_over = slam.mapper.adjusting.ask, slam.mapper.adjusting.take_over
 
-    def asking(slam_map: Map, keyframe: int, due: int) -> None:
+    def asking(slam_map: Map, keyframe: int, due: int | None) -> None:
         events.append(("asked", int(slam_map.keyframes["frame_index"][keyframe])))
         ask(slam_map, keyframe, due)
 
@@ -480,6 +481,31 @@ def test_an_adjustment_is_taken_over_after_some_frames_or_before_the_next_keyfra
     rare = asked_and_taken(monkeypatch, walk, "bundle.delay=2", "keyframes.max_translation=0.6")
     waits = [taken - asked for (_, asked), (_, taken) in zip(rare[::2], rare[1::2], strict=False)]
     assert 2 in waits
+
+
+def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
+    begin = Adjusting.begin
+
+    def beginning(self: Adjusting) -> None:
+        if self and self._begun is None:
+            begun.append(self.due)
+        begin(self)
+
+    monkeypatch.setattr(Adjusting, "begin", beginning)
+    for delay in (0, 2):
+        begun.clear()
+        runs.append(run_walk(walk, "bundle.window=1000", f"bundle.delay={delay}"))
+        assert len(begun) > 6
+        assert set(begun) == {None}  # no frame is tracked before
+    at_once, between = runs
+    assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
+    assert torch.equal(at_once.map.positions_w, between.map.positions_w)
+    events = asked_and_taken(monkeypatch, walk, "bundle.window=1000", "bundle.delay=2")
+    assert [what for what, _ in events[:6]] == ["asked", "taken"] * 3
+    assert all(taken == asked + 1 for (_, asked), (_, taken) in zip(events[:6:2], events[1:6:2], strict=True))
 
 
 def test_a_camera_that_is_lost_leaves_no_adjustment_behind(monkeypatch: pytest.MonkeyPatch) -> None:

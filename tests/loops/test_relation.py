@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
-from torchslam.geometry import se3_inverse, sim3_inverse, transform
+from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, transform
+from torchslam.geometry.similarity import Similarity
 from torchslam.loops.relation import (
     Relation,
     agreeing,
@@ -65,6 +68,24 @@ def test_noise_moves_it_a_little(S_21: Tensor) -> None:
     off = transform(relation.S_21, points) - transform(S_21, points)
     assert float(off.norm(dim=-1).median()) < 0.03 * 4.0 * 1.6
     assert relation.forward > 100
+
+
+@pytest.mark.parametrize(("known", "samples"), [(12, 1), (24, 69), (60, 1147), (120, 3000)])
+def test_no_more_samples_are_drawn_than_would_have_found_enough_matches(
+    S_21: Tensor, monkeypatch: pytest.MonkeyPatch, known: int, samples: int
+) -> None:
+    map_1, map_2 = maps(S_21)
+    shared = in_both(map_1, map_2)
+    drawn: list[int] = []
+
+    def estimate(*args: Tensor, **settings: Any) -> Similarity:
+        assert args[0].shape[1] == known
+        drawn.append(settings["max_samples"])
+        return estimate_similarity(*args, **settings)
+
+    monkeypatch.setattr("torchslam.loops.relation.estimate_similarity", estimate)
+    related(thinned(map_1, shared[:known]), map_2)
+    assert drawn == [samples]
 
 
 def test_a_map_is_related_to_itself_by_nothing_at_all() -> None:

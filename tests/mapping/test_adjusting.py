@@ -116,6 +116,23 @@ def test_it_can_be_hurried_or_dropped() -> None:
     check_same(slam_map, shaken())
 
 
+def test_it_may_be_due_before_the_next_frame() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    assert not adjusting.is_due_first
+    adjusting.ask(slam_map, 4, due=12)
+    assert not adjusting.is_due_first
+    adjusting.drop()
+    adjusting.ask(slam_map, 4, due=None)
+    assert adjusting
+    assert adjusting.is_due_first
+    assert adjusting.due is None
+    assert adjusting.is_due(0)  # after whatever frame, at the latest
+    check_same(slam_map, shaken())
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted())
+    assert not adjusting.is_due_first
+
+
 def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
     adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
     slam_map.keyframes["point_ids"][:] = -1
