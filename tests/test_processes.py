@@ -154,7 +154,7 @@ def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
         assert image.shape[-2:] == (sequence.camera.height, sequence.camera.width)
         assert not image.any()
     other = SLAM(sequence.camera, CONFIG)
-    other.extractor = None  # would be called
+    other.extractor = lambda frame: pytest.fail("other front ends are shown frames alone")
     with helped(sequence, other, 1):
         pass
     own = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]), extractor=OpenCVORB(100))

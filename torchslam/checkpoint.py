@@ -136,7 +136,8 @@ def _go_on(
     slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["adjusting"]:  # of the newest keyframe, around which the map is as it was then
-        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, run["due"] and int(run["due"]))
+        due = None if run["due"] is None else int(run["due"])
+        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, due)
     if run["looks_known"] is not None:
         key, looks_known = run["looks_known"]
         slam.memory.looks_known = int(key), bool(looks_known)
