@@ -30,7 +30,8 @@ class OnTrial:
     def take(self, world: World, view: View, tracked: Tracked) -> None:
         """Make a keyframe of a frame that is held back, if one is due."""
         parts = self.parts
-        if not parts.session.mapping or not why_keyframe(view, tracked, world, parts.config.keyframes):
+        settings = parts.config.keyframes
+        if not parts.session.mapping or not why_keyframe(view, tracked, world, settings, is_fragile=True):
             return
         if self._before is None:
             self.mapping.take_over(world)

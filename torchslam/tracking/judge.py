@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from torchslam.geometry import se3_inverse
 from torchslam.geometry.motion import rotation_angle
 from torchslam.values import Tracked
 from torchslam.world.track import Track
+
+NEARLY = 1.5
+"""How much sooner images are nearly strange than strange."""
 
 
 def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, settings: JudgeConfig) -> str:
@@ -50,6 +54,17 @@ def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> str:
     if tracked.coverage < settings.min_coverage:
         return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     return ""
+
+
+def is_nearly_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> bool:
+    """Whether the images of late are strange, or would be by limits that are tighter by half."""
+    tighter = replace(
+        settings,
+        max_error=settings.max_error / NEARLY,
+        min_explained=min(1.0, settings.min_explained * NEARLY),
+        min_coverage=min(1.0, settings.min_coverage * NEARLY),
+    )
+    return bool(why_strange(tracked, track, tighter))
 
 
 def deviations(tracked: Tracked) -> tuple[float, float]:
