@@ -99,8 +99,9 @@ def test_most_frames_are_followed(alone: Run) -> None:
 def test_an_adjustment_is_taken_over_in_its_frame_where_only_patches_are_followed(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = replace(CONFIG.keyframes, dense_until=3, dense_below=0)  # keyframes and points are enough to wait
-    config = replace(CONFIG, bundle=replace(CONFIG.bundle, delay=2), keyframes=few)
+    config = replace(
+        CONFIG, bundle=replace(CONFIG.bundle, window=3, delay=2)
+    )  # few keyframes are enough to wait
     slam, taken = SLAM(sequence.camera, config), []
     go_along = Following.go_along
 

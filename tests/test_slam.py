@@ -233,7 +233,7 @@ def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
     assert worlds[0] == worlds[-1] == 0
     assert len(run.worlds) == 1
     assert sum(len(part) for part in run.online_parts) == len(worlds) > len(run.online)
-    assert ate_apart(run.online_parts, walk.groundtruth) < 0.02  # keyframes are adjusted two frames later
+    assert ate_apart(run.online_parts, walk.groundtruth) < 0.015  # keyframes are adjusted two frames later
     assert len(run.trajectory) == len(walk)
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 
@@ -433,10 +433,6 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
 # --- adjustments that wait -----------------------------------------------------------------------------------
 
 
-FIRM = ("keyframes.dense_until=0", "keyframes.dense_below=0")
-"""No map is so small, and no frame sees so few points, that adjustments are not waited for."""
-
-
 def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
     """When adjustments were asked for and taken over, of worlds that are no longer young."""
     events: list[tuple[str, int]] = []
@@ -469,29 +465,26 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
 def test_an_adjustment_is_taken_over_after_some_frames_or_before_the_next_keyframe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    walk = Walk(arc(80, 6.0)[:41])  # the last frame is no keyframe
+    walk = Walk(arc(80, 6.0)[:40])
     at_once = asked_and_taken(monkeypatch, walk, "bundle.delay=0")
     assert len(at_once) >= 6
     assert {(what, frame) for what, frame in at_once if what == "asked"} == {
         ("asked", frame) for what, frame in at_once if what == "taken"
     }
     for delay in (1, 3):
-        events = asked_and_taken(monkeypatch, walk, f"bundle.delay={delay}", *FIRM)
+        events = asked_and_taken(monkeypatch, walk, f"bundle.delay={delay}")
         kinds = [what for what, _ in events]
         assert kinds[: len(kinds) // 2 * 2] == ["asked", "taken"] * (len(kinds) // 2)  # one after the other
         waits = [taken - asked for (_, asked), (_, taken) in zip(events[::2], events[1::2], strict=False)]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
-    rare = asked_and_taken(monkeypatch, walk, "bundle.delay=2", "keyframes.max_translation=0.6", *FIRM)
+    rare = asked_and_taken(monkeypatch, walk, "bundle.delay=2", "keyframes.max_translation=0.6")
     waits = [taken - asked for (_, asked), (_, taken) in zip(rare[::2], rare[1::2], strict=False)]
     assert 2 in waits
 
 
-@pytest.mark.parametrize(
-    "fragile", ["keyframes.dense_until=1000", "keyframes.dense_below=1000", "judge.min_explained=0.67"]
-)
-def test_where_tracking_is_fragile_it_is_found_between_two_frames_as_if_it_were_at_once(
-    monkeypatch: pytest.MonkeyPatch, fragile: str
+def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
     begin = Adjusting.begin
@@ -504,13 +497,13 @@ def test_where_tracking_is_fragile_it_is_found_between_two_frames_as_if_it_were_
     monkeypatch.setattr(Adjusting, "begin", beginning)
     for delay in (0, 2):
         begun.clear()
-        runs.append(run_walk(walk, *FIRM, fragile, f"bundle.delay={delay}"))
+        runs.append(run_walk(walk, "bundle.window=1000", f"bundle.delay={delay}"))
         assert len(begun) > 6
         assert set(begun) == {None}  # no frame is tracked before
     at_once, between = runs
     assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
     assert torch.equal(at_once.map.positions_w, between.map.positions_w)
-    events = asked_and_taken(monkeypatch, walk, *FIRM, fragile, "bundle.delay=2")
+    events = asked_and_taken(monkeypatch, walk, "bundle.window=1000", "bundle.delay=2")
     assert [what for what, _ in events[:6]] == ["asked", "taken"] * 3
     assert all(taken == asked + 1 for (_, asked), (_, taken) in zip(events[:6:2], events[1:6:2], strict=True))
 

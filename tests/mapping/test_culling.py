@@ -83,7 +83,7 @@ def test_nine_of_ten_points_are_enough(missing: int, covered: bool) -> None:
     assert is_covered(world.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
 
 
-@pytest.mark.parametrize(("degrees", "near"), [(14.0, True), (16.0, False)])
+@pytest.mark.parametrize(("degrees", "near"), [(11.0, True), (13.0, False)])
 def test_a_keyframe_that_looks_elsewhere_stays(degrees: float, near: bool) -> None:
     T_cw = standing(4)
     angle = torch.tensor(degrees).deg2rad().double()
@@ -91,7 +91,7 @@ def test_a_keyframe_that_looks_elsewhere_stays(degrees: float, near: bool) -> No
     assert (which(world_of(T_cw), 2) == [2]) is near
 
 
-@pytest.mark.parametrize(("share", "near"), [(0.12, True), (0.13, False)])
+@pytest.mark.parametrize(("share", "near"), [(0.09, True), (0.12, False)])
 def test_a_keyframe_that_stands_elsewhere_stays(share: float, near: bool) -> None:
     T_cw = standing(4)
     T_cw[2, 0, 3] = share * float(cloud()[:, 2].median())

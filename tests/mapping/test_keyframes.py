@@ -19,21 +19,13 @@ SCENE = Scene.of(100)
 SETTINGS = KeyframesConfig()
 
 
-def why(
-    world: World,
-    T_cw: Tensor,
-    *,
-    index: int = 50,
-    share: float = 1.0,
-    is_fragile: bool = False,
-    **changes: int,
-) -> str:
+def why(world: World, T_cw: Tensor, *, index: int = 50, share: float = 1.0, **changes: int) -> str:
     """Of a frame at T_cw that sees the points of keyframe 0, `share` of what its reference has."""
     settings = load_config(None, [f"keyframes.{name}={value}" for name, value in changes.items()]).keyframes
     seen = world.map.points_seen_by(torch.tensor([0]))
     world.track.reference_size = round(len(seen) / share)
     tracked = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(world, T_cw))
-    return why_keyframe(SCENE.view(index, T_cw), tracked, world, settings, is_fragile)
+    return why_keyframe(SCENE.view(index, T_cw), tracked, world, settings)
 
 
 def depth(world: World, T_cw: Tensor) -> float:
@@ -46,41 +38,28 @@ def test_a_frame_where_a_keyframe_is_adds_nothing() -> None:
     assert why(world, pose()) == ""
 
 
-def test_an_eighth_of_the_depth_is_a_new_place() -> None:
+def test_a_tenth_of_the_depth_is_a_new_place() -> None:
     world = world_in(SCENE, sideways(1))
     step = SETTINGS.max_translation * depth(world, pose())
     assert why(world, pose(0.99 * step)) == ""
-    assert why(world, pose(1.01 * step)) == "moved by 0.13 of the depth of the scene"
-    assert why(world, pose(0, -2.0 * step)) == "moved by 0.25 of the depth of the scene"
+    assert why(world, pose(1.01 * step)) == "moved by 0.10 of the depth of the scene"
+    assert why(world, pose(0, -2.0 * step)) == "moved by 0.20 of the depth of the scene"
 
 
-def test_fifteen_degrees_are_a_new_direction() -> None:
+def test_twelve_degrees_are_a_new_direction() -> None:
     world = world_in(SCENE, sideways(1))
     turn = math.radians(SETTINGS.max_rotation_deg)
     assert why(world, pose(0, 0, 0, 0, 0, 0.99 * turn)) == ""
-    assert why(world, pose(0, 0, 0, 0, 0, 1.1 * turn)) == "turned by 16.5 degrees"
-
-
-@pytest.mark.parametrize(("change", "fragile", "firm"), [(0.78, 0, 0), (0.84, 1, 0), (1.04, 1, 1)])
-def test_where_tracking_is_fragile_four_fifths_of_a_change_suffice(
-    change: float, fragile: int, firm: int
-) -> None:
-    world = world_in(SCENE, sideways(1))
-    step, turn = SETTINGS.max_translation * depth(world, pose()), math.radians(SETTINGS.max_rotation_deg)
-    loss = 1 - SETTINGS.min_overlap
-    for is_fragile, expected in ((True, fragile), (False, firm)):
-        assert bool(why(world, pose(change * step), is_fragile=is_fragile)) == expected
-        assert bool(why(world, pose(0, 0, 0, 0, 0, change * turn), is_fragile=is_fragile)) == expected
-        assert bool(why(world, pose(), share=1 - change * loss, is_fragile=is_fragile)) == expected
+    assert why(world, pose(0, 0, 0, 0, 0, 1.1 * turn)) == "turned by 13.2 degrees"
 
 
 def test_any_keyframe_around_that_is_near_is_enough() -> None:
-    world = world_in(SCENE, sideways(3, step=1.2))
-    assert why(world, sideways(1, start=1.18)[0]) == ""  # beside the second, far from the last
-    assert why(world, sideways(1, start=0.6)[0]).startswith("moved by 0.1")
+    world = world_in(SCENE, sideways(3, step=1.0))
+    assert why(world, sideways(1, start=0.98)[0]) == ""  # beside the second, far from the last
+    assert why(world, sideways(1, start=0.5)[0]).startswith("moved by 0.1")
     turned = pose(0, 0, 0, 0, 0, math.radians(20.0))
     # far from two, and turned away from the third: what it turned by says why
-    assert why(world, turned @ sideways(1, start=1.18)[0]) == "turned by 20.0 degrees"
+    assert why(world, turned @ sideways(1, start=0.98)[0]) == "turned by 20.0 degrees"
 
 
 def test_the_newest_keyframe_counts_wherever_it_is() -> None:
@@ -92,8 +71,8 @@ def test_the_newest_keyframe_counts_wherever_it_is() -> None:
 
 def test_seeing_little_of_the_reference_is_a_reason() -> None:
     world = world_in(SCENE, sideways(1))
-    assert why(world, pose(), share=0.75) == ""
-    assert why(world, pose(), share=0.73).startswith("sees 73% of the points")
+    assert why(world, pose(), share=0.8) == ""
+    assert why(world, pose(), share=0.78).startswith("sees 78% of the points")
     assert why(world, pose(), share=0.3).startswith("sees 30% of the points")
 
 

@@ -13,7 +13,7 @@ from tests.scene import pose
 from tests.world.simulated import tracked_at
 from torchslam.config import JudgeConfig
 from torchslam.geometry import se3_exp
-from torchslam.tracking.judge import NEARLY, deviations, is_nearly_strange, jump, why_doubt
+from torchslam.tracking.judge import deviations, jump, why_doubt
 from torchslam.values import Tracked
 from torchslam.world.track import Track
 
@@ -62,23 +62,6 @@ def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
     assert doubt(seen(), explained=least - 0.01).startswith(
         f"the map explains only {least - 0.01:.0%} of the image"
     )
-
-
-def test_images_are_nearly_strange_by_limits_that_are_tighter_by_half() -> None:
-    def nearly(error: float = 0.0, explained: float = 1.0, coverage: float = 1.0) -> bool:
-        track = replace(Track.nowhere(HERE), error=error, explained=explained)
-        return is_nearly_strange(seen(coverage=coverage), track, SETTINGS)
-
-    assert not nearly()
-    for sign, expected in ((0.01, True), (-0.01, False)):
-        assert nearly(error=SETTINGS.max_error / NEARLY + sign) is expected
-        assert nearly(explained=SETTINGS.min_explained * NEARLY - sign) is expected
-        assert nearly(coverage=SETTINGS.min_coverage * NEARLY - sign) is expected
-    assert nearly(error=9.0)
-    assert nearly(explained=0.0)
-    assert not is_nearly_strange(
-        seen(), Track.nowhere(HERE), replace(SETTINGS, min_coverage=0.9)
-    )  # all is seen
 
 
 def covariance(position: float = 0.0, rotation: float = 0.0) -> Tensor:

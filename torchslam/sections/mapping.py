@@ -11,22 +11,13 @@ from torchslam.settings import Settings, setting
 @dataclass(frozen=True)
 class KeyframesConfig(Settings, section="keyframes"):
     max_translation: float = setting(
-        0.125, "as a share of the median depth of the tracked points", low=0, high=LARGEST
+        0.10, "as a share of the median depth of the tracked points", low=0, high=LARGEST
     )
-    max_rotation_deg: float = setting(15.0, "from the reference keyframe", low=0, high=180)
+    max_rotation_deg: float = setting(12.0, "from the reference keyframe", low=0, high=180)
     min_overlap: float = setting(
-        0.75, "tracked points as a share of the well observed ones of the reference keyframe", low=0, high=1
+        0.8, "tracked points as a share of the well observed ones of the reference keyframe", low=0, high=1
     )
     min_interval: int = setting(0, "frames between two keyframes", low=0, high=MOST)
-    dense_until: int = setting(
-        8,
-        "keyframes of a map until which four fifths of such a change suffice, and adjustments are waited for",
-        low=0,
-        high=MOST,
-    )
-    dense_below: int = setting(
-        100, "tracked points below which it is likewise, as where the judge nearly doubts", low=0, high=MOST
-    )
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ class Following:
         """
         parts, mapping, closing = self.parts, self.mapping, self.loop_closing
         parts.here.state, recalls = State.TRACKING, closing.count
-        why = mapping.take(world, view, tracked, self._delay(world, tracked))
+        why = mapping.take(world, view, tracked, self._delay(world))
         is_keyframe = bool(why)
         if is_keyframe and not mapping.adjusting:
             world = closing.look_back(world)
@@ -113,13 +113,13 @@ class Following:
         why = "; ".join(filter(None, [why, STAYS * stays, moves]))
         return Outcome(why, world, tracked, is_keyframe)
 
-    def _delay(self, world: World, tracked: Tracked) -> int | None:
-        """Frames that are tracked before a keyframe's adjustment is taken over: none while each means a lot."""
-        config = self.parts.config
-        if config.bundle.delay == 0:
+    def _delay(self, world: World) -> int | None:
+        """Frames that are tracked before a keyframe's adjustment is taken over: none while each moves the whole map."""
+        settings = self.parts.config.bundle
+        if settings.delay == 0:
             return None
-        is_fragile = self.mapping.is_fragile(world, tracked) or self.beginning.youth is not None
-        return 0 if is_fragile else config.bundle.delay
+        is_small = world.map.num_keyframes < settings.window
+        return 0 if is_small or self.beginning.youth is not None else settings.delay
 
     def _wants_map(self, doubt: str) -> bool:
         """Whether frames that are held back are to be mapped: not what came back and is certain so far."""

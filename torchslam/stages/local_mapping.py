@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torchslam.mapping.keyframes import why_keyframe
 from torchslam.stages.parts import Parts
-from torchslam.tracking.judge import is_nearly_strange
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
 
@@ -23,10 +22,7 @@ class LocalMapping:
         """
         parts, adjusting = self.parts, self.adjusting
         parts.tracker.expect(world.map, tracked)
-        why = ""
-        if parts.session.mapping:
-            is_fragile = self.is_fragile(world, tracked)
-            why = why_keyframe(view, tracked, world, parts.config.keyframes, is_fragile)
+        why = why_keyframe(view, tracked, world, parts.config.keyframes) if parts.session.mapping else ""
         if why and adjusting:
             adjusting.hurry(view.index)
             why = ""
@@ -37,16 +33,6 @@ class LocalMapping:
         parts.tracker.vouch(world.map, tracked)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return why
-
-    def is_fragile(self, world: World, tracked: Tracked) -> bool:
-        """Whether each keyframe is a large part of what the next frames are tracked by.
-
-        So it is in a small map, where few points are tracked, and where the images nearly are not what the map expects.
-        """
-        settings = self.parts.config.keyframes
-        if world.map.num_keyframes < settings.dense_until or tracked.inliers < settings.dense_below:
-            return True
-        return is_nearly_strange(tracked, world.track, self.parts.config.judge)
 
     def begin_adjusting(self) -> None:
         """What was asked for with the last frame begins: that one was long enough."""

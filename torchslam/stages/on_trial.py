@@ -30,8 +30,7 @@ class OnTrial:
     def take(self, world: World, view: View, tracked: Tracked) -> None:
         """Make a keyframe of a frame that is held back, if one is due."""
         parts = self.parts
-        settings = parts.config.keyframes
-        if not parts.session.mapping or not why_keyframe(view, tracked, world, settings, is_fragile=True):
+        if not parts.session.mapping or not why_keyframe(view, tracked, world, parts.config.keyframes):
             return
         if self._before is None:
             self.mapping.take_over(world)

@@ -13,9 +13,6 @@ from torchslam.geometry.motion import rotation_angle
 from torchslam.values import Tracked
 from torchslam.world.track import Track
 
-NEARLY = 1.5
-"""How much sooner images are nearly strange than strange."""
-
 
 def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, settings: JudgeConfig) -> str:
     """Why a pose should not be built on, in words; empty when it may be.
@@ -44,23 +41,15 @@ def why_unsound(tracked: Tracked, predicted_T_cw: Tensor | None, settings: Judge
     return ""
 
 
-def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig, sooner: float = 1.0) -> str:
-    """Why the images of late are not what the map leads to expect; empty when they are.
-
-    sooner: by what factor the limits are tighter
-    """
-    if sooner * track.error > settings.max_error:
+def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> str:
+    """Why the images of late are not what the map leads to expect; empty when they are."""
+    if track.error > settings.max_error:
         return f"the matches of the last frames are off by {track.error**0.5:.1f} times their noise in the median"
-    if track.explained < min(1.0, sooner * settings.min_explained):
+    if track.explained < settings.min_explained:
         return f"the map explains only {track.explained:.0%} of the image"
-    if tracked.coverage < min(1.0, sooner * settings.min_coverage):
+    if tracked.coverage < settings.min_coverage:
         return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     return ""
-
-
-def is_nearly_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> bool:
-    """Whether the images of late are strange, or would be by limits that are tighter by half."""
-    return bool(why_strange(tracked, track, settings, NEARLY))
 
 
 def deviations(tracked: Tracked) -> tuple[float, float]:
