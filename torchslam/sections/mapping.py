@@ -54,7 +54,7 @@ class LoopsConfig(Settings, section="loops"):
         high=LARGEST,
     )
     max_drift_deg: float = setting(20.0, "likewise, of the rotation", above=0, high=180)
-    max_drift_scale: float = setting(2.0, "likewise, of the scale, as a factor", low=1, high=LARGEST)
+    max_drift_scale: float = setting(5.0, "likewise, of the scale, as a factor", low=1, high=LARGEST)
     adjust: bool = setting(True, "the whole map after a loop was closed or worlds were joined")
 
 
