@@ -246,20 +246,36 @@ class Map:
     def shared(self, keyframes: Tensor) -> Tensor:
         """(k, K) how many points each of keyframes (k,) shares with every other one; none with itself."""
         table, count = self.keyframes["point_ids"][keyframes], self.num_keyframes
-        row, keypoint = torch.nonzero(table >= 0, as_tuple=True)
-        which, places = self._index_of_points.of(table[row, keypoint])
-        pairs = row[which] * count + places // self._keypoints
-        shared = torch.bincount(pairs, minlength=len(keyframes) * count).view(-1, count)
-        return shared.scatter_(1, keyframes[:, None], 0)
+        ids = torch.nonzero(torch.bincount(table[table >= 0]))[:, 0]
+        which, places = self._index_of_points.of(ids)
+        observers = places // self._keypoints
+        takes_part = torch.bincount(observers, minlength=count) > 0
+        takes_part[keyframes] = True
+        columns, column = torch.nonzero(takes_part)[:, 0], takes_part.cumsum(0) - 1
+        width = len(columns)
+        cells = which * width + column[observers]
+        sees = torch.bincount(cells, minlength=len(ids) * width).view(len(ids), width).float()
+        shared = (sees[:, column[keyframes]].T @ sees).long()  # exact: far below 2**24
+        return (
+            shared.new_zeros(len(keyframes), count)
+            .index_copy_(1, columns, shared)
+            .scatter_(1, keyframes[:, None], 0)
+        )
 
     def covisible(self, keyframe: int, count: int, min_shared: int = MIN_SHARED) -> Tensor:
         """(<= count,) keyframes that share most points with this one, best first, itself excluded."""
-        return most(self.shared(self.ids(keyframe))[0], count, min_shared)
+        row = self.keyframes["point_ids"][keyframe]
+        shared = self.observers(row[row >= 0])
+        shared[keyframe] = 0
+        return most(shared, count, min_shared)
 
     def around(self, keyframes: Tensor, count: int) -> Tensor:
         """(n,) keyframes (k,) and those that share most points with each of them, `count` at most, ascending."""
-        near = [most(shared, count, MIN_SHARED) for shared in self.shared(keyframes)]
-        return torch.unique(torch.cat([keyframes, *near]))
+        shared = self.shared(keyframes)
+        columns = torch.nonzero((shared >= MIN_SHARED).any(0))[:, 0]
+        ranked = torch.sort(shared[:, columns], dim=1, descending=True, stable=True)
+        is_near = ranked.values[:, :count] >= MIN_SHARED
+        return torch.unique(torch.cat([keyframes, columns[ranked.indices[:, :count][is_near]]]))
 
     def sees(self, keyframes: Tensor, point_ids: Tensor) -> Tensor:
         """(k, n) whether keyframes (k,) observe distinct points (n,)."""
