@@ -156,6 +156,8 @@ TRIALS: dict[str, Trial] = {
         for seed in SEEDS
     },
     "loop/storey": Trial(partial(frames, STOREY)),
+    "loop/storey_3": Trial(partial(frames, f"{STOREY}&seed=3")),
+    "loop/storey_8": Trial(partial(frames, f"{STOREY}&seed=8")),
     "loop/storey_open": Trial(partial(frames, STOREY), ("loops.enabled=false",)),
     "loop/corridors": Trial(partial(frames, "synthetic:corridors")),
     "loop/lookalike": Trial(lookalike),
