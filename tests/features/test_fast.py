@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchslam.features import brief, fast
+from torchslam.features import brief
+from torchslam.features import pieces as in_pieces
 from torchslam.features.fast import CIRCLE, fast_scores, find_peaks, patch_scores
 
 
@@ -30,10 +31,13 @@ def test_scores_are_the_best_arc_of_nine(height: int, width: int, seed: int) -> 
 
 def test_pieces_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     pixels = torch.from_numpy(noise(40, 50, 3)).flatten()
+    floor = torch.full_like(pixels, 10)
     scores, blurred = fast_scores(pixels, 50), brief.blur(pixels, 50)
-    monkeypatch.setattr(fast, "PIECE", 333)
-    monkeypatch.setattr(brief, "PIECE", 333)
+    peaks = find_peaks(scores, floor, 50)
+    assert 10 < peaks.sum() < 500
+    monkeypatch.setattr(in_pieces, "PIECE", 333)
     assert torch.equal(fast_scores(pixels, 50), scores)
+    assert torch.equal(find_peaks(scores, floor, 50), peaks)
     assert torch.equal(brief.blur(pixels, 50), blurred)
 
 
@@ -82,3 +86,16 @@ def test_peaks_exceed_the_floor() -> None:
     scores[2, 2], scores[6, 6] = 10, 20
     peaks = find_peaks(scores.flatten(), torch.full((81,), 10, dtype=torch.uint8), 9)
     assert peaks.nonzero().flatten().tolist() == [6 * 9 + 6]
+
+
+@given(st.integers(0, 50), st.integers(0, 2000), st.integers(1, 400))
+@settings(max_examples=50, deadline=None)
+def test_pieces_make_up_the_whole(start: int, count: int, most: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(in_pieces, "PIECE", most)
+        parts = in_pieces.pieces(torch.zeros(0), start, start + count)
+    assert [row for first, length in parts for row in range(first, first + length)] == list(
+        range(start, start + count)
+    )
+    assert all(0 < length <= most for _, length in parts)
+    assert len(parts) == -(-count // most)

@@ -11,10 +11,10 @@ from torch import Tensor
 from torchslam.features.bits import pack_bits
 from torchslam.features.corners import gather_patches
 from torchslam.features.pattern import PATTERN
+from torchslam.features.pieces import pieces
 
 RADIUS = 15
 BLUR_RADIUS = 3
-PIECE = 1 << 18  # pixels blurred at once: their sums stay in the cache
 ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 
 
@@ -46,18 +46,16 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
     pixels: (P,) uint8. Returns (P - 6 stride - 6,) int16, 256 times the blurred value less 2^15: entry i belongs to
     pixel i + BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
     """
-    # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
-    signed = (pixels ^ 128).view(torch.int8)
     margin = 2 * BLUR_RADIUS * (stride + 1)
-    count = pixels.shape[0] - margin
-    pieces = []
-    for start in range(0, count, PIECE):
-        smooth = signed.narrow(0, start, min(PIECE, count - start) + margin).to(torch.int16)
+    blurred = []
+    for start, count in pieces(pixels, 0, pixels.shape[0] - margin):
+        # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
+        smooth = (pixels.narrow(0, start, count + margin) ^ 128).view(torch.int8).to(torch.int16)
         for shift in (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride):
             length = smooth.shape[0] - shift
             smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
-        pieces.append(smooth)
-    return torch.cat(pieces)
+        blurred.append(smooth)
+    return torch.cat(blurred)
 
 
 @lru_cache(maxsize=16)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+
+from torchslam.features.pieces import pieces
 
 # The circle of radius 3, (dx, dy), clockwise from the top.
 CIRCLE = (
     (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
-
-PIECE = 1 << 18  # pixels worked on at once: few calls, and the intermediate results stay in the cache
 
 Extremum = Callable[..., Tensor]
 Opposites = Callable[[Extremum, int, int], tuple[Tensor, Tensor]]
@@ -29,18 +28,11 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
     score exceeds t.
     """
     margin = 3 * stride + 3
-    count = pixels.shape[0] - 2 * margin
-    if count <= 0:
+    if pixels.shape[0] <= 2 * margin:
         return torch.zeros_like(pixels)
-    piece = (
-        count if torch.compiler.is_compiling() else PIECE
-    )  # a compiled function has no intermediate results
-    pieces = [
-        _piece_scores(pixels, stride, start, min(piece, margin + count - start))
-        for start in range(margin, margin + count, piece)
-    ]
     rim = pixels.new_zeros(margin)
-    return torch.cat([rim, *pieces, rim])
+    inner = pieces(pixels, margin, pixels.shape[0] - margin)
+    return torch.cat([rim, *(_piece_scores(pixels, stride, *piece) for piece in inner), rim])
 
 
 def _piece_scores(pixels: Tensor, stride: int, start: int, count: int) -> Tensor:
@@ -106,13 +98,19 @@ def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     scores, floor: (P,) uint8, flattened with row length `stride`. Returns (P,) bool, False on the margins.
     """
     margin = stride + 1
-    count = scores.shape[0] - 2 * margin
-    if count <= 0:
+    if scores.shape[0] <= 2 * margin:
         return torch.zeros_like(scores, dtype=torch.bool)
-    left, middle, right = (scores[k : scores.shape[0] - 2 + k] for k in range(3))
-    rows = _onto(torch.maximum(left, right), torch.maximum, middle)  # rows[i] covers columns i, i+1, i+2
+    rim = torch.zeros(margin, dtype=torch.bool, device=scores.device)
+    inner = pieces(scores, margin, scores.shape[0] - margin)
+    return torch.cat([rim, *(_piece_peaks(scores, floor, stride, *piece) for piece in inner), rim])
+
+
+def _piece_peaks(scores: Tensor, floor: Tensor, stride: int, start: int, count: int) -> Tensor:
+    """`find_peaks` of `count` pixels from `start` on."""
+    left, middle, right = (scores.narrow(0, start - stride + k, count + 2 * stride) for k in (-1, 0, 1))
+    rows = _onto(torch.maximum(left, right), torch.maximum, middle)  # rows[i] covers columns i-1, i, i+1
     before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
     after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
-    before = _onto(before, torch.maximum, floor.narrow(0, margin, count))
+    before = _onto(before, torch.maximum, floor.narrow(0, start, count))
     centre = middle.narrow(0, stride, count)
-    return F.pad((centre > before) & (centre >= after), (margin, margin))
+    return (centre > before).logical_and_(centre >= after)
