@@ -74,13 +74,19 @@ def sign_products(descriptors_1: Tensor, descriptors_2: Tensor, amplitude: int) 
     sums stay below 2^24.
     """
     signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
-    if not _fast_int8(descriptors_1.device) or 0 in (*signs_1.shape, *signs_2.shape):
-        return signs_1.float() @ signs_2.float().mT
-    batch = signs_1.shape[:-2]
-    pairs = zip(
-        signs_1.reshape(-1, *signs_1.shape[-2:]), signs_2.reshape(-1, *signs_2.shape[-2:]), strict=True
-    )
-    products = [torch._int_mm(left, right.mT) for left, right in pairs]
+    return int8_product(signs_1, signs_2.mT)
+
+
+def int8_product(left: Tensor, right: Tensor) -> Tensor:
+    """left @ right of int8 matrices (..., M, K) and (..., K, N).
+
+    int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
+    """
+    if not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
+        return left.float() @ right.float()
+    batch = left.shape[:-2]
+    pairs = zip(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]), strict=True)
+    products = [torch._int_mm(*pair) for pair in pairs]
     stacked = products[0] if len(products) == 1 else torch.stack(products)
     return stacked.view(*batch, *products[0].shape)
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchslam.features.bits import pack_bits
+from torchslam.features.bits import int8_product, pack_bits
 from torchslam.features.corners import gather_patches
 from torchslam.features.pattern import PATTERN
 from torchslam.features.pieces import pieces
@@ -20,11 +20,11 @@ ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle 
 
 @lru_cache(maxsize=8)
 def _moment_weights(device: torch.device) -> Tensor:
-    """(2, side^2) float32: x and y of each pixel of the patch within the disk of RADIUS, else 0."""
+    """(2, side^2) int8: x and y of each pixel of the patch within the disk of RADIUS, else 0; they sum to 0."""
     axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
-    return torch.stack([x * disk, y * disk]).flatten(1).to(device)
+    return torch.stack([x * disk, y * disk]).flatten(1).to(device, torch.int8)
 
 
 def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
@@ -33,9 +33,9 @@ def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
     pixels: (P,) uint8 flattened atlas; positions: (N,) int64 into it. Returns (N,) float32 radians in [-pi, pi],
     from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
     """
-    patches = gather_patches(pixels, positions, stride, RADIUS)
-    # This order of factors is much faster than (N, side^2) @ (side^2, 2) on the CPU.
-    x, y = _moment_weights(pixels.device) @ patches.flatten(1).to(torch.float32).T
+    patches = gather_patches(pixels, positions, stride, RADIUS).flatten(1)
+    # As int8: what is subtracted is the same everywhere, and has no moment. The other order of factors is slower.
+    x, y = int8_product(_moment_weights(pixels.device), (patches ^ 128).view(torch.int8).mT)
     # In float64, as vectorised float32 may differ in the last bit from one position in memory to another.
     return torch.atan2(y.double(), x.double()).float()
 
@@ -47,15 +47,18 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
     pixel i + BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
     """
     margin = 2 * BLUR_RADIUS * (stride + 1)
-    blurred = []
-    for start, count in pieces(pixels, 0, pixels.shape[0] - margin):
+    blurred = pixels.new_empty(max(0, pixels.shape[0] - margin), dtype=torch.int16)
+    *shifts, last = (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride)
+    for start, count in pieces(pixels, 0, len(blurred)):
         # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
         smooth = (pixels.narrow(0, start, count + margin) ^ 128).view(torch.int8).to(torch.int16)
-        for shift in (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride):
+        for shift in shifts:
             length = smooth.shape[0] - shift
             smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
-        blurred.append(smooth)
-    return torch.cat(blurred)
+        torch.add(
+            smooth.narrow(0, last, count), smooth.narrow(0, 0, count), out=blurred.narrow(0, start, count)
+        )
+    return blurred
 
 
 @lru_cache(maxsize=16)
@@ -78,7 +81,7 @@ def sample_rotated(
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)
-    samples = rotated_offsets(points, stride, blurred.device).index_select(0, bins) + origins[:, None]
+    samples = rotated_offsets(points, stride, blurred.device).index_select(0, bins).add_(origins[:, None])
     return blurred.index_select(0, samples.view(-1)).view(samples.shape)
 
 

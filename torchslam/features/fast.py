@@ -30,9 +30,10 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
     margin = 3 * stride + 3
     if pixels.shape[0] <= 2 * margin:
         return torch.zeros_like(pixels)
-    rim = pixels.new_zeros(margin)
-    inner = pieces(pixels, margin, pixels.shape[0] - margin)
-    return torch.cat([rim, *(_piece_scores(pixels, stride, *piece) for piece in inner), rim])
+    scores = _with_rim(pixels, margin)
+    for start, count in pieces(pixels, margin, pixels.shape[0] - margin):
+        scores.narrow(0, start, count).copy_(_piece_scores(pixels, stride, start, count))
+    return scores
 
 
 def _piece_scores(pixels: Tensor, stride: int, start: int, count: int) -> Tensor:
@@ -92,6 +93,13 @@ def _onto(values: Tensor, function: Callable[..., Tensor], others: Tensor) -> Te
     return function(values, others, out=None if values.is_floating_point() else values)
 
 
+def _with_rim(values: Tensor, margin: int) -> Tensor:
+    """Memory for as many bytes as there are values; zero at both ends."""
+    empty = torch.empty_like(values, dtype=torch.uint8)
+    empty[:margin] = empty[-margin:] = 0
+    return empty
+
+
 def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     """True where a score exceeds its floor and its eight neighbours; of equal neighbours the first wins.
 
@@ -100,9 +108,10 @@ def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     margin = stride + 1
     if scores.shape[0] <= 2 * margin:
         return torch.zeros_like(scores, dtype=torch.bool)
-    rim = torch.zeros(margin, dtype=torch.bool, device=scores.device)
-    inner = pieces(scores, margin, scores.shape[0] - margin)
-    return torch.cat([rim, *(_piece_peaks(scores, floor, stride, *piece) for piece in inner), rim])
+    peaks = _with_rim(scores, margin)
+    for start, count in pieces(scores, margin, scores.shape[0] - margin):
+        peaks.narrow(0, start, count).copy_(_piece_peaks(scores, floor, stride, start, count))
+    return peaks.view(torch.bool)
 
 
 def _piece_peaks(scores: Tensor, floor: Tensor, stride: int, start: int, count: int) -> Tensor:

@@ -155,15 +155,17 @@ class ORB(nn.Module):
     def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int) -> Tensor:
         """(K,) where corners are: peaks of the scores above a floor, which is lower in images that offer few."""
         positions = true_indices(find_peaks(scores, floor, stride))
-        faint = self._is_weak(positions // (len(scores) // batch), batch)
+        images = _images_of(positions, len(scores), batch)
+        faint = self._are_few(torch.ones_like(positions, dtype=torch.bool), images, batch)
         if self.low_threshold <= FAINT or not bool(faint.any()):
             return positions
         lower = torch.where(faint[:, None] & (floor.view(batch, -1) < NEVER), FAINT, floor.view(batch, -1))
         return true_indices(find_peaks(scores, lower.flatten(), stride))
 
-    def _is_weak(self, images: Tensor, batch: int) -> Tensor:
-        """(batch,) whether an image has few of some corners, given the image (K,) of each."""
-        return torch.bincount(images, minlength=batch) < SPARSE * self.num_keypoints
+    def _are_few(self, corners: Tensor, images: Tensor, batch: int) -> Tensor:
+        """(batch,) whether an image has few of some corners, a mask (K,), given the image (K,) of each."""
+        count = corners.sum()[None] if batch == 1 else torch.bincount(images[corners], minlength=batch)
+        return count < SPARSE * self.num_keypoints
 
     def _choose(
         self, pixels: Tensor, scores: Tensor, positions: Tensor, grid: Grid, stride: int
@@ -171,12 +173,12 @@ class ORB(nn.Module):
         """Out of all corners those to keep: positions, rows of the flattened (B, num_keypoints) table, strengths."""
         area, num_cells = grid.table.shape[0], grid.levels.shape[0]
         batch = pixels.shape[0] // area
-        image = positions // area
+        image = _images_of(positions, len(scores), batch)
         cell = grid.table.index_select(0, positions - image * area).to(torch.int64)
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
         best = best_of_cells(image * num_cells + cell, fast, batch * num_cells)
-        strong |= self._is_weak(image[strong | best], batch).index_select(0, image)
+        strong |= self._are_few(strong | best, image, batch).index_select(0, image)
         if self.ranking == "fast":  # the whole part of what they compete by
             needed = best | (
                 strong & contend(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
@@ -207,6 +209,11 @@ class ORB(nn.Module):
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
         return soft_peak(fast), _stand_out(fast)
+
+
+def _images_of(positions: Tensor, pixels: int, batch: int) -> Tensor:
+    """(K,) which of `batch` images positions (K,) in their flattened atlases, of so many pixels together, are in."""
+    return torch.zeros_like(positions) if batch == 1 else positions // (pixels // batch)
 
 
 def _stand_out(fast: Tensor) -> Tensor:

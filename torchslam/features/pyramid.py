@@ -59,7 +59,7 @@ def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:
 
     images: (B, 1, H, W) in [0, 1]. Returns one (B, 1, h, w) per level; cutting off what follows the point rounds.
     """
-    levels = [images * 255 + 0.5]
+    levels = [(images * 255).add_(0.5)]
     for size in atlas.sizes[1:]:
         levels.append(F.interpolate(levels[-1], size=size, mode="bilinear", align_corners=False))
     return levels
