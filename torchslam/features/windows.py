@@ -37,8 +37,10 @@ def window_pairs(
     right = torch.where((bands <= high[..., None]) & mask[..., None], right, left)
     run, place = expand_runs(left.flatten(), right.flatten())
     row, column = torch.div(run, spans, rounding_mode="floor"), order.index_select(0, place)
-    off = keypoints.flatten(0, 1).index_select(0, column) - pixels.flatten(0, 1).index_select(0, row)
-    near = torch.nonzero(off.square_().sum(1) <= radius.flatten().square().index_select(0, row))[:, 0]
+    columns, rows = keypoints.flatten(0, 1).unbind(1), pixels.flatten(0, 1).unbind(1)
+    off_x, off_y = (columns[k].index_select(0, column) - rows[k].index_select(0, row) for k in (0, 1))
+    squared = off_x.square_().add_(off_y.square_())
+    near = torch.nonzero(squared <= radius.flatten().square().index_select(0, row))[:, 0]
     return row.index_select(0, near), column.index_select(0, near)
 
 

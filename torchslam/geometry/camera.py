@@ -256,7 +256,7 @@ class Camera:
         safe = torch.where(valid[..., None], points_c, 1.0)
         normalized = safe[..., :2] / safe[..., 2:]
         if self.model != "pinhole":
-            radius = normalized.detach().norm(dim=-1)
+            radius = distortion.length(normalized.detach())
             valid = valid & (self._distortion.coordinate(radius) < self.limit[..., None])
         return torch.where(valid[..., None], normalized, 0.0), valid
 

@@ -71,6 +71,13 @@ def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
     return -_beside(d * x - b * y, a * y - c * x) / determinant[..., None]
 
 
+def length(xy: Tensor) -> Tensor:
+    """Of vectors (..., 2) -> (...), not to be differentiated at zero: many times as fast as `norm` where each coordinate
+    is in one piece of memory."""
+    x, y = xy.unbind(-1)
+    return (x * x + y * y).sqrt()
+
+
 def _beside(*columns: Tensor) -> Tensor:
     """(..., n) of n tensors (...), each in one piece of memory: whoever reads or writes one of them streams."""
     return torch.stack(columns).movedim(0, -1)
@@ -142,20 +149,19 @@ def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
 
 def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
     with torch.no_grad():
-        xy = distorted / distorted.norm(dim=-1, keepdim=True).clamp_min(1.0)  # no start far outside
+        xy = distorted / length(distorted)[..., None].clamp_min(1.0)  # no start far outside
         edge = torch.where(torch.isfinite(limit), 0.999 * limit, 1e3)[..., None]
         for _ in range(_NEWTON_STEPS):
             step = _implicit_step(_radial_tangential_slope(xy, k), _radial_tangential(xy, k) - distorted)
             xy = xy + step
-            radius = xy.norm(dim=-1, keepdim=True)
-            xy = xy * (edge / radius.clamp_min(1e-12)).clamp_max(1.0)
+            xy = xy * (edge / length(xy)[..., None].clamp_min(1e-12)).clamp_max(1.0)
             if _converged(step):
                 break
     if not needs_gradient(distorted, k):
         return xy
     slope = _radial_tangential_slope(xy, k.detach())
     step = _implicit_step(slope, _radial_tangential(xy, k) - distorted)
-    clamped = xy.norm(dim=-1, keepdim=True) >= edge * (1 - 1e-9)
+    clamped = length(xy)[..., None] >= edge * (1 - 1e-9)
     return xy + torch.where(clamped, 0.0, first_order(step - step.detach()))
 
 

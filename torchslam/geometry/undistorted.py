@@ -74,9 +74,9 @@ class Undistortion:
         last = self._size - 1
         at = (pixels.mT / self._step).round_().clamp_(torch.zeros_like(last), last)
         node = (at[1] * self._size[0] + at[0]).long()
-        xy, slope, inverse = (column.index_select(-1, node) for column in self._table)
+        xy, slope, inverse = self._table.index_select(0, node).mT.contiguous().split((2, 4, 4))
         off = torch.addcmul(pixels.mT, at, self._step, value=-1)
-        return Undistorted(xy + (inverse * off[:, None]).sum(0), slope)
+        return Undistorted(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
 
     def normalize(self, pixels: Tensor) -> Tensor:
         """As `Camera.normalize`, from the table. (..., 2) -> (..., 2)."""
@@ -96,8 +96,8 @@ class Undistortion:
         return (self.camera.params.new_tensor(self.camera.size)[:, None] / self._step).ceil() + 1
 
     @cached_property
-    def _table(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the nodes, row by row: xy (2, n), slope (2, 2, n) and its inverse, d xy / d pixel, (2, 2, n)."""
+    def _table(self) -> Tensor:
+        """(n, 10) of the nodes, row by row: xy, slope and its inverse, d xy / d pixel."""
         columns, rows = (torch.arange(int(count), device=self._step.device) for count in self._size)
         nodes = torch.cartesian_prod(rows, columns).flip(1) * self._step
         exact = Undistorted.of(nodes, self.camera)
@@ -108,4 +108,5 @@ class Undistortion:
         projected, valid = self.camera.project(ray)
         is_within = valid & (failed == 0) & ((projected - nodes).abs().amax(1) < 0.1)
         inverse = torch.where(is_within[:, None, None], inverse, 0.0)
-        return exact.xy, exact.slope, inverse.permute(2, 1, 0).contiguous()
+        inverse = inverse.permute(2, 1, 0)
+        return torch.cat((exact.xy, exact.slope.flatten(0, 1), inverse.flatten(0, 1))).mT.contiguous()

@@ -52,6 +52,7 @@ class Localizer:
     ) -> Tracked | None:
         """The pose by the first of several sets of matches that gives one, refined against the local points (n,).
 
+        local_points:  ascending
         expected_T_cw: (4, 4) where it is looked for first; None where nobody knows
 
         Where too few of the matches agree with a pose, the next sets are heard too, and most inliers win.
@@ -124,7 +125,7 @@ class Localizer:
 
     def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
         """The local points, or those around what was matched where that is elsewhere in the map."""
-        if len(local_points) and bool(torch.isin(point_ids, local_points).all()):
+        if len(local_points) and _are_among(point_ids, local_points):
             return local_points
         return slam_map.points_seen_by(self.around(slam_map, point_ids))
 
@@ -203,3 +204,9 @@ def weights_of(pairs: Pairs, guided: Pairs, keypoints: int) -> Tensor | None:
     weights = pairs.weights.new_zeros(keypoints).index_put((pairs.second,), pairs.weights)
     is_same = points[guided.second] == guided.first
     return torch.where(is_same, weights[guided.second], pairs.weights.median())
+
+
+def _are_among(ids: Tensor, ascending: Tensor) -> bool:
+    """Whether ids (n,) are all among others (m,), at least one; `isin` would sort them, which they are."""
+    at = torch.searchsorted(ascending, ids).clamp_(max=len(ascending) - 1)
+    return bool((ascending.index_select(0, at) == ids).all())
