@@ -131,6 +131,26 @@ def test_no_more_than_a_few_frames_are_asked_for() -> None:
         assert sorted(frames._asked) == [*range(12, 20)]
 
 
+@pytest.mark.usefixtures("patient")
+def test_what_comes_after_the_first_frame_is_read_while_the_run_is_prepared() -> None:
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+        frames.begin(5)
+        assert sorted(frames._asked) == [*range(6, 14)]
+        assert frames[5].features is None
+        assert sorted(frames._asked) == [*range(6, 14)]
+        assert frames[6].features is not None
+
+
+def test_a_process_that_has_not_started_is_asked_for_nothing(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.worker.starts_at_once", lambda: False)
+    with ahead(sequence) as frames:
+        frames.begin(0)
+        assert frames._asked == {}
+        assert frames._next is None  # so that it still may be
+
+
 def test_a_process_that_has_not_started_is_not_waited_for(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in (Ahead, LiveAhead, Scouting, Beside):
         monkeypatch.setattr(kind, "__enter__", lambda self: self)
         monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
+    monkeypatch.setattr(Ahead, "begin", lambda self, start: None)
 
 
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
@@ -162,3 +163,16 @@ def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
     with helped(sequence, own, 1):
         pass
     assert slam.last_frame is None
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_the_first_frame_that_is_tracked_does_not_wait_for_a_table() -> None:
+    sequence = room(20)
+    width, height = sequence.camera.size
+    slam = SLAM(
+        Camera.fisheye(150, 150, width / 2, height / 2, 0.02, -0.01, 0, 0, size=(width, height)), CONFIG
+    )
+    undistorted = slam.tracker.localizer.undistorted
+    assert "_table" not in vars(undistorted)
+    with helped(sequence, slam, 1):
+        assert "_table" in vars(undistorted)

@@ -57,6 +57,11 @@ class Ahead:
         for worker in self._workers:
             worker.end()
 
+    def begin(self, start: int) -> None:
+        """Ask for the frames after the first one, which is read here, if everybody is there already."""
+        if all(worker.is_there() for worker in self._workers):
+            self._ask(start)
+
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError where it cannot be read or does not fit the camera."""
         self._ask(index)

@@ -66,6 +66,9 @@ def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0
         if slam.mapping and wanted > (1 if ahead is None else 2):
             slam.mapper.adjusting.solver = others.enter_context(Beside(slam.camera))
             others.callback(setattr, slam.mapper.adjusting, "solver", solve_here)
+        if isinstance(ahead, Ahead):
+            ahead.begin(start)
+        slam.prepare()  # while others read
         yield frames
 
 

@@ -233,6 +233,11 @@ class SLAM:
             self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
 
     @torch.inference_mode()
+    def prepare(self) -> None:
+        """Make what is looked up of the camera at every frame, so that the first one that is tracked does not wait."""
+        self.tracker.localizer.undistorted.prepare()
+
+    @torch.inference_mode()
     def settle(self) -> None:
         """Believe a young world as it is: the frames from before its start get their poses."""
         self._following.settle()

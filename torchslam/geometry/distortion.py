@@ -72,8 +72,10 @@ def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
 
 
 def length(xy: Tensor) -> Tensor:
-    """Of vectors (..., 2) -> (...), not to be differentiated at zero: many times as fast as `norm` where each coordinate
-    is in one piece of memory."""
+    """Of vectors (..., 2) -> (...), not to be differentiated at zero.
+
+    Many times as fast as `norm` where each coordinate is in one piece of memory.
+    """
     x, y = xy.unbind(-1)
     return (x * x + y * y).sqrt()
 

@@ -61,7 +61,7 @@ class Undistortion:
     """Undistorts the keypoints of one camera, frame by frame, without iterations: from the nearest node of a table and
     the slope there, to a hundredth of a pixel, two towards the edge of a fisheye.
 
-    The table is made when first asked for.
+    The table is made when first asked for, or by `prepare`.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -77,6 +77,11 @@ class Undistortion:
         xy, slope, inverse = self._table.index_select(0, node).mT.contiguous().split((2, 4, 4))
         off = torch.addcmul(pixels.mT, at, self._step, value=-1)
         return Undistorted(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
+
+    def prepare(self) -> None:
+        """Make the table, so that nobody waits for it later."""
+        if self.camera.model != "pinhole":
+            _ = self._table
 
     def normalize(self, pixels: Tensor) -> Tensor:
         """As `Camera.normalize`, from the table. (..., 2) -> (..., 2)."""
