@@ -12,16 +12,9 @@ from torchslam.features.selection import (
     plan_grid,
     ranks_within,
     spread,
-    true_indices,
 )
 
 CPU = torch.device("cpu")
-
-
-@given(st.lists(st.booleans(), max_size=60))
-def test_true_indices_are_those_of_nonzero(values: list[bool]) -> None:
-    mask = torch.tensor(values, dtype=torch.bool)
-    assert torch.equal(true_indices(mask), mask.nonzero().squeeze(1))
 
 
 @given(st.lists(st.integers(0, 3), max_size=30))

@@ -15,7 +15,8 @@ from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
 from torchslam.features.fast import fast_scores, find_peaks, patch_scores
 from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
-from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread, true_indices
+from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread
+from torchslam.ids import true_indices
 from torchslam.values import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding

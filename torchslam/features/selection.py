@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -73,13 +72,6 @@ def _level_budgets(num_keypoints: int, atlas: Atlas, border: int) -> list[int]:
         return [0] * len(shares)
     edges = [round(num_keypoints * sum(shares[:k]) / total) for k in range(len(shares) + 1)]
     return [after - before for before, after in pairwise(edges)]
-
-
-def true_indices(mask: Tensor) -> Tensor:
-    """Positions (K,) int64 where a flat boolean mask is true, ascending."""
-    if mask.is_cpu:  # where few are true numpy takes half the time
-        return torch.from_numpy(np.flatnonzero(mask.numpy()))
-    return mask.nonzero().squeeze(1)
 
 
 def ranks_within(groups: Tensor, num_groups: int) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
+from torchslam.ids import distinct, is_among, ranks_among
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.solvers.schur import Marginals
@@ -102,17 +103,17 @@ def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part 
     """The free keyframes (k,), what they see, and the fixed ones that see some of it; None where that is nothing."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
-    seen = select(seen, torch.isin(seen.point_index, slam_map.points_seen_by(free)))
-    _, which, counts = torch.unique(seen.point_index, return_inverse=True, return_counts=True)
-    seen = select(seen, counts[which] >= 2)
+    seen = select(seen, is_among(seen.point_index, slam_map.points_seen_by(free)))
+    which = ranks_among(seen.point_index, distinct(seen.point_index))
+    seen = select(seen, torch.bincount(which)[which] >= 2)
     if len(seen) == 0:
         return None
-    point_ids, point_index = torch.unique(seen.point_index, return_inverse=True)
+    point_ids = distinct(seen.point_index)
     problem = BundleProblem(
         slam_map.T_cw[keyframes],
         slam_map.positions_w[point_ids],
         torch.searchsorted(keyframes, seen.keyframe_index),
-        point_index,
+        ranks_among(seen.point_index, point_ids),
         seen.pixels,
         camera,
         weights=seen.noise.weights,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchslam.ids import is_among
 from torchslam.tracking.correspondences import Projected
 from torchslam.values import View
 from torchslam.world.map import Map
@@ -87,7 +88,7 @@ def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, 
     cell = cells(expected.pixels[old], size)
     count = CELLS[0] * CELLS[1]
     wanted = torch.bincount(cell, minlength=count)
-    found = torch.bincount(cell[torch.isin(expected.ids[old], seen)], minlength=count)
+    found = torch.bincount(cell[is_among(expected.ids[old], seen)], minlength=count)
     asked = wanted >= 2
     if int(asked.sum()) < LEAST_ASKED:
         return 1.0

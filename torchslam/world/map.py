@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Noise, se3_inverse
+from torchslam.ids import distinct, ranks_among
 from torchslam.solvers import Marginals
 from torchslam.values import Features, Observations, View
 from torchslam.world.observers import Observers, first_of_each, most
@@ -290,7 +291,7 @@ class Map:
     def points_seen_by(self, keyframes: Tensor) -> Tensor:
         """(n,) ids of the points that at least one of the keyframes (k,) observes, ascending."""
         table = self.keyframes["point_ids"][keyframes].flatten()
-        return torch.unique(table[table >= 0])
+        return distinct(table[table >= 0])
 
     def append(self, other: Map) -> tuple[int, int]:
         """Add all keyframes and points of another map, in the same world frame; returns how far their rows moved."""
@@ -371,7 +372,8 @@ class Map:
         seen = self.observations(torch.sort(keyframes).values)  # the newest keyframe comes last and wins
         if len(seen) == 0:
             return
-        ids, which = torch.unique(seen.point_index, return_inverse=True)
+        ids = distinct(seen.point_index)
+        which = ranks_among(seen.point_index, ids)
         rows = torch.arange(len(seen), device=keyframes.device)
         row = torch.zeros_like(ids).scatter_reduce(0, which, rows, "amax", include_self=False)
         keyframe, keypoint = seen.keyframe_index[row], seen.keypoint_index[row]
