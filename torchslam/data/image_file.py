@@ -15,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from torchslam import regular_file
+from torchslam.data import png
 from torchslam.errors import FrameError
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
@@ -64,6 +65,8 @@ def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
     whole image."""
     if not data or _promised_pixels(data) > MAX_PIXELS:
         return None
+    if flags == AS_GREY and (grey := png.decode_grey(data)) is not None:
+        return grey
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
