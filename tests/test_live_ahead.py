@@ -79,6 +79,7 @@ def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LiveAhea
             continue
         frame = reader[index]
         assert frame.index == index
+        assert frame.waiting == 7 - index  # also with one of them taken from the source before its turn
         assert frame.image.shape[-1] == SIZE[0]  # for those who want it
         found.append(frame.features is not None)
         if frame.features is not None:

@@ -49,7 +49,7 @@ class LiveAhead(WithWorker):
         if self._is_sent:
             frame = self._with_features(frame)
         self._look_ahead(index + 1)
-        return frame
+        return replace(frame, waiting=self._sequence.waiting + (self._next is not None))
 
     def _with_features(self, frame: Frame) -> Frame:
         self._is_sent = False

@@ -29,6 +29,7 @@ class Frame:
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
     features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
     followed:  what following its image by patches gave, where that was tried already
+    waiting:   frames of a live source that have come after it: so far behind its camera is who works on it
     """
 
     index: int
@@ -39,6 +40,7 @@ class Frame:
     mask: Tensor | None = None
     features: Features | None = None
     followed: Followed | None = None
+    waiting: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ class View:
     session:     which run over the same map saw it, from 0
     information: (N, I) as in `Noise`: what the front end says of the keypoints' errors; nothing if left out
     image:       (1, 1, H, W) grey, where a matcher wants it
+    waiting:     frames that have come after it, as in `Frame`
     """
 
     index: int
@@ -131,6 +134,7 @@ class View:
     session: int = 0
     information: Tensor = field(default_factory=lambda: torch.zeros(0))
     image: Tensor | None = None
+    waiting: int = 0
 
     def __post_init__(self) -> None:
         _nothing_said(self)
@@ -151,6 +155,7 @@ class View:
             features.mask[0],
             None if truth is None else truth.to(like),
             information=packed_information(information, scales)[0].to(like.dtype),
+            waiting=frame.waiting,
         )
 
     @property

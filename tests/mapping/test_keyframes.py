@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -19,13 +20,16 @@ SCENE = Scene.of(100)
 SETTINGS = KeyframesConfig()
 
 
-def why(world: World, T_cw: Tensor, *, index: int = 50, share: float = 1.0, **changes: int) -> str:
+def why(
+    world: World, T_cw: Tensor, *, index: int = 50, share: float = 1.0, waiting: int = 0, **changes: int
+) -> str:
     """Of a frame at T_cw that sees the points of keyframe 0, `share` of what its reference has."""
     settings = load_config(None, [f"keyframes.{name}={value}" for name, value in changes.items()]).keyframes
     seen = world.map.points_seen_by(torch.tensor([0]))
     world.track.reference_size = round(len(seen) / share)
     tracked = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(world, T_cw))
-    return why_keyframe(SCENE.view(index, T_cw), tracked, world, settings)
+    view = replace(SCENE.view(index, T_cw), waiting=waiting)
+    return why_keyframe(view, tracked, world, settings)
 
 
 def depth(world: World, T_cw: Tensor) -> float:
@@ -100,3 +104,12 @@ def test_how_far_cameras_are_apart() -> None:
     translation, rotation = apart(here, there, torch.tensor(4.0).double())
     assert translation.tolist() == pytest.approx([0.25, 0.0])
     assert rotation.tolist() == pytest.approx([0.0, math.degrees(0.3)], abs=1e-6)
+
+
+def test_a_live_camera_that_is_ahead_puts_a_keyframe_off_while_enough_is_seen() -> None:
+    world = world_in(SCENE, sideways(1))
+    far, age = pose(2.0 * SETTINGS.max_translation * depth(world, pose())), 3
+    assert why(world, far, index=age, waiting=age) != ""
+    assert why(world, far, index=age, waiting=age + 1) == ""
+    assert why(world, far, index=age, waiting=age + 1, share=0.38) != ""
+    assert why(world, far, index=age, waiting=age + 1, share=0.42) == ""

@@ -174,6 +174,7 @@ class Sequence(ABC):
             T_cw_groundtruth=self.pose(index),
             mask=self.mask(index),
             features=self.features(index),
+            waiting=self.waiting,
         )
 
     def __iter__(self) -> Iterator[Frame]:

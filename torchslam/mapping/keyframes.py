@@ -9,6 +9,10 @@ from torchslam.geometry.motion import apart
 from torchslam.values import Tracked, View
 from torchslam.world.world import World
 
+ENOUGH_OVERLAP = 0.4
+"""Above it a keyframe is put off for as many frames as a live camera is ahead, since what waits too long is dropped;
+half of the default `min_overlap`, so that tracking stays safe."""
+
 
 def why_keyframe(view: View, tracked: Tracked, world: World, settings: KeyframesConfig) -> str:
     """Why a tracked frame should become a keyframe, in words; empty when it should not.
@@ -19,12 +23,12 @@ def why_keyframe(view: View, tracked: Tracked, world: World, settings: Keyframes
     slam_map, track = world.map, world.track
     newest = slam_map.num_keyframes - 1
     age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
-    if age < max(1, settings.min_interval):
+    overlap = tracked.inliers / max(track.reference_size, 1)
+    if age < max(1, settings.min_interval) or (age < view.waiting and overlap > ENOUGH_OVERLAP):
         return ""
     around = torch.cat([track.local_keyframes, track.local_keyframes.new_tensor([newest])])
     translation, rotation = apart(tracked.T_cw, slam_map.T_cw[around], tracked.depth)
     has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
-    overlap = tracked.inliers / max(track.reference_size, 1)
     if bool((has_moved | has_turned).all()):
         if bool(has_moved.all()):
             return f"moved by {float(translation.min()):.2f} of the depth of the scene"
