@@ -241,6 +241,7 @@ class Map:
             timestamp=float(row["timestamp"]),
             session=int(row["session"]),
             image=self.images.get(self.key(keyframe)) if self.images else None,
+            waiting=0,
             **{name: row[name] for name in names},
         )
 
