@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchslam.features import brief
+from torchslam.features import brief, fast
 from torchslam.features import pieces as in_pieces
 from torchslam.features.fast import CIRCLE, fast_scores, find_peaks, patch_scores
 
@@ -39,6 +39,20 @@ def test_pieces_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(fast_scores(pixels, 50), scores)
     assert torch.equal(find_peaks(scores, floor, 50), peaks)
     assert torch.equal(brief.blur(pixels, 50), blurred)
+
+
+@pytest.mark.parametrize("height", [12, 40])
+def test_numpy_makes_no_difference(monkeypatch: pytest.MonkeyPatch, height: int) -> None:
+    pixels, floor = torch.from_numpy(noise(height, 50, 4)).flatten(), torch.full((50 * height,), 10).byte()
+    scores = fast_scores(pixels, 50)
+    found = scores, find_peaks(scores, floor, 50), brief.blur(pixels, 50)
+    for module in (fast, brief):
+        monkeypatch.setattr(module, "on_host", lambda values: values)  # as on a GPU
+    for expected, by_torch in zip(
+        found, (fast_scores(pixels, 50), find_peaks(scores, floor, 50), brief.blur(pixels, 50)), strict=True
+    ):
+        assert expected.dtype == by_torch.dtype
+        assert torch.equal(expected, by_torch)
 
 
 def test_corners_are_those_of_opencv() -> None:
@@ -93,9 +107,13 @@ def test_peaks_exceed_the_floor() -> None:
 def test_pieces_make_up_the_whole(start: int, count: int, most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(in_pieces, "PIECE", most)
-        parts = in_pieces.pieces(torch.zeros(0), start, start + count)
+        parts = in_pieces.pieces(np.zeros(0), start, start + count)
     assert [row for first, length in parts for row in range(first, first + length)] == list(
         range(start, start + count)
     )
     assert all(0 < length <= most for _, length in parts)
     assert len(parts) == -(-count // most)
+
+
+def test_elsewhere_than_on_the_host_there_is_one_piece() -> None:
+    assert in_pieces.pieces(torch.zeros(0), 3, 10**6) == [(3, 10**6 - 3)]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchslam.features.bits import int8_product, pack_bits
 from torchslam.features.corners import gather_patches
 from torchslam.features.pattern import PATTERN
-from torchslam.features.pieces import pieces
+from torchslam.features.pieces import library_of, on_host, pieces
 
 RADIUS = 15
 BLUR_RADIUS = 3
@@ -48,16 +48,14 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
     """
     margin = 2 * BLUR_RADIUS * (stride + 1)
     blurred = pixels.new_empty(max(0, pixels.shape[0] - margin), dtype=torch.int16)
+    whole = on_host(blurred)
     *shifts, last = (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride)
-    for start, count in pieces(pixels, 0, len(blurred)):
+    for start, count in pieces(whole, 0, len(blurred)):
         # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
-        smooth = (pixels.narrow(0, start, count + margin) ^ 128).view(torch.int8).to(torch.int16)
+        smooth = on_host((pixels.narrow(0, start, count + margin) ^ 128).view(torch.int8).to(torch.int16))
         for shift in shifts:
-            length = smooth.shape[0] - shift
-            smooth = smooth.narrow(0, shift, length) + smooth.narrow(0, 0, length)
-        torch.add(
-            smooth.narrow(0, last, count), smooth.narrow(0, 0, count), out=blurred.narrow(0, start, count)
-        )
+            smooth = smooth[shift:] + smooth[:-shift]
+        library_of(whole).add(smooth[last:], smooth[:-last], out=whole[start : start + count])
     return blurred
 
 

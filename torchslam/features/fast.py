@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchslam.features.pieces import pieces
+from torchslam.features.pieces import as_tensor, library_of, on_host, pieces
 
 # The circle of radius 3, (dx, dy), clockwise from the top.
 CIRCLE = (
@@ -15,8 +17,8 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
-Extremum = Callable[..., Tensor]
-Opposites = Callable[[Extremum, int, int], tuple[Tensor, Tensor]]
+Extremum = Callable[..., Any]
+Opposites = Callable[[Extremum, int, int], tuple[Any, Any]]
 """(extremum, i, j) -> the extremum of neighbours i and j on the circle, and that of those opposite, i + 8 and j + 8."""
 
 
@@ -30,24 +32,27 @@ def fast_scores(pixels: Tensor, stride: int) -> Tensor:
     margin = 3 * stride + 3
     if pixels.shape[0] <= 2 * margin:
         return torch.zeros_like(pixels)
-    rim = torch.zeros_like(pixels[:margin])
-    parts = pieces(pixels, margin, pixels.shape[0] - margin)
+    rim, values = torch.zeros_like(pixels[:margin]), on_host(pixels)
+    parts = pieces(values, margin, pixels.shape[0] - margin)
     # Put together, not written into what is there: compiled, that would do without vector instructions.
-    return torch.cat([rim, *(_piece_scores(pixels, stride, start, count) for start, count in parts), rim])
+    scores = [as_tensor(_piece_scores(values, stride, start, count)) for start, count in parts]
+    return torch.cat([rim, *scores, rim])
 
 
-def _piece_scores(pixels: Tensor, stride: int, start: int, count: int) -> Tensor:
-    """`fast_scores` of `count` pixels from `start` on."""
+def _piece_scores(pixels: Any, stride: int, start: int, count: int) -> Any:
+    """`fast_scores` of `count` pixels of `on_host` from `start` on."""
 
-    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Tensor, Tensor]:
+    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Any, Any]:
         # The opposite pair has the same shape: it is this one elsewhere in the image.
         first, second = (dy * stride + dx for dx, dy in (CIRCLE[i], CIRCLE[j]))
-        low, length = min(first, -second), count + abs(first + second)
-        here, there = (pixels.narrow(0, start + low + k, length) for k in (0, second - first))
+        low, high = min(first, -second), max(first, -second)
+        here, there = (
+            pixels[k : k + count + high - low] for k in (start + low, start + low + second - first)
+        )
         found = extremum(here, there)
-        return found.narrow(0, first - low, count), found.narrow(0, -second - low, count)
+        return found[first - low :][:count], found[-second - low :][:count]
 
-    return _scores(opposites, pixels.narrow(0, start, count))
+    return _scores(opposites, pixels[start : start + count], library_of(pixels))
 
 
 def patch_scores(patches: Tensor) -> Tensor:
@@ -58,18 +63,19 @@ def patch_scores(patches: Tensor) -> Tensor:
     def opposites(extremum: Extremum, i: int, j: int) -> tuple[Tensor, Tensor]:
         return extremum(ring[i], ring[j]), extremum(ring[i - 8], ring[j - 8])
 
-    return _scores(opposites, patches[:, 3:-3, 3:-3])
+    return _scores(opposites, patches[:, 3:-3, 3:-3], torch)
 
 
-def _scores(opposites: Opposites, centre: Tensor) -> Tensor:
+def _scores(opposites: Opposites, centre: Any, library: ModuleType) -> Any:
     """FAST scores of pixels, given what their neighbours on the circle are."""
+    minimum, maximum, subtract = library.minimum, library.maximum, library.subtract
     # The darkest pixel of the brightest arc, and the brightest pixel of the darkest one.
-    bright = _onto(_best_arc(opposites, torch.minimum, torch.maximum), torch.maximum, centre)
-    dark = _onto(_best_arc(opposites, torch.maximum, torch.minimum), torch.minimum, centre)
-    return torch.maximum(_onto(bright, torch.sub, centre), centre - dark)
+    bright = _onto(_best_arc(opposites, minimum, maximum), maximum, centre)
+    dark = _onto(_best_arc(opposites, maximum, minimum), minimum, centre)
+    return _onto(centre - dark, maximum, _onto(bright, subtract, centre))
 
 
-def _best_arc(opposites: Opposites, inner: Extremum, outer: Extremum) -> Tensor:
+def _best_arc(opposites: Opposites, inner: Extremum, outer: Extremum) -> Any:
     """`outer` over the sixteen arcs of nine of `inner` within the arc.
 
     Pair k holds the neighbours 2 k + 1 and 2 k + 2. The arcs from 2 k and 2 k + 1 on hold the pairs k to k + 3 and an
@@ -88,16 +94,9 @@ def _best_arc(opposites: Opposites, inner: Extremum, outer: Extremum) -> Tensor:
     return _onto(halves[0], outer, halves[1])
 
 
-def _onto(values: Tensor, function: Callable[..., Tensor], others: Tensor) -> Tensor:
+def _onto(values: Any, function: Callable[..., Any], others: Any) -> Any:
     """function(values, others), for bytes in the memory of the values: new memory costs more than the function."""
-    return function(values, others, out=None if values.is_floating_point() else values)
-
-
-def _with_rim(values: Tensor, margin: int) -> Tensor:
-    """Memory for as many bytes as there are values; zero at both ends."""
-    empty = torch.empty_like(values, dtype=torch.uint8)
-    empty[:margin] = empty[-margin:] = 0
-    return empty
+    return function(values, others, out=values if values.itemsize == 1 else None)
 
 
 def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
@@ -108,18 +107,20 @@ def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
     margin = stride + 1
     if scores.shape[0] <= 2 * margin:
         return torch.zeros_like(scores, dtype=torch.bool)
-    peaks = _with_rim(scores, margin)
-    for start, count in pieces(scores, margin, scores.shape[0] - margin):
-        peaks.narrow(0, start, count).copy_(_piece_peaks(scores, floor, stride, start, count))
-    return peaks.view(torch.bool)
+    rim = torch.zeros_like(scores[:margin], dtype=torch.bool)
+    values, floors = on_host(scores), on_host(floor)
+    parts = pieces(values, margin, scores.shape[0] - margin)
+    peaks = [as_tensor(_piece_peaks(values, floors, stride, start, count)) for start, count in parts]
+    return torch.cat([rim, *peaks, rim])
 
 
-def _piece_peaks(scores: Tensor, floor: Tensor, stride: int, start: int, count: int) -> Tensor:
-    """`find_peaks` of `count` pixels from `start` on."""
-    left, middle, right = (scores.narrow(0, start - stride + k, count + 2 * stride) for k in (-1, 0, 1))
-    rows = _onto(torch.maximum(left, right), torch.maximum, middle)  # rows[i] covers columns i-1, i, i+1
-    before = torch.maximum(rows.narrow(0, 0, count), left.narrow(0, stride, count))
-    after = torch.maximum(rows.narrow(0, 2 * stride, count), right.narrow(0, stride, count))
-    before = _onto(before, torch.maximum, floor.narrow(0, start, count))
-    centre = middle.narrow(0, stride, count)
-    return (centre > before).logical_and_(centre >= after)
+def _piece_peaks(scores: Any, floor: Any, stride: int, start: int, count: int) -> Any:
+    """`find_peaks` of `count` pixels of `on_host` from `start` on."""
+    maximum = library_of(scores).maximum
+    first, length = start - stride, count + 2 * stride
+    left, middle, right = (scores[first + k : first + k + length] for k in (-1, 0, 1))
+    rows = _onto(maximum(left, right), maximum, middle)  # rows[i] covers columns i-1, i, i+1
+    before = _onto(maximum(rows[:count], left[stride:][:count]), maximum, floor[start : start + count])
+    after = maximum(rows[2 * stride :], right[stride:][:count])
+    centre = middle[stride:][:count]
+    return (centre > before) & (centre >= after)
