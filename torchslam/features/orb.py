@@ -67,7 +67,7 @@ class ORB(nn.Module):
     ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
     differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
                     chosen, angles and descriptors stay discrete
-    compile:        run the FAST test through torch.compile: the same result in half of the time, after some seconds
+    compile:        run the FAST test through torch.compile: the same result in less time, after some seconds
                     at the first image of each size
     """
 
