@@ -63,12 +63,13 @@ def test_errors_and_depths_are_those_at_the_pose(pose_scene):
 def test_the_rows_are_the_derivatives_of_the_errors(pose_scene, model):
     scene = pose_scene(batch=1, model=model)
     problem, step = problem_of(scene), 1e-6
-    rows = problem.see(scene.T_cw[0]).rows
+    rows = torch.from_numpy(problem.see(scene.T_cw[0]).rows)
     for axis in range(6):
         xi = torch.zeros(6, dtype=torch.float64)
         xi[axis] = step
         ahead, behind = (problem.see(se3_exp(sign * xi) @ scene.T_cw[0]).rows[6] for sign in (1, -1))
-        torch.testing.assert_close((ahead - behind) / (2 * step), rows[axis], rtol=1e-5, atol=1e-3)
+        slope = torch.from_numpy((ahead - behind) / (2 * step))
+        torch.testing.assert_close(slope, rows[axis], rtol=1e-5, atol=1e-3)
 
 
 def test_points_behind_the_camera_fit_nothing_and_pull_nowhere(pose_scene):

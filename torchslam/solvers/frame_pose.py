@@ -1,9 +1,10 @@
-"""The pose of one frame against known points, for every frame of a run: `refine_pose` in a tenth of the operations.
+"""The pose of one frame against known points, for every frame of a run: `refine_pose` in a fraction of the time.
 
 In undistorted coordinates a pose moves points alike whatever the camera is, and an error in them times the slope of the
 distortion at the keypoint is one in pixels, to first order: the iterations pass no distortion. What is far off is to be
-left out before. What is six by six is computed on the host, where a number costs less than a call. There are no
-gradients: a run's graph is solved anew (`solvers.graph`).
+left out before. It is all computed on the host, by numpy and in double precision: of a few hundred points a call costs
+more than its numbers, and one of numpy a third of one of torch. There are no gradients: a run's graph is solved anew
+(`solvers.graph`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchslam.geometry.precision import full_precision
-from torchslam.geometry.projections import pose_tangent
-
 RobustKernel = Literal["cauchy", "huber"]
 """As in `geometry.robust`."""
 
@@ -30,30 +28,43 @@ _ITERATIONS = 10
 _NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
 _DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0
 _SLACK = 1 + 1e-13  # of the cost: rounding is no reason to refuse a step
+_NEAREST = float(np.finfo(np.float64).eps)  # depth in front of which a point counts as behind the camera
 
-Matrix = NDArray[Any]
+Array = NDArray[Any]  # on the host, of doubles
 
 
 @dataclass(frozen=True)
 class Sighting:
     """Points as a pose sees them, before anybody says how much each counts.
 
-    pose:    (3, 4) world to camera, on the host
-    rows:    (7, 2, N) whitened derivatives in the pose's left perturbation, and the whitened errors
-    squared: (N,) squared errors in units of the noise, far beyond all gates behind the camera
-    depths:  (N,)
+    pose:   (3, 4) world to camera; rows: (7, 2, N) whitened derivatives in the pose's left perturbation, and the
+            whitened errors; squares, z: (N,) what `squared` and `depths` say, all on the host
+    like:   of the type and on the device that tensors are to have
     """
 
-    pose: Matrix
-    rows: Tensor
-    squared: Tensor
-    depths: Tensor
+    pose: Array
+    rows: Array
+    squares: Array
+    z: Array
+    like: Tensor
 
     @property
     def T_cw(self) -> Tensor:
         """(4, 4)"""
-        pose = np.concatenate((self.pose, ((0.0, 0.0, 0.0, 1.0),)))
-        return torch.from_numpy(pose).to(self.rows)
+        return self._tensor(np.concatenate((self.pose, ((0.0, 0.0, 0.0, 1.0),))))
+
+    @property
+    def squared(self) -> Tensor:
+        """(N,) squared errors in units of the noise, far beyond all gates behind the camera."""
+        return self._tensor(self.squares)
+
+    @property
+    def depths(self) -> Tensor:
+        """(N,)"""
+        return self._tensor(self.z)
+
+    def _tensor(self, values: Array) -> Tensor:
+        return torch.from_numpy(values).to(self.like)
 
 
 @dataclass(frozen=True)
@@ -77,9 +88,9 @@ class FramePose:
         """(6, 6) of the left perturbation (translation, rotation), calibrated by the errors themselves; zero where the
         pose is not determined. As `RefinedPose.covariance`."""
         if not self.success:
-            return self.sighting.rows.new_zeros(6, 6)
+            return self.sighting.like.new_zeros(6, 6)
         covariance = self._model.variance_factor() * np.linalg.inv(self._model.normal[:6, :6])
-        return torch.from_numpy(covariance).to(self.sighting.rows)
+        return torch.from_numpy(covariance).to(self.sighting.like)
 
 
 class FrameProblem:
@@ -87,43 +98,48 @@ class FrameProblem:
 
     def __init__(self, points_w: Tensor, xy: Tensor, whitened: Tensor) -> None:
         """points_w: (N, 3); xy: (2, N) undistorted coordinates; whitened: (2, 2, N) as of `Undistorted`; all finite."""
-        ones = torch.ones_like(points_w[:, :1])
-        self.homogeneous = torch.cat((points_w, ones), dim=1).mT
-        self.xy = xy
-        self.along_x, self.along_y = whitened.contiguous().unbind(0)  # rows of memory are counted on below
-        self.tangent = pose_tangent(points_w.dtype, points_w.device)
-        self.nearest = torch.finfo(points_w.dtype).eps
+        self.points_w, self.like = np.ascontiguousarray(_on_host(points_w).T), points_w.detach()
+        self.xy = _on_host(xy)
+        self.along_x, self.along_y = np.ascontiguousarray(_on_host(whitened))
 
     def see(self, T_cw: Tensor) -> Sighting:
         """The points from a pose (4, 4)."""
-        return self._see(T_cw[:3].detach().cpu().double().numpy())
+        return self._see(_on_host(T_cw[:3]))
 
-    @full_precision
-    def _see(self, pose: Matrix) -> Sighting:
-        entries = torch.from_numpy(pose.reshape(12)).to(self.xy)
-        mapped = torch.addmv(self.tangent.constant, self.tangent.linear.mT, entries).view(21, 4)
-        places, depths = (mapped @ self.homogeneous).view(7, 3, -1).split((2, 1), dim=1)
-        inverse = depths[6].clamp_min(self.nearest).reciprocal_()
-        image = places[6] * inverse
-        # d(u / w) = (du - (u / w) dw) / w; the row of the pose itself becomes the error
-        rows = torch.addcmul(places, image, depths, value=-1).mul_(inverse)
-        torch.sub(image, self.xy, out=rows[6])
-        rows = (rows[:, :1] * self.along_x).addcmul_(rows[:, 1:], self.along_y)
-        return Sighting(pose, rows, rows[6].square().sum(0), depths[6, 0])
+    def _see(self, pose: Array) -> Sighting:
+        points_c = pose[:, :3] @ self.points_w
+        points_c += pose[:, 3:]
+        z = points_c[2]
+        inverse = 1 / np.maximum(z, _NEAREST)
+        image = points_c[:2] * inverse
+        x, y = image
+        # The derivatives of (x, y) in translation and rotation, and the errors in them.
+        rows = np.zeros((7, 2, len(z)))
+        rows[0, 0] = rows[1, 1] = inverse
+        np.multiply(image, -inverse, out=rows[2])
+        np.multiply(x, y, out=rows[4, 1])
+        np.negative(rows[4, 1], out=rows[3, 0])
+        np.subtract(-1.0, y * y, out=rows[3, 1])
+        np.add(1.0, x * x, out=rows[4, 0])
+        np.negative(y, out=rows[5, 0])
+        rows[5, 1] = x
+        np.subtract(image, self.xy, out=rows[6])
+        rows = rows[:, :1] * self.along_x + rows[:, 1:] * self.along_y
+        return Sighting(pose, rows, np.square(rows[6]).sum(0), z, self.like)
 
-    @full_precision
     def minimize(self, start: Sighting, weights: Tensor, kernel: RobustKernel) -> FramePose:
         """The pose of least robust cost near a start, by Levenberg-Marquardt.
 
         weights: (N,) of the squared errors, none negative; zero where a point does not count
         """
-        model, damping = _Model.of(start, weights, kernel), _DAMPING
+        on_host = _on_host(weights)
+        model, damping = _Model.of(start, on_host, kernel), _DAMPING
         for _ in range(_ITERATIONS):
             step = _step(model.normal, damping)
             if step is None:
                 break
             promised = -0.5 * float(step @ model.normal[:6, 6])
-            trial = _Model.of(self._see(_moved(model.sighting.pose, step)), weights, kernel)
+            trial = _Model.of(self._see(_moved(model.sighting.pose, step)), on_host, kernel)
             settled = not promised > _NEGLIGIBLE * model.cost
             better = trial.cost <= _SLACK * model.cost
             model = trial if better else model
@@ -134,41 +150,45 @@ class FrameProblem:
         return FramePose(model.sighting if success else start, success, model)
 
 
+def _on_host(values: Tensor) -> Array:
+    array: Array = values.detach().cpu().double().numpy()
+    return array
+
+
 @dataclass(frozen=True)
 class _Model:
     """The cost at a pose and its quadratic model, by iteratively reweighted least squares.
 
-    squared: (N,) weighted squared errors; influence: (N,) the kernel's rho' of them; counted: (N,) bool
-    normal:  (7, 7) [J r]^T W [J r], on the host
+    squared: (N,) weighted squared errors; influence: (N,) the kernel's rho' of them
+    normal:  (7, 7) [J r]^T W [J r]
     """
 
     sighting: Sighting
     kernel: RobustKernel
-    weights: Tensor
-    squared: Tensor
-    influence: Tensor
+    weights: Array
+    squared: Array
+    influence: Array
     cost: float
-    normal: Matrix
+    normal: Array
 
     @classmethod
-    def of(cls, sighting: Sighting, weights: Tensor, kernel: RobustKernel) -> _Model:
-        squared = sighting.squared * weights
+    def of(cls, sighting: Sighting, weights: Array, kernel: RobustKernel) -> _Model:
+        squared = sighting.squares * weights
         rho, influence = _KERNELS[kernel](squared)
-        rows = sighting.rows.view(7, -1)
-        weighted = (sighting.rows * (influence * weights)).view(7, -1)
-        normal = (weighted @ rows.mT).cpu().double().numpy()
+        weighted = sighting.rows * (influence * weights)
+        normal = weighted.reshape(7, -1) @ sighting.rows.reshape(7, -1).T
         return cls(sighting, kernel, weights, squared, influence, 0.5 * float(rho.sum()), normal)
 
     def variance_factor(self) -> float:
         """As `residuals.variance_factor`, of six parameters."""
-        counted = (self.weights > 0).to(self.influence)
+        counted = (self.weights > 0).astype(np.float64)
         across = self.influence * counted
         if self.kernel == "huber":  # the slope of psi along the error: one, or zero beyond the scale
             along = (self.squared <= SCALE**2) * counted
         else:
             along = across * (2 * self.influence - 1)
         psi = across * across
-        sums = torch.stack((counted, across, along, psi, along * along, psi * self.squared)).sum(1).tolist()
+        sums = np.stack((counted, across, along, psi, along * along, psi * self.squared)).sum(1).tolist()
         count, across_sum, along_sum, across_2, along_2, psi_2 = sums
         components = 2 * count
         slope = (across_sum + along_sum) / max(components, 1.0)
@@ -177,44 +197,53 @@ class _Model:
         spread = (across_2 + along_2) / components / slope**2 - 1
         correction = 1 + 6 / components * spread
         variance = psi_2 / (components - 6)
-        return correction**2 * variance * (2 * across_sum / components) / slope**2
+        factor: float = correction**2 * variance * (2 * across_sum / components) / slope**2
+        return factor
 
 
-def _cauchy(squared: Tensor) -> tuple[Tensor, Tensor]:
+def _cauchy(squared: Array) -> tuple[Array, Array]:
     share = squared * SCALE**-2
-    return torch.log1p(share) * SCALE**2, (share + 1).reciprocal_()
+    return np.log1p(share) * SCALE**2, 1 / (share + 1)
 
 
-def _huber(squared: Tensor) -> tuple[Tensor, Tensor]:
+def _huber(squared: Array) -> tuple[Array, Array]:
     limit = SCALE**2
-    root = squared.clamp_min(limit).sqrt_()
-    return (root * (2 * SCALE)).add_(squared.clamp_max(limit)).sub_(2 * limit), SCALE / root
+    root = np.sqrt(np.maximum(squared, limit))
+    return root * (2 * SCALE) + np.minimum(squared, limit) - 2 * limit, SCALE / root
 
 
 _KERNELS = {"cauchy": _cauchy, "huber": _huber}  # squared errors (N,) -> rho, rho', as `geometry.robust`
 
 
-def _step(normal: Matrix, damping: float) -> Matrix | None:
+def _step(normal: Array, damping: float) -> Array | None:
     """(6,) the step that minimises the damped model; None where there is none."""
-    hessian, gradient = normal[:6, :6], normal[:6, 6]
+    hessian, gradient = normal[:6, :6].copy(), normal[:6, 6]
+    hessian.flat[::7] *= 1 + damping
     try:
-        step = -np.linalg.solve(hessian + damping * np.diag(hessian.diagonal()), gradient)
+        step = -np.linalg.solve(hessian, gradient)
     except np.linalg.LinAlgError:
         return None
     return step if math.isfinite(float(step @ gradient)) else None
 
 
-def _moved(pose: Matrix, step: Matrix) -> Matrix:
+def _moved(pose: Array, step: Array) -> Array:
     """A pose (3, 4) moved by [rho, omega] from the left, by Cayley's rotation: as `solvers.tangent.retract`."""
     x, y, z = (0.5 * step[3:]).tolist()
-    W = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    turn = np.eye(3) + 2 / (1 + x * x + y * y + z * z) * (W + W @ W)
-    moved: Matrix = turn @ pose
+    xx, yy, zz = x * x, y * y, z * z
+    f = 2 / (1 + xx + yy + zz)
+    turn = np.array(
+        (
+            (1 - f * (yy + zz), f * (x * y - z), f * (x * z + y)),
+            (f * (x * y + z), 1 - f * (xx + zz), f * (y * z - x)),
+            (f * (x * z - y), f * (y * z + x), 1 - f * (xx + yy)),
+        )
+    )
+    moved: Array = turn @ pose
     moved[:, 3] += step[:3]
     return moved
 
 
-def _is_definite(hessian: Matrix) -> bool:
+def _is_definite(hessian: Array) -> bool:
     """Whether a matrix is clearly positive definite, whatever its units: as `linear.factorize`."""
     diagonal = hessian.diagonal()
     if not (diagonal > 0).all():
