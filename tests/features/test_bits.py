@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchslam.features import bits
-from torchslam.features.bits import hamming, hamming_pairs, pack_bits, unpack_bits
+from torchslam.features.bits import hamming, hamming_between, hamming_pairs, pack_bits, unpack_bits
 
 
 def random_descriptors(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -55,6 +55,24 @@ def test_hamming_of_pairs(size: int) -> None:
     first[0], second[0] = 0, 255
     first[1], second[1] = 255, 255
     assert torch.equal(hamming_pairs(first, second), hamming(first, second).diagonal().long())
+
+
+@pytest.mark.parametrize("by_numpy", [True, False])
+@pytest.mark.parametrize("size", [8, 32, 64, 248])
+def test_hamming_between_rows(size: int, by_numpy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if by_numpy and not hasattr(np, "bitwise_count"):
+        pytest.skip("numpy 1 counts no bits")
+    if not by_numpy:
+        monkeypatch.delattr(np, "bitwise_count", raising=False)
+    first, second = random_descriptors(20, size), random_descriptors(30, size, seed=1)
+    first[0], second[0] = 0, 255
+    first[1], second[1] = 255, 255
+    rows = torch.cat([torch.tensor([0, 0, 1, 1]), torch.arange(20)])
+    columns = torch.cat([torch.tensor([0, 1, 0, 1]), torch.arange(20) + 10])
+    distances = hamming_between(first, rows, second, columns)
+    assert distances.dtype == torch.int64
+    assert distances[:4].tolist() == [8 * size, 8 * size, 0, 0]
+    assert torch.equal(distances, hamming(first, second)[rows, columns].long())
 
 
 def test_hamming_of_nothing() -> None:

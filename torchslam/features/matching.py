@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchslam.features.bits import hamming, hamming_pairs
+from torchslam.features.bits import hamming, hamming_between
 from torchslam.features.contract import NORMALIZE, are_comparable
 from torchslam.features.nearest import dual_softmax, nearest_by_bits, nearest_by_cosine
 from torchslam.features.windows import SAME_SCALE, nearest_bits, window_pairs
@@ -177,7 +177,7 @@ def _pair_distances(descriptors_1: Tensor, rows: Tensor, descriptors_2: Tensor, 
     if descriptors_1.dtype != torch.uint8:
         return 1 - (_take(descriptors_1, rows) * _take(descriptors_2, columns)).sum(-1)
     pieces = zip(rows.split(_PIECE), columns.split(_PIECE), strict=True)
-    distances = [hamming_pairs(_take(descriptors_1, r), _take(descriptors_2, c)).float() for r, c in pieces]
+    distances = [hamming_between(descriptors_1, r, descriptors_2, c).float() for r, c in pieces]
     return distances[0] if len(distances) == 1 else torch.cat(distances)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.features.bits import hamming_pairs
+from torchslam.features.bits import hamming_between
 from torchslam.features.matching import SCALE_TOLERANCE
 from torchslam.features.windows import nearest_bits, window_pairs
 from torchslam.values import View
@@ -30,7 +30,5 @@ def match_within(
     factor = view.scales.index_select(0, column) / expected.scales.index_select(0, row)
     alike = torch.nonzero((factor <= SCALE_TOLERANCE) & (factor * SCALE_TOLERANCE >= 1))[:, 0]
     row, column = row.index_select(0, alike), column.index_select(0, alike)
-    distance = hamming_pairs(
-        expected.descriptors.index_select(0, row), view.descriptors.index_select(0, column)
-    )
+    distance = hamming_between(expected.descriptors, row, view.descriptors, column)
     return nearest_bits(row, column, distance, rows, view.scales, ratio, min(max_distance, bits))
