@@ -4,10 +4,9 @@ import math
 from dataclasses import replace
 
 import cv2
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -341,14 +340,30 @@ def test_matching_moves_to_the_device(device: torch.device) -> None:
     assert projected.mask.device.type == device.type
 
 
-def test_numpy_reference_of_the_windows() -> None:
-    first, second = features(2, 60, 14), features(2, 70, 15)
-    radius = torch.full((2, 60), 25.0)
-    row, column = window_pairs(first.keypoints, radius, first.mask, second.keypoints, second.mask)
-    apart = np.linalg.norm(first.keypoints.numpy()[:, :, None] - second.keypoints.numpy()[:, None], axis=-1)
-    near = (apart <= 25) & first.mask.numpy()[:, :, None] & second.mask.numpy()[:, None]
-    b, i, j = np.nonzero(near)
-    assert set(zip(row.tolist(), column.tolist(), strict=True)) == set(
+@given(
+    seed=st.integers(0, 1000),
+    batch=st.integers(1, 3),
+    spread=st.sampled_from([1.0, 20.0, 1e5]),
+    largest=st.sampled_from([0.0, 25.0, 400.0]),
+)
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)  # of the fixture nothing is kept
+def test_windows_hold_what_is_near(
+    device: torch.device, seed: int, batch: int, spread: float, largest: float
+) -> None:
+    """Wherever keypoints are, in front of the first cell and behind the last one too."""
+    first, second = features(batch, 60, seed), features(batch, 70, seed + 1)
+    places, keypoints = ((view.keypoints.double() - 100) * spread + 100 for view in (first, second))
+    keypoints[:, :20] = places[:, :20]  # within a radius of nothing
+    radius = largest * torch.rand(batch, 60, generator=torch.Generator().manual_seed(seed)).double()
+    inputs = (places, radius, first.mask, keypoints, second.mask)
+    row, column = (found.cpu() for found in window_pairs(*(tensor.to(device) for tensor in inputs)))
+    squared = (places[:, :, None] - keypoints[:, None]).square().sum(-1)
+    near = (squared <= radius.square()[..., None]) & first.mask[..., None] & second.mask[:, None]
+    b, i, j = near.nonzero(as_tuple=True)
+    assert (row.diff() >= 0).all()
+    assert sorted(zip(row.tolist(), column.tolist(), strict=True)) == list(
         zip((b * 60 + i).tolist(), (b * 70 + j).tolist(), strict=True)
     )
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchslam.features.host_windows import window_pairs_on_host
+
 SAME_SCALE = 0.05
 """Share by which two scales of one level may differ."""
 _BAND = 32.0  # pixels: height of the bands of keypoints that a window search looks through
@@ -20,8 +22,13 @@ def window_pairs(
 
     pixels: (B, M, 2) finite, at least one; radius, mask: (B, M); keypoints, keypoint_mask: (B, N, 2), (B, N)
 
-    Keypoints are sorted by band of _BAND rows, then by x: what a window takes of a band is one run in that order.
+    Keypoints are sorted by band of _BAND rows, then by x: what a window takes of a band is one run in that order. The
+    CPU has a quicker way (`host_windows`). The columns of a row come in any order.
     """
+    if keypoints.is_cpu:
+        inputs = pixels.double(), radius.double(), mask, keypoints.double(), keypoint_mask
+        found = window_pairs_on_host(*(tensor.detach().numpy() for tensor in inputs))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     x, y = keypoints.double().unbind(-1)
     at_x, at_y = pixels.double().unbind(-1)
     low, high = torch.floor((at_y - radius) / _BAND), torch.floor((at_y + radius) / _BAND)
