@@ -287,7 +287,7 @@ def test_poses_are_rigid_and_results_tell_their_stages() -> None:
     assert torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), atol=1e-9)
     assert torch.allclose(torch.linalg.det(R), torch.ones(len(R), dtype=R.dtype))
     keyframe = next(r for r in run.results if r.is_keyframe and "bundle" in r.stage_ms)
-    assert {"features", "tracking", "mapping", "bundle", "total"} <= keyframe.stage_ms.keys()
+    assert {"features", "tracking", "mapping", "bundle", "rest", "total"} <= keyframe.stage_ms.keys()
     assert keyframe.reason
 
 

@@ -167,6 +167,11 @@ class SLAM:
 
         Raises FrameError for an image of another size and for a frame that does not come after the last one.
         """
+        with self.clock.rest("rest"):
+            view, outcome = self._process(frame)
+        return self._result(view, outcome)
+
+    def _process(self, frame: Frame) -> tuple[View, Outcome]:
         self._check(frame)
         followed, scouts = frame.followed, self._scouts(frame)
         if scouts:
@@ -174,7 +179,7 @@ class SLAM:
                 followed = self.patches.scout.follow(frame)
         if self.world is not None and followed is not None and self.patches.will_do(self.world, followed):
             self.last_frame = frame.index, frame.timestamp
-            return self._result(*self._following.go_along(self.world, frame, followed))
+            return self._following.go_along(self.world, frame, followed)
         view = self._look(frame)
         self.patches.expect(view.index)
         if self.world is None:
@@ -182,7 +187,7 @@ class SLAM:
         else:
             outcome = self._following.follow(self.world, view, followed)
         self.patches.tell(scouts)
-        return self._result(view, outcome)
+        return view, outcome
 
     def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
         """Process an image of one's own loop: the frame after the last one.

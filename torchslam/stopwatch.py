@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up milliseconds per stage; stages do not nest."""
+    """Adds up milliseconds per stage; stages do not nest, but in the one that has the rest."""
 
     def __init__(self) -> None:
         self.ms: dict[str, float] = {}
@@ -20,6 +20,17 @@ class Stopwatch:
             yield
         finally:
             self.ms[stage] = self.ms.get(stage, 0.0) + (time.perf_counter() - start) * 1e3
+
+    @contextmanager
+    def rest(self, stage: str) -> Iterator[None]:
+        """What is done here beside the stages inside is a stage as well."""
+        start, before = time.perf_counter(), sum(self.ms.values())
+        try:
+            yield
+        finally:
+            inside = sum(self.ms.values()) - before
+            spent = (time.perf_counter() - start) * 1e3
+            self.ms[stage] = self.ms.get(stage, 0.0) + spent - inside
 
     def take(self) -> dict[str, float]:
         """The stages since the last call, and their total."""
