@@ -6,10 +6,12 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchslam.features.pieces import as_tensor, library_of, on_host, pieces
+from torchslam.ids import true_indices
 
 # The circle of radius 3, (dx, dy), clockwise from the top.
 CIRCLE = (
@@ -17,26 +19,42 @@ CIRCLE = (
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 )  # fmt: skip
 
+Bands = tuple[tuple[int, int], ...]
+"""(start, stop) of runs of pixels in a flattened image, ascending."""
+
 Extremum = Callable[..., Any]
 Opposites = Callable[[Extremum, int, int], tuple[Any, Any]]
 """(extremum, i, j) -> the extremum of neighbours i and j on the circle, and that of those opposite, i + 8 and j + 8."""
 
 
-def fast_scores(pixels: Tensor, stride: int) -> Tensor:
+def fast_scores(pixels: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
     """Score of every pixel: the largest t at which it is brighter or darker by t than nine neighbours in a row.
 
-    pixels: (P,) uint8, a flattened image of row length `stride`. Returns (P,) uint8; 0 where there is no such
-    arc and in the first and last rows, which the circle leaves. A pixel is a FAST-9 corner of threshold t where its
-    score exceeds t.
+    pixels: (P,) uint8, a flattened image of row length `stride`; bands: of the pixels that are asked for, what others
+    score means nothing; None: all. Returns (P,) uint8; 0 where there is no such arc and in the first and last rows,
+    which the circle leaves. A pixel is a FAST-9 corner of threshold t where its score exceeds t.
     """
-    margin = 3 * stride + 3
-    if pixels.shape[0] <= 2 * margin:
-        return torch.zeros_like(pixels)
-    rim, values = torch.zeros_like(pixels[:margin]), on_host(pixels)
-    parts = pieces(values, margin, pixels.shape[0] - margin)
+    margin, values = 3 * stride + 3, on_host(pixels)
+    parts = _pieces_of(bands, values, margin)
     # Put together, not written into what is there: compiled, that would do without vector instructions.
-    scores = [as_tensor(_piece_scores(values, stride, start, count)) for start, count in parts]
-    return torch.cat([rim, *scores, rim])
+    scores, end = [], 0
+    for start, count in parts:
+        scores += [torch.zeros_like(pixels[end:start])] * (start > end)
+        scores.append(as_tensor(_piece_scores(values, stride, start, count)))
+        end = start + count
+    return torch.cat([*scores, torch.zeros_like(pixels[end:])])
+
+
+def _pieces_of(bands: Bands | None, pixels: Any, margin: int) -> list[tuple[int, int]]:
+    """(start, count) of pieces that hold all bands, ascending, but for margins at both ends of the pixels."""
+    last = len(pixels) - margin
+    if bands is None:
+        bands = ((margin, last),)
+    elif bands and not isinstance(
+        pixels, np.ndarray
+    ):  # a single piece costs less there than to leave out the rest
+        bands = ((bands[0][0], bands[-1][1]),)
+    return [piece for start, stop in bands for piece in pieces(pixels, max(start, margin), min(stop, last))]
 
 
 def _piece_scores(pixels: Any, stride: int, start: int, count: int) -> Any:
@@ -99,23 +117,24 @@ def _onto(values: Any, function: Callable[..., Any], others: Any) -> Any:
     return function(values, others, out=values if values.itemsize == 1 else None)
 
 
-def find_peaks(scores: Tensor, floor: Tensor, stride: int) -> Tensor:
-    """True where a score exceeds its floor and its eight neighbours; of equal neighbours the first wins.
+def find_peaks(scores: Tensor, floor: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
+    """Positions (K,) int64, ascending, of scores that exceed their floor and their eight neighbours; of equal ones the
+    first wins.
 
-    scores, floor: (P,) uint8, flattened with row length `stride`. Returns (P,) bool, False on the margins.
+    scores, floor: (P,) uint8, flattened with row length `stride`; bands: of the pixels that are asked, beyond which no
+    score exceeds its floor; None: all but a margin.
     """
-    margin = stride + 1
-    if scores.shape[0] <= 2 * margin:
-        return torch.zeros_like(scores, dtype=torch.bool)
-    rim = torch.zeros_like(scores[:margin], dtype=torch.bool)
     values, floors = on_host(scores), on_host(floor)
-    parts = pieces(values, margin, scores.shape[0] - margin)
-    peaks = [as_tensor(_piece_peaks(values, floors, stride, start, count)) for start, count in parts]
-    return torch.cat([rim, *peaks, rim])
+    parts = _pieces_of(bands, values, stride + 1)
+    found = [
+        true_indices(as_tensor(_piece_peaks(values, floors, stride, start, count))) + start
+        for start, count in parts
+    ]
+    return torch.cat(found) if found else torch.zeros(0, dtype=torch.int64, device=scores.device)
 
 
 def _piece_peaks(scores: Any, floor: Any, stride: int, start: int, count: int) -> Any:
-    """`find_peaks` of `count` pixels of `on_host` from `start` on."""
+    """Which are peaks of `count` pixels of `on_host` from `start` on."""
     maximum = library_of(scores).maximum
     first, length = start - stride, count + 2 * stride
     left, middle, right = (scores[first + k : first + k + length] for k in (-1, 0, 1))

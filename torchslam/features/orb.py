@@ -13,10 +13,9 @@ from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
-from torchslam.features.fast import fast_scores, find_peaks, patch_scores
+from torchslam.features.fast import Bands, fast_scores, find_peaks, patch_scores
 from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
 from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread
-from torchslam.ids import true_indices
 from torchslam.values import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
@@ -139,11 +138,13 @@ class ORB(nn.Module):
             levels = build_levels(images, atlas)
         with torch.no_grad():
             pixels = fill_atlas(levels, atlas).flatten()
-            scores = self._fast_scores(pixels, atlas.stride)
+            # Peaks lie in cells, and a score is asked for next to them as well.
+            scores = self._fast_scores(pixels, atlas.stride, _bands(grid, atlas, len(images), beside=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if wanted is not None:
                 floor = torch.where(_on_atlas(wanted, atlas), floor, NEVER)
-            positions = self._peaks(scores, floor, len(images), atlas.stride)
+            bands = _bands(grid, atlas, len(images))
+            positions = self._peaks(scores, floor, len(images), atlas.stride, bands)
             positions, slots, strengths = self._choose(pixels, scores, positions, grid, atlas.stride)
             fast = gather_patches(scores, positions, atlas.stride, 1)
             area = grid.table.shape[0]
@@ -153,15 +154,15 @@ class ORB(nn.Module):
             xy = torch.stack([inside % atlas.stride - left, inside // atlas.stride - top], dim=-1)
         return Corners(levels, pixels, atlas, positions, slots, strengths, fast, image, level, xy)
 
-    def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int) -> Tensor:
+    def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int, bands: Bands) -> Tensor:
         """(K,) where corners are: peaks of the scores above a floor, which is lower in images that offer few."""
-        positions = true_indices(find_peaks(scores, floor, stride))
+        positions = find_peaks(scores, floor, stride, bands)
         images = _images_of(positions, len(scores), batch)
         faint = self._are_few(torch.ones_like(positions, dtype=torch.bool), images, batch)
         if self.low_threshold <= FAINT or not bool(faint.any()):
             return positions
         lower = torch.where(faint[:, None] & (floor.view(batch, -1) < NEVER), FAINT, floor.view(batch, -1))
-        return true_indices(find_peaks(scores, lower.flatten(), stride))
+        return find_peaks(scores, lower.flatten(), stride, bands)
 
     def _are_few(self, corners: Tensor, images: Tensor, batch: int) -> Tensor:
         """(batch,) whether an image has few of some corners, a mask (K,), given the image (K,) of each."""
@@ -210,6 +211,18 @@ class ORB(nn.Module):
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
         return soft_peak(fast), _stand_out(fast)
+
+
+def _bands(grid: Grid, atlas: Atlas, batch: int, beside: int = 0) -> Bands:
+    """The pixels of the flattened atlases of so many images in whose rows there are cells, and rows beside them."""
+    return tuple(
+        (
+            (image * atlas.rows + first - beside) * atlas.stride,
+            (image * atlas.rows + last + beside) * atlas.stride,
+        )
+        for image in range(batch)
+        for first, last in grid.rows
+    )
 
 
 def _images_of(positions: Tensor, pixels: int, batch: int) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PIECE = 130_000
+PIECE = 260_000
 """Pixels worked on at once, at most: a dozen intermediate results of bytes fill the second cache of a processor."""
 
 
@@ -37,9 +37,9 @@ def as_tensor(pixels: Any) -> Tensor:
 def pieces(pixels: Any, start: int, stop: int) -> list[tuple[int, int]]:
     """(start, count) of pieces of nearly one size that make up the pixels of `on_host` from `start` to before `stop`.
 
-    A single one on a GPU, and where a function is compiled, which has no intermediate results.
+    A single one on a GPU, and where a function is compiled, which has no intermediate results; none of nothing.
     """
-    count = stop - start
+    count = max(0, stop - start)
     number = max(1, -(-count // PIECE)) if isinstance(pixels, np.ndarray) else 1
     size = -(-count // number)
-    return [(first, min(size, stop - first)) for first in range(start, stop, max(1, size))]
+    return [(first, min(size, stop - first)) for first in range(start, start + count, max(1, size))]

@@ -20,12 +20,14 @@ class Grid:
 
     table:   (rows * stride,) int32, the cell of each atlas pixel, -1 on the border and between levels
     floor:   (rows * stride,) uint8, the FAST score that a corner must exceed there; 255 where none may lie
+    rows:    of the atlas, runs (first, last + 1) of those in which there are cells
     levels:  (cells,) int64, the level of each cell
     budgets: (levels,) int64, how many keypoints each level may give
     """
 
     table: Tensor
     floor: Tensor
+    rows: tuple[tuple[int, int], ...]
     levels: Tensor
     budgets: Tensor
 
@@ -56,9 +58,16 @@ def plan_grid(
     return Grid(
         table.flatten().to(device),
         torch.where(table.flatten() >= 0, threshold, 255).to(device=device, dtype=torch.uint8),
+        _runs((table >= 0).any(1)),
         as_tensor(levels, dtype=torch.int64, device=device),
         as_tensor(budgets, dtype=torch.int64, device=device),
     )
+
+
+def _runs(flags: Tensor) -> tuple[tuple[int, int], ...]:
+    """(start, stop) of all runs of true ones in flags (n,)."""
+    edges = F.pad(flags.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _level_budgets(num_keypoints: int, atlas: Atlas, border: int) -> list[int]:
