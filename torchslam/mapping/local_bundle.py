@@ -13,6 +13,7 @@ from torchslam.ids import distinct, is_among, ranks_among
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.solvers.schur import Marginals
+from torchslam.solvers.window import adjust_window
 from torchslam.values import Observations
 from torchslam.world.map import Map
 from torchslam.world.observers import most
@@ -68,7 +69,9 @@ def around(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig)
 
 def solve_around(problem: BundleProblem, iterations: int, covariances: bool) -> Adjusted:
     """Adjust what is around a keyframe, as exactly as the next one leaves it; what is fixed is taken as exact."""
-    return solve(problem, iterations, covariances, tolerance=NEGLIGIBLE)
+    if covariances:
+        return solve(problem, iterations, covariances, tolerance=NEGLIGIBLE)
+    return Adjusted(*adjust_window(problem, HUBER, iterations, NEGLIGIBLE)[:2], None)
 
 
 def adjust_all(

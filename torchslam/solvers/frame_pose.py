@@ -98,13 +98,13 @@ class FrameProblem:
 
     def __init__(self, points_w: Tensor, xy: Tensor, whitened: Tensor) -> None:
         """points_w: (N, 3); xy: (2, N) undistorted coordinates; whitened: (2, 2, N) as of `Undistorted`; all finite."""
-        self.points_w, self.like = np.ascontiguousarray(_on_host(points_w).T), points_w.detach()
-        self.xy = _on_host(xy)
-        self.along_x, self.along_y = np.ascontiguousarray(_on_host(whitened))
+        self.points_w, self.like = np.ascontiguousarray(on_host(points_w).T), points_w.detach()
+        self.xy = on_host(xy)
+        self.along_x, self.along_y = np.ascontiguousarray(on_host(whitened))
 
     def see(self, T_cw: Tensor) -> Sighting:
         """The points from a pose (4, 4)."""
-        return self._see(_on_host(T_cw[:3]))
+        return self._see(on_host(T_cw[:3]))
 
     def _see(self, pose: Array) -> Sighting:
         points_c = pose[:, :3] @ self.points_w
@@ -132,14 +132,14 @@ class FrameProblem:
 
         weights: (N,) of the squared errors, none negative; zero where a point does not count
         """
-        on_host = _on_host(weights)
-        model, damping = _Model.of(start, on_host, kernel), _DAMPING
+        counts = on_host(weights)
+        model, damping = _Model.of(start, counts, kernel), _DAMPING
         for _ in range(_ITERATIONS):
             step = _step(model.normal, damping)
             if step is None:
                 break
             promised = -0.5 * float(step @ model.normal[:6, 6])
-            trial = _Model.of(self._see(_moved(model.sighting.pose, step)), on_host, kernel)
+            trial = _Model.of(self._see(moved(model.sighting.pose, step)), counts, kernel)
             settled = not promised > _NEGLIGIBLE * model.cost
             better = trial.cost <= _SLACK * model.cost
             model = trial if better else model
@@ -150,7 +150,7 @@ class FrameProblem:
         return FramePose(model.sighting if success else start, success, model)
 
 
-def _on_host(values: Tensor) -> Array:
+def on_host(values: Tensor) -> Array:
     array: Array = values.detach().cpu().double().numpy()
     return array
 
@@ -226,7 +226,7 @@ def _step(normal: Array, damping: float) -> Array | None:
     return step if math.isfinite(float(step @ gradient)) else None
 
 
-def _moved(pose: Array, step: Array) -> Array:
+def moved(pose: Array, step: Array) -> Array:
     """A pose (3, 4) moved by [rho, omega] from the left, by Cayley's rotation: as `solvers.tangent.retract`."""
     x, y, z = (0.5 * step[3:]).tolist()
     xx, yy, zz = x * x, y * y, z * z
@@ -238,9 +238,9 @@ def _moved(pose: Array, step: Array) -> Array:
             (f * (x * z - y), f * (y * z + x), 1 - f * (xx + yy)),
         )
     )
-    moved: Array = turn @ pose
-    moved[:, 3] += step[:3]
-    return moved
+    result: Array = turn @ pose
+    result[:, 3] += step[:3]
+    return result
 
 
 def _is_definite(hessian: Array) -> bool:
