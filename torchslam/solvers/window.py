@@ -201,8 +201,8 @@ def _observed(problem: BundleProblem, rows: Tensor) -> tuple[Array, Array, Array
 
 class _Seen(NamedTuple):
     """Per observation (O): the rotation (3, 3, O) of its frame, the ray (3, O) to its point, in the axes of the world,
-    where that is in the image, undistorted, (2, O), the inverse depth, the whitened errors (2, O), their square, and what
-    it counts."""
+    where that is in the image, undistorted, (2, O), the inverse depth, the whitened errors (2, O), their square, and
+    what it counts."""
 
     R_cw: Array
     rays_w: Array

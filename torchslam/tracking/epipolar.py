@@ -64,21 +64,27 @@ def match_along_epipolar_lines(
     )
     width = epipolar_px / camera.focal * there.features.scales / sines.clamp(min=1e-12)
     width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
-    # A number per angle and neighbour, each a turn below and above as well: a window may reach over the end of a turn.
-    offset = 6 * math.pi * torch.arange(len(T_21), device=width.device)[:, None]
-    turns = 2 * math.pi * torch.arange(-1, 2, device=width.device)
-    keys, order = (angles_1[..., None] + offset[..., None] + turns).flatten().sort(stable=True)
-    left, right = (torch.searchsorted(keys, angles_2 + offset + sign * width) for sign in (-1, 1))
-    column, place = expand_runs(left.flatten(), torch.where(there.features.mask, right, left).flatten())
-    count, descriptors = angles_1.shape[1], here.features.descriptors
+    # A window may reach over the end of a turn, so that angles stand a turn below and above as well. Both sides are
+    # sorted: what is looked for next is near what was looked for last.
+    sorted_1, order_1 = angles_1.sort(dim=1, stable=True)
+    sorted_2, order_2 = angles_2.sort(dim=1, stable=True)
+    keys = torch.cat([sorted_1 + 2 * math.pi * turn for turn in (-1, 0, 1)], dim=1)
+    width, mask = width.gather(1, order_2), there.features.mask.gather(1, order_2)
+    left, right = (torch.searchsorted(keys, sorted_2 + sign * width) for sign in (-1, 1))
+    at, place = expand_runs(left.flatten(), torch.where(mask, right, left).flatten())
+    count, others = angles_1.shape[1], angles_2.shape[1]
+    which = torch.div(at, others, rounding_mode="floor") if len(T_21) > 1 else torch.zeros_like(at)
+    row = order_1.flatten().index_select(0, which * count + place % count) + which * count
+    column = order_2.flatten().index_select(0, at) + which * others
+    descriptors = here.features.descriptors
     row, column = match_pairs(
         descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
         there.features.descriptors.flatten(0, 1),
-        (order // 3)[place],
+        row,
         column,
         0.8 * max_distance,
     )
-    return row // count, row % count, column % width.shape[1]
+    return row // count, row % count, column % others
 
 
 def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
