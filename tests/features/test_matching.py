@@ -415,7 +415,7 @@ def test_pairs_match_as_all_against_all_where_only_they_are_allowed(
     assert (rows.diff() > 0).all()
 
 
-def test_runs_are_expanded() -> None:
-    run, number = expand_runs(torch.tensor([3, 7, 0]), torch.tensor([5, 7, 3]))
+def test_runs_are_expanded(device: torch.device) -> None:
+    run, number = expand_runs(torch.tensor([3, 7, 0], device=device), torch.tensor([5, 7, 3], device=device))
     assert run.tolist() == [0, 0, 2, 2, 2]
     assert number.tolist() == [3, 4, 0, 1, 2]

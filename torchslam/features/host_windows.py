@@ -33,12 +33,12 @@ def window_pairs_on_host(
     left, right = (_cells(side, _WIDTH, columns) for side in (at_x - reach, at_x + reach))
     top, bottom = (_cells(side, _HEIGHT, rows) for side in (at_y - reach, at_y + reach))
     first = top * columns + left + _first_cells(mask.shape, rows * columns)
-    window, down = expand(np.where(mask.reshape(-1), bottom - top + 1, 0))
+    bands = np.where(mask.reshape(-1), bottom - top + 1, 0)
+    window, down = expand_runs_on_host(np.zeros_like(bands), bands)
     begin = first.take(window) + down * columns
     end = begin + (right - left + 1).take(window)
-    run_starts = starts.take(begin)
-    run, along = expand(starts.take(end) - run_starts)
-    row, column = window.take(run), order.take(run_starts.take(run) + along)
+    run, place = expand_runs_on_host(starts.take(begin), starts.take(end))
+    row, column = window.take(run), order.take(place)
 
     squared = x.take(column) - at_x.take(row)
     squared *= squared
@@ -49,10 +49,11 @@ def window_pairs_on_host(
     return row.take(near), column.take(near)
 
 
-def expand(counts: Array) -> tuple[Array, Array]:
-    """As many entries of each of (n,) as its count: whose each is, and the how many-th it is."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    return owner, np.arange(len(owner)) - (np.cumsum(counts) - counts).take(owner)
+def expand_runs_on_host(starts: Array, ends: Array) -> tuple[Array, Array]:
+    """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
+    counts = ends - starts
+    run = np.repeat(np.arange(len(counts)), counts)
+    return run, np.arange(len(run)) + (starts - (np.cumsum(counts) - counts)).take(run)
 
 
 def _sorted_into_cells(x: Array, y: Array, mask: Array, columns: int, rows: int) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.features.host_windows import window_pairs_on_host
+from torchslam.features.host_windows import expand_runs_on_host, window_pairs_on_host
 
 SAME_SCALE = 0.05
 """Share by which two scales of one level may differ."""
@@ -53,6 +53,9 @@ def window_pairs(
 
 def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
+    if starts.is_cpu:
+        found = expand_runs_on_host(starts.numpy(), ends.numpy())
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     counts = ends - starts
     run = torch.repeat_interleave(counts)
     shift = starts - (counts.cumsum(0) - counts)

@@ -66,16 +66,18 @@ def match_along_epipolar_lines(
     width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
     # A window may reach over the end of a turn, so that angles stand a turn below and above as well. Both sides are
     # sorted: what is looked for next is near what was looked for last.
+    count, others = angles_1.shape[1], angles_2.shape[1]
+    which = torch.arange(len(T_21), device=width.device)[:, None]
     sorted_1, order_1 = angles_1.sort(dim=1, stable=True)
     sorted_2, order_2 = angles_2.sort(dim=1, stable=True)
     keys = torch.cat([sorted_1 + 2 * math.pi * turn for turn in (-1, 0, 1)], dim=1)
+    rows = (torch.cat([order_1] * 3, dim=1) + which * count).flatten()
     width, mask = width.gather(1, order_2), there.features.mask.gather(1, order_2)
-    left, right = (torch.searchsorted(keys, sorted_2 + sign * width) for sign in (-1, 1))
+    left, right = (
+        torch.searchsorted(keys, sorted_2 + sign * width) + which * keys.shape[1] for sign in (-1, 1)
+    )
     at, place = expand_runs(left.flatten(), torch.where(mask, right, left).flatten())
-    count, others = angles_1.shape[1], angles_2.shape[1]
-    which = torch.div(at, others, rounding_mode="floor") if len(T_21) > 1 else torch.zeros_like(at)
-    row = order_1.flatten().index_select(0, which * count + place % count) + which * count
-    column = order_2.flatten().index_select(0, at) + which * others
+    row, column = rows.index_select(0, place), (order_2 + which * others).flatten().index_select(0, at)
     descriptors = here.features.descriptors
     row, column = match_pairs(
         descriptors.expand(len(T_21), *descriptors.shape[1:]).flatten(0, 1),
