@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -10,8 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.accelerator import simulated_accelerator
+from tests.conftest import HAS_SIMULATED_ACCELERATOR
 from torchslam.features import expand_runs, hamming, match, match_pairs, match_projected
-from torchslam.features.windows import window_pairs
+from torchslam.features.windows import nearest_bits, window_pairs
 from torchslam.values import Features, Matches
 
 WIDTH, HEIGHT = 320, 240
@@ -366,6 +369,35 @@ def test_windows_hold_what_is_near(
     assert sorted(zip(row.tolist(), column.tolist(), strict=True)) == list(
         zip((b * 60 + i).tolist(), (b * 70 + j).tolist(), strict=True)
     )
+
+
+@given(
+    seed=st.integers(0, 1000), ratio=st.sampled_from([None, 0.5, 0.9]), pairs=st.sampled_from([0, 1, 40, 400])
+)
+@settings(max_examples=60, deadline=None)
+def test_the_nearest_of_pairs(seed: int, ratio: float | None, pairs: int) -> None:
+    """As one finds it pair by pair, on the CPU and elsewhere, with many ties."""
+    generator = torch.Generator().manual_seed(seed)
+    key = torch.randperm(30 * 20, generator=generator)[:pairs].sort().values
+    row, column = key // 20, key % 20
+    distance = torch.randint(0, 12, (len(key),), generator=generator)
+    scales = 1.2 ** torch.randint(0, 3, (20,), generator=generator).double()
+    wanted: dict[int, tuple[int, int, int]] = {}
+    for i in range(30):
+        of_row = sorted((int(d), int(c)) for r, c, d in zip(row, column, distance, strict=True) if r == i)
+        if not of_row or of_row[0][0] > 9:
+            continue
+        nearest, chosen = of_row[0]
+        others = [d for d, c in of_row[1:] if scales[c] == scales[chosen]]
+        if ratio is not None and others and not nearest < ratio * min(others):
+            continue
+        wanted[chosen] = min(wanted.get(chosen, (99, 0, 0)), (nearest, i, chosen))
+    expected = sorted((i, c, d) for d, i, c in wanted.values())
+    with simulated_accelerator() if HAS_SIMULATED_ACCELERATOR else nullcontext(torch.device("cpu")) as other:
+        for where in (torch.device("cpu"), other):
+            inputs = (tensor.to(where) for tensor in (row, column, distance))
+            found = [x.tolist() for x in nearest_bits(*inputs, 30, scales.to(where), ratio, 9)]
+            assert list(zip(*found, strict=True)) == expected
 
 
 @pytest.mark.parametrize("wrong", [1.1, 0.5, torch.nan, torch.inf])

@@ -78,3 +78,39 @@ def _cells(values: Array, size: float, most: int) -> Array:
     """The column or row of cells in which coordinates lie, of so many."""
     found: Array = np.clip(np.floor(values * (1 / size)), 0, most - 1).astype(np.int64)
     return found
+
+
+def nearest_bits_on_host(
+    row: Array,
+    column: Array,
+    distance: Array,
+    scales: Array,
+    ratio: float | None,
+    limit: int | float,
+    same_scale: float,
+) -> tuple[Array, Array, Array]:
+    """As `windows.nearest_bits`; row ascends; same_scale: share by which two scales of one level may differ."""
+    if len(row) == 0:
+        return row, column, distance
+    is_first = np.empty(len(row), dtype=bool)
+    is_first[0], is_first[1:] = True, row[1:] != row[:-1]
+    starts = np.flatnonzero(is_first)
+    columns = len(scales)
+    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    keys = distance * columns + column
+    best = np.minimum.reduceat(keys, starts)
+    nearest, chosen = np.divmod(best, columns)
+    accepted = nearest <= limit
+    if ratio is not None:
+        counts = np.diff(starts, append=len(row))
+        rival = np.abs(scales.take(column) / np.repeat(scales.take(chosen), counts) - 1) < same_scale
+        rival &= keys != np.repeat(best, counts)
+        second = np.minimum.reduceat(np.where(rival, distance, np.inf), starts)
+        accepted &= nearest < ratio * second
+    first, partner, nearest = (values[accepted] for values in (row.take(starts), chosen, nearest))
+    # Likewise of the rows that share a column: the last one that is written stays.
+    order = np.argsort(nearest * (row[-1] + 1) + first)[::-1]
+    winner = np.full(columns, -1)
+    winner[partner[order]] = order
+    kept = winner.take(partner) == np.arange(len(partner))
+    return first[kept], partner[kept], nearest[kept]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.features.host_windows import expand_runs_on_host, window_pairs_on_host
+from torchslam.features.host_windows import expand_runs_on_host, nearest_bits_on_host, window_pairs_on_host
 
 SAME_SCALE = 0.05
 """Share by which two scales of one level may differ."""
@@ -73,12 +73,17 @@ def nearest_bits(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rows (m,), ascending, each with its nearest column (m,), and their distances (m,): no column twice.
 
-    row, column, distance: (P,) pairs of `rows` rows and the columns that have scales (N,), and their int64 distances
+    row, column, distance: (P,) pairs of `rows` rows, ascending, and of columns that have scales (N,), and their int64
+              distances
     ratio:    to the nearest other column of the scale of the nearest, which must be farther by so much; None: no test
     limit:    largest distance, finite
 
     Of equal distances the lower column wins, and of rows that share a column the nearest, then the lowest.
     """
+    if row.is_cpu:
+        pairs = row.numpy(), column.numpy(), distance.numpy()
+        found = nearest_bits_on_host(*pairs, scales.detach().numpy(), ratio, limit, SAME_SCALE)
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2]).float()
     columns = len(scales)
     # One number for distance and column: the least is the nearest, of equals that of the lowest column.
     keys = distance * columns + column
