@@ -121,7 +121,7 @@ def triangulation_covariance(
     information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
     determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
     for T_cw, sigmas, camera in ((T_1w, sigmas_1, camera_1), (T_2w, sigmas_2, camera_2)):
-        _, valid, J_c, _ = camera.project_with_jacobians(transform(T_cw, points_w))
+        _, valid, J_c = camera.project_with_point_jacobians(transform(T_cw, points_w))
         J = J_c @ T_cw[..., None, :3, :3]
         is_matrix = sigmas.ndim > 1 and sigmas.shape[-2:] == (2, 2) and sigmas.ndim == points_w.ndim + 1
         J = whitening(inverse_2x2(sigmas)) @ J if is_matrix else J / sigmas[..., None, None]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
-from torchslam.ids import distinct, is_among, ranks_among
+from torchslam.ids import distinct, is_among, ranks_among, true_indices
 from torchslam.solvers import BundleProblem, bundle_adjust
 from torchslam.solvers.levenberg import Progress
 from torchslam.solvers.schur import Marginals
@@ -106,9 +106,10 @@ def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part 
     """The free keyframes (k,), what they see, and the fixed ones that see some of it; None where that is nothing."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
-    seen = select(seen, is_among(seen.point_index, slam_map.points_seen_by(free)))
-    which = ranks_among(seen.point_index, distinct(seen.point_index))
-    seen = select(seen, torch.bincount(which)[which] >= 2)
+    rows = true_indices(is_among(seen.point_index, slam_map.points_seen_by(free)))
+    ids = seen.point_index.index_select(0, rows)
+    which = ranks_among(ids, distinct(ids))
+    seen = select(seen, rows[torch.bincount(which)[which] >= 2])
     if len(seen) == 0:
         return None
     point_ids = distinct(seen.point_index)
@@ -167,5 +168,6 @@ def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
 
 
 def select(seen: Observations, rows: Tensor) -> Observations:
-    """Some of the observations, by mask or index."""
-    return Observations(*(getattr(seen, name)[rows] for name in Observations.__dataclass_fields__))
+    """Some of the observations, by index."""
+    columns = (getattr(seen, name) for name in Observations.__dataclass_fields__)
+    return Observations(*(column.index_select(0, rows) for column in columns))

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchslam.features.bits import hamming_between
 from torchslam.features.matching import SCALE_TOLERANCE
 from torchslam.features.windows import nearest_bits, window_pairs
+from torchslam.ids import true_indices
 from torchslam.values import View
 
 
@@ -28,7 +29,7 @@ def match_within(
         expected.keypoints[None], radius[None], expected.mask[None], view.keypoints[None], view.mask[None]
     )
     factor = view.scales.index_select(0, column) / expected.scales.index_select(0, row)
-    alike = torch.nonzero((factor <= SCALE_TOLERANCE) & (factor * SCALE_TOLERANCE >= 1))[:, 0]
+    alike = true_indices((factor <= SCALE_TOLERANCE) & (factor * SCALE_TOLERANCE >= 1))
     row, column = row.index_select(0, alike), column.index_select(0, alike)
     distance = hamming_between(expected.descriptors, row, view.descriptors, column)
     return nearest_bits(row, column, distance, rows, view.scales, ratio, min(max_distance, bits))

@@ -23,9 +23,10 @@ SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its
 
 def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """(n,) int64 number of the cell of the image that pixels (n, 2) lie in."""
-    extent = pixels.new_tensor([size[0], size[1]])
-    grid = pixels.new_tensor(CELLS)
-    column, row = torch.minimum((pixels / extent * grid).clamp(min=0), grid - 1).long().unbind(-1)
+    column, row = (
+        (at / extent * count).clamp_(0, count - 1).long()
+        for at, extent, count in zip(pixels.unbind(-1), size, CELLS, strict=True)
+    )
     return row * CELLS[0] + column
 
 
