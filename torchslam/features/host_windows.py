@@ -52,8 +52,8 @@ def window_pairs_on_host(
 def expand_runs_on_host(starts: Array, ends: Array) -> tuple[Array, Array]:
     """The numbers of runs starts (n,) ... ends (n,) - 1: of which run each is, and the number."""
     counts = ends - starts
-    run = np.repeat(np.arange(len(counts)), counts)
-    return run, np.arange(len(run)) + (starts - (np.cumsum(counts) - counts)).take(run)
+    run = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+    return run, np.arange(len(run), dtype=np.int64) + (starts - (np.cumsum(counts) - counts)).take(run)
 
 
 def _sorted_into_cells(x: Array, y: Array, mask: Array, columns: int, rows: int) -> tuple[Array, Array]:
@@ -71,7 +71,7 @@ def _sorted_into_cells(x: Array, y: Array, mask: Array, columns: int, rows: int)
 def _first_cells(shape: tuple[int, ...], cells: int) -> Array | int:
     """The first cell of the image of each of (B N,) rows; shape: (B, N)."""
     batch, rows = shape
-    return 0 if batch == 1 else np.repeat(np.arange(batch) * cells, rows)
+    return 0 if batch == 1 else np.repeat(np.arange(batch, dtype=np.int64) * cells, rows)
 
 
 def _cells(values: Array, size: float, most: int) -> Array:
