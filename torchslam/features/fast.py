@@ -50,9 +50,9 @@ def _pieces_of(bands: Bands | None, pixels: Any, margin: int) -> list[tuple[int,
     last = len(pixels) - margin
     if bands is None:
         bands = ((margin, last),)
-    elif bands and not isinstance(
+    if bands and not isinstance(
         pixels, np.ndarray
-    ):  # a single piece costs less there than to leave out the rest
+    ):  # there a single piece costs less than to leave out the rest
         bands = ((bands[0][0], bands[-1][1]),)
     return [piece for start, stop in bands for piece in pieces(pixels, max(start, margin), min(stop, last))]
 

@@ -1,4 +1,4 @@
-"""`windows.window_pairs` on the CPU, by numpy: keypoints are counted into cells, so that nothing is searched for.
+"""What `windows` does, on the CPU, by numpy: keypoints are counted into cells, so that nothing is searched for.
 
 A call of numpy costs less than one of torch, and a look into a table less than a binary search: a third to two thirds
 of the time, for every frame that is tracked and every keyframe that is merged.
@@ -6,7 +6,7 @@ of the time, for every frame that is tracked and every keyframe that is merged.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _WIDTH, _HEIGHT = 8.0, 32.0  # pixels, of a cell: a window is some runs of cells, one below the other
-_COLUMNS, _ROWS = 256, 64  # at most; those at the edge take in what lies beyond
+_COLUMNS, _ROWS = 256, 64  # at most: cells of larger images are larger
 
 
 def window_pairs_on_host(
@@ -26,16 +26,16 @@ def window_pairs_on_host(
     """
     (x, y), (at_x, at_y) = (np.ascontiguousarray(xy.reshape(-1, 2).T) for xy in (keypoints, pixels))
     reach = radius.reshape(-1)
-    columns = int(_cells(x.max(), _WIDTH, _COLUMNS)) + 1
-    rows = int(_cells(y.max(), _HEIGHT, _ROWS)) + 1
-    order, starts = _sorted_into_cells(x, y, keypoint_mask, columns, rows)
+    across, down = _Axis.of(x, _WIDTH, _COLUMNS), _Axis.of(y, _HEIGHT, _ROWS)
+    columns = across.number
+    order, starts = _sorted_into_cells(x, y, keypoint_mask, across, down)
 
-    left, right = (_cells(side, _WIDTH, columns) for side in (at_x - reach, at_x + reach))
-    top, bottom = (_cells(side, _HEIGHT, rows) for side in (at_y - reach, at_y + reach))
-    first = top * columns + left + _first_cells(mask.shape, rows * columns)
+    left, right = (across(side) for side in (at_x - reach, at_x + reach))
+    top, bottom = (down(side) for side in (at_y - reach, at_y + reach))
+    first = top * columns + left + _first_cells(mask.shape, down.number * columns)
     bands = np.where(mask.reshape(-1), bottom - top + 1, 0)
-    window, down = expand_runs_on_host(np.zeros_like(bands), bands)
-    begin = first.take(window) + down * columns
+    window, band = expand_runs_on_host(np.zeros_like(bands), bands)
+    begin = first.take(window) + band * columns
     end = begin + (right - left + 1).take(window)
     run, place = expand_runs_on_host(starts.take(begin), starts.take(end))
     row, column = window.take(run), order.take(place)
@@ -56,11 +56,30 @@ def expand_runs_on_host(starts: Array, ends: Array) -> tuple[Array, Array]:
     return run, np.arange(len(run), dtype=np.int64) + (starts - (np.cumsum(counts) - counts)).take(run)
 
 
-def _sorted_into_cells(x: Array, y: Array, mask: Array, columns: int, rows: int) -> tuple[Array, Array]:
+class _Axis(NamedTuple):
+    """Columns or rows of cells: how many pixels each has, and how many there are; the outer ones take in the rest."""
+
+    size: float
+    number: int
+
+    @classmethod
+    def of(cls, values: Array, least: float, most: int) -> _Axis:
+        """For coordinates (n,): cells of at least so many pixels, and at most so many of them."""
+        extent = max(float(values.max()), 0.0)
+        size = max(least, extent / most)
+        return cls(size, min(int(extent / size) + 1, most))
+
+    def __call__(self, values: Array) -> Array:
+        """In which of them coordinates lie."""
+        found: Array = np.clip(np.floor(values * (1 / self.size)), 0, self.number - 1).astype(np.int64)
+        return found
+
+
+def _sorted_into_cells(x: Array, y: Array, mask: Array, across: _Axis, down: _Axis) -> tuple[Array, Array]:
     """The keypoints (B N,) cell by cell, image by image, and where each cell begins: (B rows columns + 1,)."""
-    cell = _cells(y, _HEIGHT, rows) * columns + _cells(x, _WIDTH, columns)
-    cell += _first_cells(mask.shape, rows * columns)
-    count = len(mask) * rows * columns
+    of_image = across.number * down.number
+    cell = down(y) * across.number + across(x) + _first_cells(mask.shape, of_image)
+    count = len(mask) * of_image
     cell[~mask.reshape(-1)] = count  # behind all others
     starts = np.zeros(count + 1, np.int64)
     np.cumsum(np.bincount(cell, minlength=count)[:count], out=starts[1:])
@@ -72,12 +91,6 @@ def _first_cells(shape: tuple[int, ...], cells: int) -> Array | int:
     """The first cell of the image of each of (B N,) rows; shape: (B, N)."""
     batch, rows = shape
     return 0 if batch == 1 else np.repeat(np.arange(batch, dtype=np.int64) * cells, rows)
-
-
-def _cells(values: Array, size: float, most: int) -> Array:
-    """The column or row of cells in which coordinates lie, of so many."""
-    found: Array = np.clip(np.floor(values * (1 / size)), 0, most - 1).astype(np.int64)
-    return found
 
 
 def nearest_bits_on_host(

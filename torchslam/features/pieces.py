@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 PIECE = 260_000
-"""Pixels worked on at once, at most: a dozen intermediate results of bytes fill the second cache of a processor."""
+"""Pixels worked on at once, at most: a dozen intermediate results of bytes stay in the third cache of a processor. With
+half as many they fill the second, and more calls take 3 % longer."""
 
 
 def on_host(pixels: Tensor) -> Any:

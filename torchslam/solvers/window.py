@@ -90,7 +90,9 @@ class _Window:
         by_frame = np.argsort(slots, kind="stable")
         self.slot, self.point = slots[by_frame], point[by_frame]
         counts = np.bincount(self.slot, minlength=len(fixed))
-        self.anchors = int((counts[self.num_free :] > 0).sum())
+        self.anchors = (
+            np.flatnonzero(counts[self.num_free :] > 0) + self.num_free
+        )  # slots that see and are fixed
         self.first = (np.cumsum(counts) - counts)[: self.num_free]  # observation of each free frame
         self.linked = int(counts[: self.num_free].sum())  # observations by free frames, which come first
         self.start = _State(
@@ -140,16 +142,13 @@ class _Window:
     def gauge(self, poses: Array) -> Array | None:
         """(6 F', 1 or 7) directions of the free frames, along the axes of the world, that what is fixed leaves open:
         scale, or a similarity; None where nothing is."""
-        if self.anchors > 1 or not self.num_free:
+        if len(self.anchors) > 1 or not self.num_free:
             return None
-        free = poses[: self.num_free]
-        anchor = poses[self.num_free :][np.bincount(self.slot, minlength=len(poses))[self.num_free :] > 0]
-        R, t = (anchor[0] if self.anchors else free[0])[:, :3], (anchor[0] if self.anchors else free[0])[:, 3]
-        origin = -(R.T @ t)
-        centres_w = -np.einsum("fji,fj->fi", free[:, :, :3], free[:, :, 3])
-        motions = np.zeros((self.num_free, 6, 1 if self.anchors else 7))
+        centres_w = -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
+        origin, centres_w = centres_w[self.anchors[0] if len(self.anchors) else 0], centres_w[: self.num_free]
+        motions = np.zeros((self.num_free, 6, 1 if len(self.anchors) else 7))
         motions[:, :3, 0] = centres_w - origin  # its sign says nothing
-        if not self.anchors:  # all of the world moves along or turns around its axes
+        if not len(self.anchors):  # all of the world moves along or turns around its axes
             motions[:, :3, 1:4] = motions[:, 3:, 4:] = np.eye(3)
             x, y, z = centres_w.T
             motions[:, 0, 5], motions[:, 0, 6] = z, -y
