@@ -160,6 +160,19 @@ def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong)
         adjust_window(replace(problem, **{name: index}), SCALE, 1, 1e-6)
 
 
+@pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
+def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
+    problem = bundle_scene().problem
+    rows = torch.zeros(len(problem.T_cw), dtype=torch.int64)
+    given = {"mask": problem.frame_index > 0, "camera_index": rows, "fixed_points": rows[:1]}
+    if name == "batch":
+        problem = replace(problem, T_cw=problem.T_cw[None])
+    else:
+        problem = replace(problem, **{name: given[name]})
+    with pytest.raises(ValueError, match=r"a window is one problem, without .*: use bundle_adjust"):
+        adjust_window(problem, SCALE, 1, 1e-6)
+
+
 def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
     problem = bundle_scene().problem
     single = BundleProblem(

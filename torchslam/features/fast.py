@@ -50,9 +50,8 @@ def _pieces_of(bands: Bands | None, pixels: Any, margin: int) -> list[tuple[int,
     last = len(pixels) - margin
     if bands is None:
         bands = ((margin, last),)
-    if bands and not isinstance(
-        pixels, np.ndarray
-    ):  # there a single piece costs less than to leave out the rest
+    # Where nothing is done in pieces, a single one costs less than to leave out the rest.
+    if bands and not isinstance(pixels, np.ndarray):
         bands = ((bands[0][0], bands[-1][1]),)
     return [piece for start, stop in bands for piece in pieces(pixels, max(start, margin), min(stop, last))]
 

@@ -151,8 +151,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
     )
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
     rows = asked.shape
-    frame_index = _index("frame_index", problem.frame_index, rows, num_frames)
-    point_index = _index("point_index", problem.point_index, rows, num_points)
+    frame_index = checked_rows("frame_index", problem.frame_index, rows, num_frames)
+    point_index = checked_rows("point_index", problem.point_index, rows, num_points)
 
     is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
     seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, rows)
@@ -173,8 +173,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
         frame_index,
         point_index,
         camera_index,
-        is_finite & ~_as_mask(problem.fixed_frames, is_finite),
-        ~_as_mask(problem.fixed_points, points_w[..., 0]),
+        is_finite & ~as_mask(problem.fixed_frames, is_finite),
+        ~as_mask(problem.fixed_points, points_w[..., 0]),
     )
 
 
@@ -207,7 +207,7 @@ def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
         params = _over("camera.params", "(K,)", params, (len(T_cw), params.shape[-1]))
         return params[:, None], torch.zeros(T_cw.shape[:2], dtype=torch.int64, device=T_cw.device)
     params = _over("camera.params", "(C, K)", params, (len(T_cw), *params.shape[-2:]))
-    return params, _index("camera_index", index, T_cw.shape[:2], params.shape[1])
+    return params, checked_rows("camera_index", index, T_cw.shape[:2], params.shape[1])
 
 
 def _priors(problem: BundleProblem, T_cw: Tensor, params: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -238,7 +238,7 @@ def _over(name: str, described: str, tensor: Tensor, shape: tuple[int, ...]) -> 
     return tensor.expand(shape)
 
 
-def _index(name: str, index: Tensor, shape: tuple[int, ...], size: int) -> Tensor:
+def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) -> Tensor:
     """Rows (B, N) that lie in 0 ... size - 1."""
     if index.shape not in (shape, shape[1:]):
         each = "frame" if name == "camera_index" else "observation"
@@ -248,7 +248,7 @@ def _index(name: str, index: Tensor, shape: tuple[int, ...], size: int) -> Tenso
     return index.expand(shape)
 
 
-def _as_mask(rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
+def as_mask(rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
     """A bool mask of the shape (B, N) of `like`, of rows given as one, or as indices."""
     batch, count = like.shape
     rows = torch.as_tensor(() if rows is None else rows, device=like.device)

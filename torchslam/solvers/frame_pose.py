@@ -11,12 +11,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from torchslam.solvers.host import (
+    DAMPING,
+    DAMPING_DOWN,
+    DAMPING_UP,
+    NEAREST,
+    SLACK,
+    Array,
+    cauchy,
+    huber,
+    moved,
+    on_host,
+)
 
 RobustKernel = Literal["cauchy", "huber"]
 """As in `geometry.robust`."""
@@ -26,11 +38,6 @@ SCALE = 2.0
 
 _ITERATIONS = 10
 _NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
-_DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0
-_SLACK = 1 + 1e-13  # of the cost: rounding is no reason to refuse a step
-_NEAREST = float(np.finfo(np.float64).eps)  # depth in front of which a point counts as behind the camera
-
-Array = NDArray[Any]  # on the host, of doubles
 
 
 @dataclass(frozen=True)
@@ -110,7 +117,7 @@ class FrameProblem:
         points_c = pose[:, :3] @ self.points_w
         points_c += pose[:, 3:]
         z = points_c[2]
-        inverse = 1 / np.maximum(z, _NEAREST)
+        inverse = 1 / np.maximum(z, NEAREST)
         image = points_c[:2] * inverse
         x, y = image
         # The derivatives of (x, y) in translation and rotation, and the errors in them.
@@ -133,7 +140,7 @@ class FrameProblem:
         weights: (N,) of the squared errors, none negative; zero where a point does not count
         """
         counts = on_host(weights)
-        model, damping = _Model.of(start, counts, kernel), _DAMPING
+        model, damping = _Model.of(start, counts, kernel), DAMPING
         for _ in range(_ITERATIONS):
             step = _step(model.normal, damping)
             if step is None:
@@ -141,18 +148,13 @@ class FrameProblem:
             promised = -0.5 * float(step @ model.normal[:6, 6])
             trial = _Model.of(self._see(moved(model.sighting.pose, step)), counts, kernel)
             settled = not promised > _NEGLIGIBLE * model.cost
-            better = trial.cost <= _SLACK * model.cost
+            better = trial.cost <= SLACK * model.cost
             model = trial if better else model
             if settled:
                 break
-            damping *= _DAMPING_DOWN if better else _DAMPING_UP
+            damping *= DAMPING_DOWN if better else DAMPING_UP
         success = _is_definite(model.normal[:6, :6])
         return FramePose(model.sighting if success else start, success, model)
-
-
-def on_host(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().double().numpy()
-    return array
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ class _Model:
     @classmethod
     def of(cls, sighting: Sighting, weights: Array, kernel: RobustKernel) -> _Model:
         squared = sighting.squares * weights
-        rho, influence = _KERNELS[kernel](squared)
+        rho, influence = _KERNELS[kernel](squared, SCALE)
         weighted = sighting.rows * (influence * weights)
         normal = weighted.reshape(7, -1) @ sighting.rows.reshape(7, -1).T
         return cls(sighting, kernel, weights, squared, influence, 0.5 * float(rho.sum()), normal)
@@ -201,18 +203,7 @@ class _Model:
         return factor
 
 
-def _cauchy(squared: Array) -> tuple[Array, Array]:
-    share = squared * SCALE**-2
-    return np.log1p(share) * SCALE**2, 1 / (share + 1)
-
-
-def _huber(squared: Array) -> tuple[Array, Array]:
-    limit = SCALE**2
-    root = np.sqrt(np.maximum(squared, limit))
-    return root * (2 * SCALE) + np.minimum(squared, limit) - 2 * limit, SCALE / root
-
-
-_KERNELS = {"cauchy": _cauchy, "huber": _huber}  # squared errors (N,) -> rho, rho', as `geometry.robust`
+_KERNELS = {"cauchy": cauchy, "huber": huber}
 
 
 def _step(normal: Array, damping: float) -> Array | None:
@@ -224,23 +215,6 @@ def _step(normal: Array, damping: float) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     return step if math.isfinite(float(step @ gradient)) else None
-
-
-def moved(pose: Array, step: Array) -> Array:
-    """A pose (3, 4) moved by [rho, omega] from the left, by Cayley's rotation: as `solvers.tangent.retract`."""
-    x, y, z = (0.5 * step[3:]).tolist()
-    xx, yy, zz = x * x, y * y, z * z
-    f = 2 / (1 + xx + yy + zz)
-    turn = np.array(
-        (
-            (1 - f * (yy + zz), f * (x * y - z), f * (x * z + y)),
-            (f * (x * y + z), 1 - f * (xx + zz), f * (y * z - x)),
-            (f * (x * z - y), f * (y * z + x), 1 - f * (xx + yy)),
-        )
-    )
-    result: Array = turn @ pose
-    result[:, 3] += step[:3]
-    return result
 
 
 def _is_definite(hessian: Array) -> bool:

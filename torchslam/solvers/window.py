@@ -8,7 +8,6 @@ and in double precision: the numbers are few, and calls are what costs. There ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -19,14 +18,23 @@ from torch import Tensor
 
 from torchslam.geometry import Undistorted
 from torchslam.geometry.whitening import whitening
-from torchslam.solvers.bundle_problem import BundleProblem
-from torchslam.solvers.frame_pose import Array, moved, on_host
+from torchslam.solvers.bundle_problem import BundleProblem, as_mask, checked_rows
+from torchslam.solvers.host import (
+    DAMPING,
+    DAMPING_DOWN,
+    DAMPING_UP,
+    NEAREST,
+    SLACK,
+    Array,
+    huber,
+    moved,
+    on_host,
+)
 from torchslam.solvers.window_equations import LOWER, Equations, Step
 
-_DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0  # as of `levenberg`, and so the next two
-_NEAR = 1e-2  # share of the cost that a step promises: below it the kernel's curvature counts
-_SLACK = 1 + 1e-13  # of the cost: rounding is no reason to refuse a step
-_NEAREST = float(np.finfo(np.float64).eps)  # depth in front of which a point counts as behind the camera
+_NEAR = (
+    1e-2  # share of the cost that a step promises: below it the kernel's curvature counts, as of `levenberg`
+)
 
 
 class Adjusted(NamedTuple):
@@ -40,25 +48,25 @@ class Adjusted(NamedTuple):
 def adjust_window(problem: BundleProblem, scale: float, iterations: int, tolerance: float) -> Adjusted:
     """Minimise Huber's costs of reprojection errors over the poses that are not fixed, and all points.
 
-    problem:   one, without mask, priors and fixed points, of finite numbers and one camera
+    problem:   one, of finite numbers and one camera, without mask, priors and fixed points
     scale:     of the kernel, in units of the whitened error
     tolerance: stop where a step promises to lower the cost by less than this share of it
 
-    Raises ValueError for indices that do not fit.
+    Raises ValueError for indices that do not fit, and for what it does not take.
     """
     window = _Window(problem, scale)
-    model, damping, is_near = window.evaluate(window.start), _DAMPING, False
+    model, damping, is_near = window.evaluate(window.start), DAMPING, False
     for _ in range(iterations):
         step = model.equations(is_near).step(damping, window.gauge(model.state.poses))
         if step is None:
-            damping *= _DAMPING_UP
+            damping *= DAMPING_UP
             continue
         trial = window.evaluate(window.moved(model.state, step))
         promised = step.promised / model.cost if model.cost > 0 else 0.0
-        is_better = trial.cost <= _SLACK * model.cost
+        is_better = trial.cost <= SLACK * model.cost
         if is_better:
             model, is_near = trial, promised < _NEAR
-        damping *= _DAMPING_DOWN if is_better else _DAMPING_UP
+        damping *= DAMPING_DOWN if is_better else DAMPING_UP
         if promised <= tolerance:
             break
     return window.adjusted(model)
@@ -80,9 +88,7 @@ class _Window:
 
     def __init__(self, problem: BundleProblem, scale: float) -> None:
         self.problem, self.scale = problem, scale
-        fixed = _fixed_frames(problem)
-        frame = _index("frame_index", problem.frame_index, len(fixed))
-        point = _index("point_index", problem.point_index, len(problem.points_w))
+        frame, point, fixed = _rows_of(problem)
         moves = ~fixed & (np.bincount(frame, minlength=len(fixed)) > 0)
         self.order = np.argsort(~moves, kind="stable")  # of frames, by slot
         self.num_free = int(moves.sum())
@@ -120,16 +126,14 @@ class _Window:
         rays_w = state.points.take(self.point, axis=1)
         rays_w -= rows[9:]
         x, y, z = (R_cw * rays_w).sum(1)
-        in_front = z > _NEAREST
+        in_front = z > NEAREST
         inverse = 1 / np.where(in_front, z, 1.0)
         image = np.stack((x * inverse, y * inverse))
         off = image - self.xy
         errors = self.along[0] * off[0] + self.along[1] * off[1]
         squared = np.where(in_front, np.square(errors).sum(0), self.behind)
-        limit = self.scale**2
-        root = np.sqrt(np.maximum(squared, limit))
-        rho = root * (2 * self.scale) + np.minimum(squared, limit) - 2 * limit
-        seen = _Seen(R_cw, rays_w, image, inverse, errors, squared, in_front * (self.scale / root))
+        rho, influence = huber(squared, self.scale)
+        seen = _Seen(R_cw, rays_w, image, inverse, errors, squared, in_front * influence)
         return _Model(self, state, 0.5 * float(rho.sum()), seen)
 
     def moved(self, state: _State, step: Step) -> _State:
@@ -165,20 +169,16 @@ class _Window:
         return Adjusted(T_cw, points_w, model.cost)
 
 
-def _index(name: str, index: Tensor, size: int) -> Array:
-    """Rows (O,) that lie in 0 ... size - 1."""
-    rows: Array = index.cpu().numpy()
-    if len(rows) and not 0 <= rows.min() <= rows.max() < size:
-        raise ValueError(f"{name} must lie in 0 ... {size - 1}")
-    return rows
-
-
-def _fixed_frames(problem: BundleProblem) -> Array:
-    """(F,) bool."""
-    fixed: Tensor | Sequence[int] = () if problem.fixed_frames is None else problem.fixed_frames
-    mask = np.zeros(len(problem.T_cw), dtype=bool)
-    mask[torch.as_tensor(fixed, device="cpu").numpy() if len(fixed) else []] = True
-    return mask
+def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
+    """(O,), (O,) the frame and the point of each observation, and (F,) bool, which frames are fixed."""
+    names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior")
+    if problem.is_batch or any(getattr(problem, name) is not None for name in names):
+        raise ValueError(f"a window is one problem, without {', '.join(names)}: use bundle_adjust")
+    shape = (1, len(problem.pixels))
+    frame = checked_rows("frame_index", problem.frame_index, shape, len(problem.T_cw))
+    point = checked_rows("point_index", problem.point_index, shape, len(problem.points_w))
+    fixed = as_mask(problem.fixed_frames, problem.T_cw[None, :, 0, 0])
+    return frame[0].cpu().numpy(), point[0].cpu().numpy(), fixed[0].cpu().numpy()
 
 
 def _observed(problem: BundleProblem, rows: Tensor) -> tuple[Array, Array, Array]:

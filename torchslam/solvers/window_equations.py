@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchslam.solvers.frame_pose import Array
+from torchslam.solvers.host import Array
 
-_TINY = (
-    float(np.finfo(np.float64).tiny) ** 0.5
-)  # keeps a frame solvable that lost all it saw: its step is zero
+# Keeps a frame solvable that lost all it saw: its step is zero.
+_TINY = float(np.finfo(np.float64).tiny) ** 0.5
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 """Of a symmetric 3x3 matrix the entries that are kept."""
