@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from torchslam import Features, Matches
-from torchslam.values import View
+from torchslam.types import View
 
 APART, LEAST, EDGE = 8, 0.005, 8  # pixels between samples; share of the best corner; pixels to the edge
 RETURNS = 0.5  # pixels: to the next image and back, a sample is where it was

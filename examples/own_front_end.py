@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from torchslam import ORB, Features, Matches
-from torchslam.values import View
+from torchslam.types import View
 
 
 class Patches(torch.nn.Module):

@@ -15,9 +15,9 @@ import torch
 
 from torchslam import open_sequence
 from torchslam.data import write_trajectory
-from torchslam.export.colmap import write_colmap
-from torchslam.export.scene import scene_of
-from torchslam.refinement import CameraChoice, refine
+from torchslam.io.export.colmap import write_colmap
+from torchslam.io.export.scene import scene_of
+from torchslam.refine import CameraChoice, refine
 
 
 def main() -> None:

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
-from torchslam.batch.identity import digest, of_files, program
-from torchslam.batch.kept import RUNS, keep
+from torchslam.batch.fingerprints import digest, of_files, program
+from torchslam.batch.result_store import RUNS, keep
 from torchslam.batch.rows import short_name
 from torchslam.batch.table import read_times
 from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
-from torchslam.output.results import read_metrics
+from torchslam.io.results import read_metrics
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

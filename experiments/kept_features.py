@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchslam.features import extractor
-from torchslam.values import Features
+from torchslam.types import Features
 
 FOLDER = Path(os.environ.get("TORCHSLAM_KEPT_FEATURES", "results/kept_features"))
 

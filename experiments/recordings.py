@@ -11,8 +11,8 @@ import torch
 
 from experiments.common import DATA_DIR, add_engine, at_hand, figures_of_all, row_of, table
 from torchslam.batch import Columns, Row
-from torchslam.batch.kept import RUNS
-from torchslam.output.results import read_metrics
+from torchslam.batch.result_store import RUNS
+from torchslam.io.results import read_metrics
 
 SEEDS = (0, 1, 2)
 DEFAULT = "default"

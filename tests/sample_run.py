@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
-from torchslam.run import Run
-from torchslam.values import State, StepResult, Tracked, Trajectory, View
-from torchslam.world.map import Map
-from torchslam.world.track import Track
-from torchslam.world.world import World
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.map.tracking_state import Track
+from torchslam.system.run import Run
+from torchslam.types import State, StepResult, Tracked, Trajectory, View
 
 KEYPOINTS = 40
 FRAMES = 30

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tests.world.simulated import tracked_at
+from tests.map.simulated import tracked_at
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
+from torchslam.map.submap import World
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import View
-from torchslam.world.world import World
+from torchslam.types import View
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 UNTOUCHED = torch.eye(4, dtype=torch.float64)

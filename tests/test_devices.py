@@ -13,7 +13,7 @@ from tests.accelerator import SimulatedTensor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import ORB, SLAM, ClipSLAM, evaluate, load_config, open_sequence, solve
-from torchslam.cli import main
+from torchslam.cli.main import main
 from torchslam.evaluation import ate
 
 CPU = torch.device("cpu")

@@ -15,7 +15,7 @@ from torchslam.data.association import interpolate_poses
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate, ate_apart, evaluate, rpe
 from torchslam.geometry.lie import quaternion_from_matrix, rigid, se3_exp, se3_inverse, so3_exp
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 
 def _poses(generator: torch.Generator, count: int, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import torchslam
-from torchslam import named_configs
-from torchslam.cli import main
-from torchslam.missing import OPENCV
+from torchslam.cli.main import main
+from torchslam.config import builtin as named_configs
+from torchslam.utils.optional_deps import OPENCV
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "configs", "torchslam")
@@ -67,7 +67,7 @@ def test_every_file_of_the_package_and_every_configuration_is_in_the_wheel_uncha
 
 def test_configurations_are_found_by_name_outside_of_the_repository(unpacked: Path, tmp_path: Path) -> None:
     def config(name: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "torchslam.cli", "config", "--config", name]
+        command = [sys.executable, "-m", "torchslam.cli.main", "config", "--config", name]
         environment = os.environ | {"PYTHONPATH": str(unpacked)}
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
@@ -118,7 +118,7 @@ def test_no_window_of_opencv_is_ever_opened() -> None:
 @pytest.mark.parametrize(
     "code",
     [
-        "from torchslam.cli import main; raise SystemExit(main(['info', 'synthetic:room']))",
+        "from torchslam.cli.main import main; raise SystemExit(main(['info', 'synthetic:room']))",
         "import torchslam; torchslam.SLAM",
     ],
     ids=["command line", "library"],

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from torchslam import ORB, SLAM, ClipSLAM, Config, Features, load_config, open_sequence, plugins
-from torchslam.cli import main
+from torchslam.cli.main import main
 from torchslam.errors import ConfigError
-from torchslam.front_end import image_extractor
+from torchslam.system.front_end import image_extractor
 from torchslam.tracking.lightglue import LightGlue
 from torchslam.tracking.matcher import matcher_of
-from torchslam.values import Frame, View
+from torchslam.types import Frame, View
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_front_end.py"
 ROOM = "synthetic:room?frames=14"

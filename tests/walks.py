@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 
 class Walk(Sequence):

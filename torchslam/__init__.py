@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from torchslam.missing import explained
+from torchslam.utils.optional_deps import explained
 
 if TYPE_CHECKING:
     from torchslam.config import Config, load_config
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
         umeyama,
     )
     from torchslam.learning.clip import ClipGraph, ClipPoses, ClipSLAM, clip_loss
-    from torchslam.run import Run
-    from torchslam.slam import SLAM
-    from torchslam.solvers import BundleProblem, bundle_adjust, minimize, refine_pose
-    from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
-    from torchslam.values import Features, Frame, Matches, State, StepResult, Trajectory
+    from torchslam.optim import BundleProblem, bundle_adjust, minimize, refine_pose
+    from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve
+    from torchslam.system.run import Run
+    from torchslam.system.slam import SLAM
+    from torchslam.types import Features, Frame, Matches, State, StepResult, Trajectory
 
     __version__: str
 
@@ -80,11 +80,11 @@ HOMES = {
     "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_projected",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
     "torchslam.learning.clip": "ClipGraph ClipPoses ClipSLAM clip_loss",
-    "torchslam.run": "Run",
-    "torchslam.slam": "SLAM",
-    "torchslam.solvers": "BundleProblem bundle_adjust minimize refine_pose",
-    "torchslam.solvers.graph": "GraphSolution ObservationGraph solve",
-    "torchslam.values": "Features Frame Matches State StepResult Trajectory",
+    "torchslam.system.run": "Run",
+    "torchslam.system.slam": "SLAM",
+    "torchslam.optim": "BundleProblem bundle_adjust minimize refine_pose",
+    "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve",
+    "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from torchslam.cli import main
+from torchslam.cli.main import main
 
 sys.exit(main())

@@ -19,7 +19,7 @@ from torchslam.errors import TrajectoryError
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 TOLERANCE = 0.02
 """Seconds: an estimated pose without a true one this near in time is left out."""

@@ -52,7 +52,7 @@ def _settings() -> str:
 
 
 def _sections(settings: Any, prefix: str) -> Iterator[str]:
-    from torchslam.settings import Settings
+    from torchslam.config.schema import Settings
 
     rows, inner = [], []
     for each in fields(settings):
@@ -84,7 +84,7 @@ def _sections(settings: Any, prefix: str) -> Iterator[str]:
 
 def _commands() -> str:
     """What every command says of itself under `--help`."""
-    from torchslam.cli import COMMANDS, build_parser
+    from torchslam.cli.main import COMMANDS, build_parser
 
     os.environ["COLUMNS"] = "100"
     parts = [
@@ -105,15 +105,15 @@ def _commands() -> str:
 
 def _map_file() -> str:
     """The columns of `map.safetensors`."""
-    from torchslam.world import schema
-    from torchslam.world.map_file import FORMAT
+    from torchslam.map import schema
+    from torchslam.map.file import FORMAT
 
     parts = [
         f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds everything that a run keeps: of each world its "
         "tables, and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by "
         "row, the columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a "
         "descriptor. Floats are float64 as a run writes them; a descriptor is bytes or floats.",
-        "`torchslam.world.map_file.read_worlds(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
+        "`torchslam.map.file.read_worlds(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
         "Any safetensors reader gets at the tensors.",
     ]
     for name in ("points", "keyframes", "frames", "observations"):

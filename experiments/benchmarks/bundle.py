@@ -22,7 +22,7 @@ from torch import Tensor
 from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, milliseconds, rmse
 from experiments.common import parser_of, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
-from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
 
 HERE = Path(__file__).parent
 NOISE_PX = 0.5

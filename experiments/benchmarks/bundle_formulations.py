@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from experiments.benchmarks.bundle import loss_of, points_loss
 from experiments.benchmarks.solvers import CENTRE, FOCAL, colmap_solve
-from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.optim import BundleProblem, bundle_adjust
 
 ITERATIONS = 5  # of the peers that do not stop by themselves; all have converged then
 ANCHOR = 1e5  # weight of what holds theseus's first two frames, px per unit

@@ -34,7 +34,7 @@ from experiments.benchmarks.bundle import FRAMES, POINTS, ring, window
 from experiments.benchmarks.bundle_formulations import Stated
 from experiments.benchmarks.solvers import rmse
 from experiments.common import parser_of, table
-from torchslam.solvers import BundleProblem
+from torchslam.optim import BundleProblem
 
 HERE = Path(__file__).parent
 SECONDS, GIGABYTES = 200, 8  # of processor time and memory that a solver is given

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchslam.features import ORB, OpenCVORB, match, match_projected
-from torchslam.values import Features
+from torchslam.types import Features
 
 HERE = Path(__file__).parent
 SEQUENCES = ("redkitchen", "kitti07", "shelf_bin")

@@ -20,12 +20,12 @@ from torch import Tensor
 from experiments.common import parser_of, table
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
-from torchslam.loops.memory import Memory
+from torchslam.loop_closing.loop_closer import Memory
+from torchslam.map.atlas import Worlds
 from torchslam.mapping.mapper import Mapper
-from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import Tracked, View
-from torchslam.world.worlds import Worlds
+from torchslam.types import Tracked, View
+from torchslam.utils.timing import Stopwatch
 
 HERE = Path(__file__).parent
 SIZES, NEXT = (200, 1000, 5000), 31

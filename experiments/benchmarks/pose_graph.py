@@ -21,7 +21,7 @@ from torch import Tensor
 from experiments.benchmarks.solvers import gradient_error, milliseconds
 from experiments.common import parser_of, table
 from torchslam.geometry import rigid, sim3_exp, sim3_inverse, sim3_log, sim3_scale, so3_exp
-from torchslam.solvers import PoseGraph, pose_graph_optimize
+from torchslam.optim import PoseGraph, pose_graph_optimize
 
 HERE = Path(__file__).parent
 RADIUS = 20.0

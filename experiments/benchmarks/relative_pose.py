@@ -38,7 +38,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
 from torchslam.geometry.relative_pose_search import Model
-from torchslam.values import Features
+from torchslam.types import Features
 
 HERE = Path(__file__).parent
 # Sequences with the least baseline in metres whose direction the ground truth tells, to some degrees: several times

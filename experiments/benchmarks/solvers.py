@@ -22,7 +22,7 @@ from torch import Tensor
 from experiments.benchmarks.problems import PEERS, load_problems
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.geometry.robust import Kernel
-from torchslam.solvers import BundleProblem, bundle_adjust, refine_pose
+from torchslam.optim import BundleProblem, bundle_adjust, refine_pose
 
 HERE = Path(__file__).parent
 FOCAL, CENTRE, SIZE = 525.0, (319.5, 239.5), (640, 480)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from torchslam.config import MatchingConfig
 from torchslam.features import match
 from torchslam.tracking.matcher import DescriptorMatcher, Prior, max_distance
-from torchslam.values import Matches, View
+from torchslam.types import Matches, View
 
 
 class Mutual:

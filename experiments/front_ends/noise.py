@@ -19,7 +19,7 @@ from experiments.common import DATA_DIR, sequences, table
 from experiments.front_ends.run import FRONT_ENDS, NAMES
 from torchslam import SLAM, load_config
 from torchslam.geometry import squared_reprojection_errors, transform
-from torchslam.solvers.graph import ObservationGraph
+from torchslam.optim.run_graph import ObservationGraph
 
 LEAST_VIEWS = 4
 MEDIAN = 2 * math.log(2)  # of a chi-square distribution of two degrees of freedom

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.solvers.implicit import Backward
+from torchslam.optim import RefinedPose, refine_pose
+from torchslam.optim.core.implicit import Backward
 
 HERE = Path(__file__).parent
 MODES: tuple[tuple[Backward, int], ...] = (("implicit", 20), ("unroll", 20), ("unroll", 5), ("truncated", 20))

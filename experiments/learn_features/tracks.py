@@ -15,7 +15,7 @@ from experiments.learn_features.front_end import patches
 from torchslam import Camera, match
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import triangulate_many
-from torchslam.values import Features
+from torchslam.types import Features
 
 VIEWS_S = (-0.4, -0.2, 0.0, 0.2, 0.4)  # seconds from the base frame
 MAX_DISTANCE = 0.25  # 1 - cosine

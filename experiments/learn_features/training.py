@@ -14,7 +14,7 @@ from experiments.learn_features.tracks import MIN_PARALLAX, MIN_VIEWS, Tracks, s
 from torchslam.geometry import Camera, se3_inverse, triangulate_many
 from torchslam.learning.losses import pose_errors, reprojection_loss
 from torchslam.learning.training import Training
-from torchslam.solvers import refine_pose
+from torchslam.optim import refine_pose
 
 UNIT = 3e-3  # of the errors, radians and shares of the median depth: about their median
 KERNEL_PX = 1.5

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from experiments.common import table, write_between
 from torchslam.config import load_config
-from torchslam.front_end import Simulated
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
-from torchslam.slam import SLAM
-from torchslam.values import Frame
+from torchslam.system.front_end import Simulated
+from torchslam.system.slam import SLAM
+from torchslam.types import Frame
 
 
 def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:

@@ -17,9 +17,9 @@ from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import evaluate
 from torchslam.geometry import se3_inverse
-from torchslam.run import finish
-from torchslam.slam import SLAM
-from torchslam.values import StepResult, Trajectory
+from torchslam.system.run import finish
+from torchslam.system.slam import SLAM
+from torchslam.types import StepResult, Trajectory
 
 WINDOW = 500  # frames
 START, END = "<!-- to and fro -->\n", "<!-- end of to and fro -->"

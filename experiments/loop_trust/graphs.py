@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import sim3_inverse, sim3_log, umeyama
-from torchslam.solvers import PoseGraph, pose_graph_optimize
-from torchslam.solvers.implicit import Backward
+from torchslam.optim import PoseGraph, pose_graph_optimize
+from torchslam.optim.core.implicit import Backward
 
 
 @dataclass(frozen=True)

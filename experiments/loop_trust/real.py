@@ -11,11 +11,11 @@ from experiments.loop_trust.graphs import Graphs
 from experiments.loop_trust.simulation import false_loops
 from torchslam.config import Config
 from torchslam.data.association import interpolate_poses
-from torchslam.data.trajectory_file import read_trajectory
+from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.geometry import Camera, se3_inverse, sim3_inverse
-from torchslam.loops.relation import relate
-from torchslam.world.map import Map
-from torchslam.world.map_file import read_map
+from torchslam.loop_closing.relative_sim3 import relate
+from torchslam.map.file import read_map
+from torchslam.map.map import Map
 
 _APART = 10  # keyframes between the ends of a loop, at least
 _LOOPS = 30  # pairs of keyframes that are tried, evenly spaced among those that share points

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from experiments.loop_trust.baselines import agreement
 from experiments.loop_trust.graphs import Graphs, chi_squares, solve
-from torchslam.solvers.implicit import Backward
+from torchslam.optim.core.implicit import Backward
 
 WIDTH = 32
 _LAYERS = 3

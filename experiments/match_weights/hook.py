@@ -21,9 +21,9 @@ from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import hamming
 from torchslam.geometry import se3_exp, transform
-from torchslam.solvers import RefinedPose
+from torchslam.optim import RefinedPose
 from torchslam.tracking.matcher import DescriptorMatcher, Prior
-from torchslam.values import Matches, View
+from torchslam.types import Matches, View
 
 NUM_CUES = 12
 BOUND = 8.0

@@ -20,7 +20,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.features import ORB, hamming, match
 from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform, triangulate_many
 from torchslam.learning.clips import frames_in
-from torchslam.values import Features
+from torchslam.types import Features
 
 REFERENCES_S = (0.2, 0.4)  # seconds before the base frame that points are triangulated with
 QUERIES_S = (0.5, 1.0, 2.0)  # seconds after it that frames are localised

@@ -16,8 +16,8 @@ from torchslam import SLAM
 from torchslam.data.sequence import Sequence
 from torchslam.data.synthetic import SyntheticSequence
 from torchslam.evaluation import evaluate
-from torchslam.front_end import true_poses
 from torchslam.geometry import se3_inverse
+from torchslam.system.front_end import true_poses
 
 
 def reference_poses(sequence: Sequence, cache: Path) -> Tensor:

@@ -19,7 +19,7 @@ from experiments.match_weights.problems import Problems
 from experiments.match_weights.weighting import refine, refine_learned
 from torchslam.learning.losses import pose_errors
 from torchslam.learning.training import Training
-from torchslam.solvers import RefinedPose
+from torchslam.optim import RefinedPose
 
 SHARDS = 2  # of a batch; the number of processes divides it
 _CHUNK = 64

@@ -9,7 +9,7 @@ from experiments.match_weights.layers import InContext, crowd_and_support, maske
 from experiments.match_weights.problems import Problems
 from torchslam.geometry import innovation_covariances, mahalanobis_squared, transform
 from torchslam.geometry.robust import Kernel
-from torchslam.solvers import RefinedPose, refine_pose
+from torchslam.optim import RefinedPose, refine_pose
 
 NUM_FEATURES = 21
 ROUNDS = 2

@@ -16,7 +16,7 @@ from experiments.match_weights.hook import HookWeights, as_in_tracking, refine_s
 from experiments.match_weights.run import CACHE, HERE, TRAINING, problems_of
 from experiments.match_weights.training import Settings, losses, train
 from experiments.recordings import DEFAULT, KEPT_ORB, RECORDINGS, add_choices, outcomes_of, report
-from torchslam.batch.identity import digest
+from torchslam.batch.fingerprints import digest
 
 ALIKE, LEARNED = "alike", "learned"
 ARMS = (DEFAULT, ALIKE, LEARNED)

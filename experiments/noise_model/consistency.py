@@ -15,7 +15,7 @@ from torchslam.geometry import se3_inverse, skew, transform
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.robust import robustify
 from torchslam.geometry.whitening import times
-from torchslam.solvers.graph import ObservationGraph
+from torchslam.optim.run_graph import ObservationGraph
 
 GAUGE = 7
 _SCALE = 2.45  # of `solve`

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchslam import ORB, Features
-from torchslam.features.bits import hamming
 from torchslam.features.fast import patch_scores
+from torchslam.features.matching.hamming import hamming
 from torchslam.features.pyramid import build_levels, gather_level_patches, plan_atlas
 
 NAMES = (

@@ -14,10 +14,10 @@ from experiments.trials.trials import drone
 from torchslam import ORB, SLAM, Config, Features, open_sequence
 from torchslam.data.association import interpolate_poses
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
-from torchslam.front_end import image_extractor
 from torchslam.geometry import se3_inverse
-from torchslam.solvers.graph import ObservationGraph
-from torchslam.world.history import RunGraph
+from torchslam.map.posed_frames import RunGraph
+from torchslam.optim.run_graph import ObservationGraph
+from torchslam.system.front_end import image_extractor
 
 LEAST_KNOWN = 4
 """Keyframes of which the truth must be known: fewer leave hardly more than the seven directions of their alignment."""

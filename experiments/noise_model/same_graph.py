@@ -22,7 +22,7 @@ from experiments.noise_model.training import (
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.alignment import umeyama
-from torchslam.solvers.graph import solve
+from torchslam.optim.run_graph import solve
 
 SPLITS = 5
 

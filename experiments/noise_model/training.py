@@ -14,7 +14,7 @@ from experiments.noise_model.model import NoiseModel
 from torchslam.evaluation import ate
 from torchslam.geometry import transform
 from torchslam.geometry.robust import robustify
-from torchslam.solvers.graph import GraphSolution, solve
+from torchslam.optim.run_graph import GraphSolution, solve
 
 BEND = 2.45
 """Of the Huber kernel, in standard deviations: that of `solve`."""

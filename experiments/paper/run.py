@@ -14,8 +14,8 @@ from typing import Any
 from PIL import Image
 
 from experiments.common import DATA_DIR, add_engine, figures_of_all, row_of, table, write_between
-from torchslam.batch.kept import RUNS
-from torchslam.output.results import PLOTS
+from torchslam.batch.result_store import RUNS
+from torchslam.io.results import PLOTS
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parents[1] / "configs" / "paper.toml"

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from experiments.places.train import k_majority
 from torchslam.features import match, unpack_bits
-from torchslam.features.bits import sign_products
-from torchslam.loops import Places
-from torchslam.values import Features
+from torchslam.features.matching.hamming import sign_products
+from torchslam.loop_closing import Places
+from torchslam.types import Features
 
 
 def places(features: Features, strongest: int, words: Tensor | None = None) -> Tensor:
-    """torchslam.loops, with so many descriptors of each image (at most the 400 it takes)."""
+    """torchslam.loop_closing, with so many descriptors of each image (at most the 400 it takes)."""
     memory, mask = Places(words), features.mask.clone()
     mask[:, strongest:] = False
     for key in range(len(mask)):
@@ -61,7 +61,7 @@ def own_words(features: Features, num_words: int) -> Tensor:
 
 
 def first_words(features: Features, image: int) -> Tensor:
-    """The descriptors of one image as words, as torchslam.loops does for floats."""
+    """The descriptors of one image as words, as torchslam.loop_closing does for floats."""
     return features.descriptors[image][features.mask[image]][:400]
 
 

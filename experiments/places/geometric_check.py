@@ -8,7 +8,7 @@ from torch import Tensor
 from experiments.places.images import lookalike_truth
 from torchslam.features import match
 from torchslam.geometry import Camera, estimate_relative_pose
-from torchslam.values import Features
+from torchslam.types import Features
 
 SIZE = (512, 384)
 FOCAL = 0.9 * SIZE[0]  # the camera is unknown: a guess

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from experiments.common import DATA_DIR
 from torchslam.data import open_sequence
-from torchslam.data.image_file import read_grey
+from torchslam.data.formats.image_file import read_grey
 from torchslam.features import ORB
 from torchslam.geometry import se3_inverse, so3_log
-from torchslam.values import Features
+from torchslam.types import Features
 
 # Name: (what is opened, every how many frames). The last three share no place with anything and only distract.
 SEQUENCES = {

@@ -14,9 +14,9 @@ from experiments.places import alternatives
 from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
-from torchslam.loops import Places
-from torchslam.loops.codes import rendered_words
-from torchslam.values import Features
+from torchslam.loop_closing import Places
+from torchslam.loop_closing.global_descriptor import rendered_words
+from torchslam.types import Features
 
 HEADER = ["", "lookalike: AP, recall at precision 1, recall@1"]
 HEADER += [f"{name}: AP, recall@1, @5" for name in MEASURED]

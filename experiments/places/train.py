@@ -1,4 +1,4 @@
-"""Make the words that torchslam.loops brings along: centres of ORB descriptors of rendered images. See README.md."""
+"""Make the words that torchslam.loop_closing brings along: centers of ORB descriptors. See README.md."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-import torchslam.loops.codes
+import torchslam.loop_closing.global_descriptor
 from torchslam.data import open_sequence
 from torchslam.features import ORB, pack_bits
-from torchslam.features.bits import sign_products, spread_bits
+from torchslam.features.matching.hamming import sign_products, spread_bits
 
 # Seed 0 is left to measurements, tests and demonstrations.
 TRAINING = [f"synthetic:room?seed={seed}" for seed in range(1, 13)]
@@ -25,7 +25,7 @@ ROUNDS = 8
 def main() -> None:
     torch.set_num_threads(1)
     words = k_majority(sample(rendered_descriptors(), DESCRIPTORS), NUM_WORDS, ROUNDS)
-    path = Path(torchslam.loops.codes.__file__).parent / "words.safetensors"
+    path = Path(torchslam.loop_closing.global_descriptor.__file__).parent / "words.safetensors"
     save_file({"words": words}, path)
     print(f"{len(words)} words in {path}")
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.common import parser_of, table
 from experiments.report.record import HISTORY, ROOT, Record, is_quiet, read_history
-from torchslam.output.plots.style import ACCENT, ESTIMATE, house_style, new_figure, save
+from torchslam.io.plots.style import ACCENT, ESTIMATE, house_style, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from experiments.benchmarks.bundle import WINDOWS, batch_of, loss_of, ring, rmse
 from experiments.benchmarks.pose_graph import drift, loop
 from torchslam.data import open_sequence
 from torchslam.features import ORB, match
-from torchslam.solvers import bundle_adjust, pose_graph_optimize
+from torchslam.optim import bundle_adjust, pose_graph_optimize
 
 ROUNDS = 5
 

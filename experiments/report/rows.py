@@ -17,13 +17,13 @@ from experiments.trials.judging import extent
 from experiments.trials.outcome import timed
 from experiments.trials.trials import POSED, drone, opened
 from torchslam.config import Config, to_toml
+from torchslam.data.formats.trajectory_file import write_trajectory
 from torchslam.data.sequence import Sequence
-from torchslam.data.trajectory_file import write_trajectory
 from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.output.results import TRAJECTORY
-from torchslam.run import Run
-from torchslam.slam import SLAM
-from torchslam.values import State
+from torchslam.io.results import TRAJECTORY
+from torchslam.system.run import Run
+from torchslam.system.slam import SLAM
+from torchslam.types import State
 
 NAMES = (*POSED, "standstill", "drone", "synthetic:room")
 """Everything that `make report` runs; what is not at hand is left out, and named."""

@@ -21,8 +21,8 @@ from torchslam.data.association import interpolate_poses
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.slam import SLAM
-from torchslam.solvers.graph import GraphSolution, ObservationGraph, solve
+from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve
+from torchslam.system.slam import SLAM
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from experiments.common import DATA_DIR, add_engine, check, each_case, kept, table, write_between
 from torchslam.batch import DONE, Columns
-from torchslam.batch.kept import RECORD, RUNS, read_record
+from torchslam.batch.result_store import RECORD, RUNS, read_record
 from torchslam.calibration import FoundCamera, Round, calibrate, refine
-from torchslam.calibration.words import contradiction
+from torchslam.calibration.report import contradiction
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import MIN_POSES, evaluate
-from torchslam.front_end import Simulated, true_poses
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.run import Run
-from torchslam.slam import SLAM
-from torchslam.values import Trajectory
+from torchslam.system.front_end import Simulated, true_poses
+from torchslam.system.run import Run
+from torchslam.system.slam import SLAM
+from torchslam.types import Trajectory
 
 HERE = Path(__file__).parent
 WRONG = 1.2  # how far off a given focal length is that a run should warn of

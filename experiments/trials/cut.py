@@ -12,14 +12,14 @@ from tempfile import TemporaryDirectory
 import torch
 
 from experiments.trials.edited import Edited
-from torchslam.checkpoint import read_checkpoint
-from torchslam.commands.folder import Checkpoints
-from torchslam.commands.run import CHECKPOINT_EVERY
+from torchslam.cli.result_folder import Checkpoints
+from torchslam.cli.run import CHECKPOINT_EVERY
 from torchslam.config import Config
-from torchslam.output.results import CHECKPOINT
-from torchslam.run import Progressed, run_sequence
-from torchslam.slam import SLAM
-from torchslam.values import StepResult
+from torchslam.io.results import CHECKPOINT
+from torchslam.system.checkpoint import read_checkpoint
+from torchslam.system.run import Progressed, run_sequence
+from torchslam.system.slam import SLAM
+from torchslam.types import StepResult
 
 
 def after_the_cut(

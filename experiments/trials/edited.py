@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.formats.image_file import grey_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 RATE = 30.0
 """Frames per second of what was put together, whatever the rate of its parts."""

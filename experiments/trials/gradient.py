@@ -14,9 +14,9 @@ from experiments.trials.edited import Edited, shots
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, rigid, so3_exp
-from torchslam.run import Run
-from torchslam.solvers.graph import ObservationGraph, solve
-from torchslam.values import Trajectory
+from torchslam.optim.run_graph import ObservationGraph, solve
+from torchslam.system.run import Run
+from torchslam.types import Trajectory
 
 SETTINGS = (
     "features.kind=simulated",

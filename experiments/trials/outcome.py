@@ -22,10 +22,10 @@ from experiments.trials.trials import Trial
 from torchslam.config import Config, load_config
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import se3_inverse, so3_log
-from torchslam.loops.recognition import Recall
-from torchslam.run import Progressed, Run, run_sequence
-from torchslam.slam import SLAM
-from torchslam.values import Frame, State, StepResult
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.system.run import Progressed, Run, run_sequence
+from torchslam.system.slam import SLAM
+from torchslam.types import Frame, State, StepResult
 
 LETTERS = {State.INITIALIZING: "i", State.TRACKING: "T", State.UNCERTAIN: "U", State.LOST: "L"}
 TOLD = 8  # stretches of states, and recalls, of which the table tells

@@ -15,10 +15,10 @@ from experiments.trials.gradient import report
 from experiments.trials.outcome import HEADER, Outcome, cells, perform
 from experiments.trials.trials import TRIALS, Trial
 from torchslam.batch import DONE, Columns
-from torchslam.batch.kept import RUNS
+from torchslam.batch.result_store import RUNS
 from torchslam.batch.rows import short_name
 from torchslam.errors import SequenceError
-from torchslam.run import Run
+from torchslam.system.run import Run
 
 HERE = Path(__file__).parent
 README = HERE / "README.md"

@@ -17,8 +17,8 @@ from experiments.trials.gradient import SETTINGS as GRADIENT_SETTINGS
 from experiments.trials.gradient import Round
 from torchslam.data import open_sequence
 from torchslam.data.association import nearest
+from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.data.sequence import Sequence
-from torchslam.data.trajectory_file import read_trajectory
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 
 POSED = ("redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20")

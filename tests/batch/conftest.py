@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from torchslam.batch import Row, Task
-from torchslam.batch.one import TIMES
+from torchslam.batch.run_row import TIMES
 from torchslam.batch.table import TIMES_CSV
-from torchslam.cli import main
+from torchslam.cli.main import main
 
 SETTINGS = (
     *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),

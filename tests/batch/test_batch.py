@@ -13,14 +13,14 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.test_cli import write_tum_folder
 
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
-from tests.test_cli import write_tum_folder
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import table as tables
-from torchslam.batch.identity import of_files
-from torchslam.batch.kept import ERRORS, RECORD, RUNS
-from torchslam.cli import main
+from torchslam.batch.fingerprints import of_files
+from torchslam.batch.result_store import ERRORS, RECORD, RUNS
+from torchslam.cli.main import main
 from torchslam.errors import ConfigError
 
 
@@ -211,7 +211,16 @@ def until(happens: object, patience: float = 120.0) -> None:
 
 
 def test_killed_and_started_again(whole: Path, listed: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "torchslam.cli", "batch", str(listed), "-o", str(tmp_path), *OPTIONS]
+    command = [
+        sys.executable,
+        "-m",
+        "torchslam.cli.main",
+        "batch",
+        str(listed),
+        "-o",
+        str(tmp_path),
+        *OPTIONS,
+    ]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     # The second sequence is being run: its folder has begun.
     until(lambda: (tmp_path / RUNS / "one").exists() and (tmp_path / RUNS / ".two.part").exists())
@@ -235,7 +244,7 @@ def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
     status: int,
 ) -> None:
     shutil.copytree(whole / RUNS / "one", tmp_path / RUNS / "one")
-    monkeypatch.setattr("torchslam.batch.one._run", lambda todo, folder: os.kill(os.getpid(), number))
+    monkeypatch.setattr("torchslam.batch.run_row._run", lambda todo, folder: os.kill(os.getpid(), number))
     before = signal.getsignal(number)
     with pytest.raises(SystemExit, match=str(status)):
         batch(listed, tmp_path)

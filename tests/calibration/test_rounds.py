@@ -9,11 +9,11 @@ import torch
 
 from tests.walks import Walk, arc, turn
 from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
-from torchslam.calibration.words import contradiction, in_words
+from torchslam.calibration.report import contradiction, in_words
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
-from torchslam.front_end import Simulated, true_poses
 from torchslam.geometry import Camera
+from torchslam.system.front_end import Simulated, true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 

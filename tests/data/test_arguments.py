@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchslam.cli import main
+from torchslam.cli.main import main
 from torchslam.data import open_sequence
 
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=300"]

@@ -8,7 +8,7 @@ from hypothesis import given
 
 from torchslam.data.association import interpolate_poses, nearest
 from torchslam.geometry.lie import se3_exp
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 TIMES = st.lists(st.floats(-100, 100), min_size=1, max_size=20, unique=True).map(sorted)
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from torchslam.data import Calibrated, open_sequence, parse_camera, read_calibration
 from torchslam.data.calibration import size_text
-from torchslam.data.exif import EXIF_BLOCK, FOCAL_LENGTH_35MM
+from torchslam.data.formats.exif import EXIF_BLOCK, FOCAL_LENGTH_35MM
 from torchslam.data.presets import PRESETS
 from torchslam.errors import CalibrationError
 

@@ -20,8 +20,8 @@ from tests.fuzz.__main__ import _outcomes
 from tests.fuzz.inputs import clear, numbers, outcome
 from tests.fuzz.readers import Reader, readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
-from torchslam.data.eth3d_tum import read_image_list
-from torchslam.data.image_file import read_grey
+from torchslam.data.formats.image_file import read_grey
+from torchslam.data.readers.eth3d_tum import read_image_list
 from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
 
 WORDS = st.one_of(

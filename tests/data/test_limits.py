@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from tests.data.mp4 import edited, write_mp4
-from torchslam.data import open_sequence, read_calibration, video
+from torchslam.data import open_sequence, read_calibration
 from torchslam.data.calibration import parse_numbers
-from torchslam.data.mp4_claims import claimed_samples
+from torchslam.data.formats.mp4 import claimed_samples
+from torchslam.data.readers import video
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 
 CAMERA = "60,60,32,24"

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchslam.data import image_file as image_files
 from torchslam.data import open_sequence
+from torchslam.data.formats import image_file as image_files
 from torchslam.errors import CalibrationError, FrameError, SequenceError
 
 CAMERA = "60,60,32,24"
@@ -182,6 +182,6 @@ def test_nothing_is_read_without_a_limit(
     with pytest.raises(FrameError, match="more than the 100 of an image"):
         image_files.read_grey(tmp_path / "0.png", "here")
     (tmp_path / "calibration.txt").write_text("60 60 32 24\n" * 20)
-    monkeypatch.setattr("torchslam.data.text_file.MAX_BYTES", 100)
+    monkeypatch.setattr("torchslam.data.formats.text_file.MAX_BYTES", 100)
     with pytest.raises(CalibrationError, match="more than the 100 of a text"):
         open_sequence(tmp_path)

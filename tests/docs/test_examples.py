@@ -10,7 +10,7 @@ import pytest
 
 from examples import live_camera, own_loop, refine_and_export
 from torchslam.data import read_trajectory
-from torchslam.world.map_file import read_map
+from torchslam.map.file import read_map
 
 CAMERA = "250,250,159.5,119.5"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.running import blocks, first_missing, run_page
-from torchslam.cli import main
+from torchslam.cli.main import main
 
 DOCS = Path(__file__).parents[2] / "docs"
 RUN_HERE = sorted(page for page in DOCS.rglob("*.md") if any(blocks(page)))

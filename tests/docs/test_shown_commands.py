@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from torchslam.cli import COMMANDS, build_parser
+from torchslam.cli.main import COMMANDS, build_parser
 
 ROOT = Path(__file__).parents[2]
 PAGES = [

@@ -32,7 +32,7 @@ from experiments.noise_model.training import (
 )
 from torchslam import ORB, Camera
 from torchslam.geometry import se3_exp, transform
-from torchslam.solvers.graph import ObservationGraph, solve
+from torchslam.optim.run_graph import ObservationGraph, solve
 
 FRAMES, POINTS = 10, 150
 SMALL = Settings(rounds=3, likelihood_steps=120, likelihood_rate=0.05, trajectory_steps=3)

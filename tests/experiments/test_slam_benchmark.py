@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from experiments.benchmarks.slam import run, stages
-from torchslam.output.frames_file import write_frames
-from torchslam.values import State, StepResult
+from torchslam.io.frames_file import write_frames
+from torchslam.types import State, StepResult
 
 OURS = ["ours", "ours, one process", "ours, fast", "ours, fast, one process"]
 

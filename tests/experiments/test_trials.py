@@ -25,9 +25,9 @@ from tests.sample_run import *  # noqa: F403  fixtures of a run that tracked, lo
 from tests.walks import Walk, arc
 from torchslam.data import open_sequence
 from torchslam.geometry import rigid, se3_inverse, so3_exp, transform
-from torchslam.loops.recognition import Recall
-from torchslam.run import Run
-from torchslam.values import State, StepResult, Trajectory
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.system.run import Run
+from torchslam.types import State, StepResult, Trajectory
 
 N = 40
 SIZE = (64, 48)

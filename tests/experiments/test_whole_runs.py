@@ -31,7 +31,7 @@ from tests.experiments.test_match_weights import simulated
 from torchslam import ORB, SLAM, load_config, open_sequence
 from torchslam.errors import ConfigError
 from torchslam.tracking.matcher import DescriptorMatcher, Prior
-from torchslam.values import View
+from torchslam.types import View
 
 ROOM = "synthetic:room?frames=14"
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchslam.features import brief, fast
-from torchslam.features import pieces as in_pieces
+from torchslam.features import chunks as in_pieces
 from torchslam.features.fast import CIRCLE, fast_scores, find_peaks, patch_scores
 
 

@@ -12,8 +12,8 @@ from torchslam.data import open_sequence
 from torchslam.errors import FrameError
 from torchslam.features import ORB, extractor
 from torchslam.features.masking import only_where
-from torchslam.front_end import check_size, image_extractor
-from torchslam.values import Features
+from torchslam.system.front_end import check_size, image_extractor
+from torchslam.types import Features
 
 LEFT = torch.arange(640) < 320
 

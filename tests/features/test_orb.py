@@ -15,7 +15,7 @@ from torchslam.features import ORB, OpenCVORB, extractor, match
 from torchslam.features import orb as orb_module
 from torchslam.features.brief import blur, describe
 from torchslam.features.pattern import PATTERN
-from torchslam.values import Features
+from torchslam.types import Features
 
 EXTRACTORS = pytest.mark.parametrize("kind", [ORB, OpenCVORB])
 

@@ -20,24 +20,24 @@ from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
 from torchslam.batch import Row, Task, read_list
-from torchslam.batch.kept import RUNS
-from torchslam.batch.one import configuration
+from torchslam.batch.result_store import RUNS
+from torchslam.batch.run_row import configuration
 from torchslam.batch.table import gather, read_times
-from torchslam.checkpoint import read_checkpoint
-from torchslam.cli import main
+from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
-from torchslam.data.given_poses import read_poses
-from torchslam.data.image_file import read_colour, read_grey
+from torchslam.data.formats.given_poses import read_poses
+from torchslam.data.formats.image_file import read_colour, read_grey
 from torchslam.data.sequence import Sequence
 from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
-from torchslam.front_end import Simulated
-from torchslam.output.results import read_results
-from torchslam.output.view import page
-from torchslam.session import Session
-from torchslam.world.history import RunGraph
-from torchslam.world.map_file import read_worlds, write_worlds
+from torchslam.io.results import read_results
+from torchslam.io.viewer.page import page
+from torchslam.map.file import read_worlds, write_worlds
+from torchslam.map.posed_frames import RunGraph
+from torchslam.system.checkpoint import read_checkpoint
+from torchslam.system.front_end import Simulated
+from torchslam.system.session import Session
 
 CAMERA = "60,61,31.5,23.5"
 IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "colour.png", "colour.jpg", "16.png")

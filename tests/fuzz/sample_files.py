@@ -12,13 +12,13 @@ from tests.fuzz.goods import content_of
 from tests.fuzz.mutators import Files
 from tests.walks import Walk, arc
 from torchslam import SLAM, load_config
-from torchslam.checkpoint import write_checkpoint
-from torchslam.export.colmap import write_colmap
-from torchslam.export.nerfstudio import write_nerfstudio
-from torchslam.export.scene import scene_of
-from torchslam.output.report import metrics
-from torchslam.output.results import write_results
-from torchslam.run import Progressed, run_sequence
+from torchslam.io.export.colmap import write_colmap
+from torchslam.io.export.nerfstudio import write_nerfstudio
+from torchslam.io.export.scene import scene_of
+from torchslam.io.report import metrics
+from torchslam.io.results import write_results
+from torchslam.system.checkpoint import write_checkpoint
+from torchslam.system.run import Progressed, run_sequence
 
 CONFIG = load_config(
     None,

@@ -6,17 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.world.simulated import CAMERA, path, tracked_at, view_of
+from tests.map.simulated import CAMERA, path, tracked_at, view_of
 from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
+from torchslam.map import compaction
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.map.tracking_state import Track
 from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
 from torchslam.mapping.mapper import Mapper
-from torchslam.stopwatch import Stopwatch
-from torchslam.values import View
-from torchslam.world import compaction
-from torchslam.world.map import Map
-from torchslam.world.track import Track
-from torchslam.world.world import World
+from torchslam.types import View
+from torchslam.utils.timing import Stopwatch
 
 SETTINGS = KeyframesConfig()
 POINTS = 20

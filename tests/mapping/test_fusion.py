@@ -11,9 +11,9 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, transform
+from torchslam.map.map import NO_POINT, Map
+from torchslam.map.submap import World
 from torchslam.mapping.fusion import find_in, fuse, merge
-from torchslam.world.map import NO_POINT, Map
-from torchslam.world.world import World
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)

@@ -9,8 +9,8 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import BundleConfig, load_config
 from torchslam.geometry import se3_exp, transform
+from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import HUBER, adjust, adjust_all, adjust_keyframes, drop_outliers, select
-from torchslam.world.map import NO_POINT, Map
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)

@@ -12,12 +12,12 @@ from tests.scene import CAMERA, Scene, centre, pose, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import transform, triangulation_covariance
+from torchslam.map.map import Map
+from torchslam.map.submap import World
 from torchslam.mapping.mapper import YOUNG, Mapper, world_scale
-from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import Start
-from torchslam.world.map import Map
-from torchslam.world.world import World
+from torchslam.types import Start
+from torchslam.utils.timing import Stopwatch
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

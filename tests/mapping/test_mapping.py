@@ -12,21 +12,21 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.front_end import Simulated
 from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
+from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.fusion import fuse
-from torchslam.mapping.keyframes import why_keyframe
+from torchslam.mapping.keyframe_policy import why_keyframe
 from torchslam.mapping.local_bundle import adjust, adjust_all
 from torchslam.mapping.mapper import Mapper, world_scale
 from torchslam.mapping.new_points import has_consistent_scale
-from torchslam.slam import SLAM
+from torchslam.system.front_end import Simulated
+from torchslam.system.slam import SLAM
 from torchslam.tracking.correspondences import match_near, match_points, project_points
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import Start, View
-from torchslam.world.map import NO_POINT, Map
+from torchslam.types import Start, View
 
 OVERRIDES = [
     "features.kind=simulated",

@@ -12,11 +12,11 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
 from torchslam.geometry import Noise, se3_inverse, so3_exp, transform, triangulation_covariance
+from torchslam.map.map import Map
 from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
 from torchslam.tracking.epipolar import FreeKeypoints, around, match_along_epipolar_lines
 from torchslam.tracking.matcher import max_distance
-from torchslam.values import View
-from torchslam.world.map import Map
+from torchslam.types import View
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

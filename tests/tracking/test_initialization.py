@@ -14,7 +14,7 @@ from tests.scene import CAMERA, Scene, centre, pose
 from torchslam.config import InitializationConfig, load_config
 from torchslam.geometry import Noise, Triangulation, transform
 from torchslam.tracking.initialization import Initializer, is_good, refine_pair, why_not
-from torchslam.values import Start, View
+from torchslam.types import Start, View
 
 SCENE = Scene.of(400)
 SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)

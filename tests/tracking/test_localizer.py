@@ -7,14 +7,14 @@ import math
 import pytest
 import torch
 
+from tests.map.simulated import tracked_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
-from tests.world.simulated import tracked_at
 from torchslam.config import load_config
 from torchslam.geometry import Noise, Undistorted, transform
+from torchslam.map.submap import World
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.matcher import Pairs
 from torchslam.tracking.tracker import Tracker
-from torchslam.world.world import World
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

@@ -15,7 +15,7 @@ from tests.walks import Walk, arc
 from torchslam import SLAM, Matches, Run, load_config
 from torchslam.errors import ConfigError
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, nearest_keypoints
-from torchslam.values import State, View
+from torchslam.types import State, View
 
 CONFIG = load_config(
     None,

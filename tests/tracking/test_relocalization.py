@@ -7,6 +7,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
+from torchslam.map.submap import World
 from torchslam.tracking.correspondences import (
     match_keyframe,
     match_points,
@@ -14,7 +15,6 @@ from torchslam.tracking.correspondences import (
 )
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.tracking.tracker import Tracker
-from torchslam.world.world import World
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchslam.config import load_config
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
 from torchslam.tracking.scout import Scout
-from torchslam.values import Anchor, Followed, Frame
+from torchslam.types import Anchor, Followed, Frame
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, (320, 240))
 DEPTH = 2.0

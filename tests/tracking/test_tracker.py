@@ -12,8 +12,9 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.map.submap import World
 from torchslam.tracking.correspondences import Projected, project_points
-from torchslam.tracking.spread import (
+from torchslam.tracking.match_selection import (
     CELLS,
     CROWD,
     PER_CELL,
@@ -26,8 +27,7 @@ from torchslam.tracking.spread import (
     voices,
 )
 from torchslam.tracking.tracker import MEMORY, Tracker, well_observed
-from torchslam.values import Tracked, View
-from torchslam.world.world import World
+from torchslam.types import Tracked, View
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

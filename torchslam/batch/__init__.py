@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from torchslam.batch.engines import ENGINES, RETRIES, Engine
-from torchslam.batch.kept import DONE, ERROR, NO_MAP, OPEN, Columns, failed
-from torchslam.batch.one import Task, configuration, run_row
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, failed
 from torchslam.batch.rows import Row, named, read_list
+from torchslam.batch.run_row import Task, configuration, run_row
 from torchslam.batch.shards import Shard, parse_shard
 from torchslam.batch.table import write_table
 

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchslam.data.formats.text_file import MAX_LINE, numbered_lines, parse_count, read_text
 from torchslam.data.synthetic import sequence as synthetic
-from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, read_text
 from torchslam.errors import SequenceError
 
 MAX_BYTES = 1 << 26

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from torchslam.data.text_file import parse_count
+from torchslam.data.formats.text_file import parse_count
 from torchslam.errors import ConfigError
 
 AUTO = "auto"

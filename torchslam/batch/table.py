@@ -13,11 +13,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchslam.batch.kept import DONE, ERROR, NO_MAP, RUNS, Columns, read_kept
-from torchslam.batch.one import TIMES, Task, configuration
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_kept
+from torchslam.batch.run_row import TIMES, Task, configuration
 from torchslam.errors import ResultsError, TorchslamError
-from torchslam.output import plots
-from torchslam.regular_file import JSON_BYTES, parse_json, read_text
+from torchslam.io import plots
+from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
 
 CSV = "table.csv"
 PARQUET = "table.parquet"

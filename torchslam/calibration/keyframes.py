@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera
-from torchslam.solvers import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.solvers.graph import ObservationGraph
+from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.run_graph import ObservationGraph
 
 KERNEL_SCALE = 2.45  # as in `solve`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import torch
 
-from torchslam.calibration.refinement import Refinement, refine
+from torchslam.calibration.intrinsics import Refinement, refine
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.front_end import Extractor, FrontEnd, WithFeatures, image_extractor
 from torchslam.geometry import Camera
-from torchslam.run import Run
-from torchslam.slam import SLAM
-from torchslam.values import Features, Frame
+from torchslam.system.front_end import Extractor, FrontEnd, WithFeatures, image_extractor
+from torchslam.system.run import Run
+from torchslam.system.slam import SLAM
+from torchslam.types import Features, Frame
 
 # Focal lengths in widths of the image that are tried beside the first one; the first map decides.
 GUESSES = 0.6, 1.2, 1.7

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.lie import se3_interpolate
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 
 def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:

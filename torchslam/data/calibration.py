@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from torchslam.data.text_file import numbered_lines, parse_floats
+from torchslam.data.formats.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 

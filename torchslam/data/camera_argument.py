@@ -9,10 +9,10 @@ import re
 from pathlib import Path
 
 from torchslam.data.calibration import COUNTS, Calibration, FocalGuess, Preset, Size, parse_numbers, size_text
-from torchslam.data.calibration_files import read_calibration
-from torchslam.data.exif import FromExif, read_focal
+from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.formats.exif import FromExif, read_focal
+from torchslam.data.formats.text_file import parse_floats
 from torchslam.data.presets import PRESETS
-from torchslam.data.text_file import parse_floats
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 

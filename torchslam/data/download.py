@@ -23,10 +23,10 @@ from pathlib import Path, PurePosixPath
 
 from tqdm import tqdm
 
-from torchslam import regular_file
-from torchslam.data.frame_names import MAX_FILES
+from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
-from torchslam.progress_line import stream
+from torchslam.utils import bounded_read as regular_file
+from torchslam.utils.progress import stream
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20

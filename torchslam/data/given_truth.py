@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchslam.data.sequence import Sequence, Transformed
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 
 class WithTruth(Transformed):

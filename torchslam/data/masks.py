@@ -7,8 +7,8 @@ from pathlib import Path
 from torch import Tensor
 
 from torchslam.data.calibration import size_text
-from torchslam.data.frame_names import natural
-from torchslam.data.image_file import SUFFIXES, read_grey
+from torchslam.data.formats.frame_names import natural
+from torchslam.data.formats.image_file import SUFFIXES, read_grey
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
 

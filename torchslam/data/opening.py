@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from torchslam.data import archive, live
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, parse_calibration
+from torchslam.data.formats import archive
+from torchslam.data.formats.transforms import cut, resize, thin
 from torchslam.data.masks import Masked
-from torchslam.data.readers import find_reader
+from torchslam.data.readers.registry import find_reader, live
 from torchslam.data.sequence import Sequence
 from torchslam.data.suggestions import why_nothing
 from torchslam.data.synthetic import sequence as synthetic
-from torchslam.data.transforms import cut, resize, thin
 from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 

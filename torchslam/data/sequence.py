@@ -15,7 +15,7 @@ from torchslam.data.association import interpolate_poses
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
-from torchslam.values import Features, Frame, Trajectory
+from torchslam.types import Features, Frame, Trajectory
 
 GROUNDTRUTH_TOLERANCE = 0.02
 """Seconds between an image and the nearest ground-truth pose beyond which the image counts as without one."""

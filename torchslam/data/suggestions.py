@@ -7,10 +7,10 @@ import itertools
 from collections import Counter
 from pathlib import Path
 
-from torchslam.data import archive, bag, video
-from torchslam.data.frame_names import folder_kind, other_kind, subfolder
-from torchslam.data.image_file import SUFFIXES
-from torchslam.data.readers import READERS, find_reader
+from torchslam.data.formats import archive
+from torchslam.data.formats.frame_names import folder_kind, other_kind, subfolder
+from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.readers.registry import READERS, bag, find_reader, video
 
 MAX_ENTRIES = 10_000
 """Entries of a folder that are looked at in search of something to propose."""

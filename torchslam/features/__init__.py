@@ -7,13 +7,13 @@ from pathlib import Path
 from torch import nn
 
 from torchslam.errors import ConfigError
-from torchslam.features.bits import hamming, pack_bits, unpack_bits
 from torchslam.features.learned import ALIKED, XFeat
-from torchslam.features.matching import match, match_pairs, match_projected
+from torchslam.features.matching.brute_force import match, match_pairs, match_projected
+from torchslam.features.matching.hamming import hamming, pack_bits, unpack_bits
+from torchslam.features.matching.radius_search import expand_runs
 from torchslam.features.opencv_orb import OpenCVORB
 from torchslam.features.orb import ORB
 from torchslam.features.simulated import SimulatedFeatures
-from torchslam.features.windows import expand_runs
 
 __all__ = [
     "ALIKED",

@@ -8,10 +8,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchslam.features.bits import int8_product, pack_bits
+from torchslam.features.chunks import library_of, on_host, pieces
 from torchslam.features.corners import gather_patches
+from torchslam.features.matching.hamming import int8_product, pack_bits
 from torchslam.features.pattern import PATTERN
-from torchslam.features.pieces import library_of, on_host, pieces
 
 RADIUS = 15
 BLUR_RADIUS = 3

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.errors import ConfigError
 from torchslam.geometry.whitening import is_definite
-from torchslam.values import Features
+from torchslam.types import Features
 
 COLUMNS: dict[str, tuple[int, ...]] = {
     "keypoints": (2,),

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.features.pieces import as_tensor, library_of, on_host, pieces
-from torchslam.ids import true_indices
+from torchslam.features.chunks import as_tensor, library_of, on_host, pieces
+from torchslam.utils.indexing import true_indices
 
 # The circle of radius 3, (dx, dy), clockwise from the top.
 CIRCLE = (

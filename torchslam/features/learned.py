@@ -20,8 +20,8 @@ from torchslam.errors import ConfigError
 from torchslam.features.corners import soft_peak
 from torchslam.features.masking import only_where
 from torchslam.features.orb import check_images
-from torchslam.regular_file import check_regular
-from torchslam.values import Features
+from torchslam.types import Features
+from torchslam.utils.bounded_read import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0

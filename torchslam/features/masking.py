@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchslam.values import Features
+from torchslam.types import Features
 
 
 def only_where(features: Features, wanted: Tensor) -> Features:

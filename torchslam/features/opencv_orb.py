@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchslam.features.orb import check_images
-from torchslam.values import Features
+from torchslam.types import Features
 
 
 class OpenCVORB(nn.Module):

@@ -16,7 +16,7 @@ from torchslam.features.corners import gather_patches, harris_responses, quadrat
 from torchslam.features.fast import Bands, fast_scores, find_peaks, patch_scores
 from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
 from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread
-from torchslam.values import Features
+from torchslam.types import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
 HARRIS_RADIUS = 4  # of the patch that a Harris response needs

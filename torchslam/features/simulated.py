@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.values import Features
+from torchslam.types import Features
 
 DESCRIPTOR_BYTES = 32
 LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB

@@ -20,12 +20,12 @@ from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import check_features
 from torchslam.geometry import Camera, Noise
 from torchslam.geometry.whitening import times
-from torchslam.run import finish
-from torchslam.slam import SLAM
-from torchslam.solvers.graph import GraphSolution
-from torchslam.solvers.many_graphs import solve_each
-from torchslam.values import Features, Frame
-from torchslam.world.history import RunGraph
+from torchslam.map.posed_frames import RunGraph
+from torchslam.optim.run_graph import GraphSolution
+from torchslam.optim.run_graph_batch import solve_each
+from torchslam.system.run import finish
+from torchslam.system.slam import SLAM
+from torchslam.types import Features, Frame
 
 OnFailure = Literal["raise", "skip"] | float
 

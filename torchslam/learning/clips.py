@@ -18,7 +18,7 @@ from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse
 from torchslam.learning.clip import ClipGraph, ClipSLAM
 from torchslam.learning.training import seed_of
-from torchslam.values import Features
+from torchslam.types import Features
 
 MIN_MATCHES = 50
 """Between the first and the last frame of a clip: with fewer, its frames hardly show the same."""

@@ -15,9 +15,9 @@ from torch import Tensor
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import transform
 from torchslam.geometry.motion import apart
-from torchslam.world.compaction import Renumbering, remove_keyframes
-from torchslam.world.map import Map
-from torchslam.world.world import World
+from torchslam.map.compaction import Renumbering, remove_keyframes
+from torchslam.map.map import Map
+from torchslam.map.submap import World
 
 SHARE, OTHERS = 0.9, 3  # of a keyframe's points that so many others must see
 COARSER = 1.25  # seen one level of the pyramid (a factor of 1.2) coarser is seen as well

@@ -8,9 +8,9 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, fits
+from torchslam.map.map import Map
 from torchslam.tracking.correspondences import look_at
 from torchslam.tracking.matcher import max_distance
-from torchslam.world.map import Map
 
 RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
 

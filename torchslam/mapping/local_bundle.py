@@ -9,14 +9,14 @@ from torch import Tensor
 
 from torchslam.config import BundleConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
-from torchslam.ids import distinct, is_among, ranks_among, true_indices
-from torchslam.solvers import BundleProblem, bundle_adjust
-from torchslam.solvers.levenberg import Progress
-from torchslam.solvers.schur import Marginals
-from torchslam.solvers.window import adjust_window
-from torchslam.values import Observations
-from torchslam.world.map import Map
-from torchslam.world.observers import most
+from torchslam.map.map import Map
+from torchslam.map.observation_index import most
+from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.optim.bundle.local_numpy import adjust_window
+from torchslam.optim.bundle.schur import Marginals
+from torchslam.optim.core.levenberg_marquardt import Progress
+from torchslam.types import Observations
+from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 
 NEGLIGIBLE = 1e-4  # share of the cost that a step must promise: the next keyframe moves the map by more
 HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part

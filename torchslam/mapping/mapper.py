@@ -7,16 +7,16 @@ import torch
 from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_covariance
-from torchslam.mapping.adjusting import Adjusting
+from torchslam.map.compaction import Renumbering, compact
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.mapping.async_bundle import Adjusting
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.new_points import triangulate_against
-from torchslam.stopwatch import Stopwatch
 from torchslam.tracking.matcher import Matcher
-from torchslam.values import Start, Tracked, View
-from torchslam.world.compaction import Renumbering, compact
-from torchslam.world.map import Map
-from torchslam.world.world import World
+from torchslam.types import Start, Tracked, View
+from torchslam.utils.timing import Stopwatch
 
 YOUNG = 3  # keyframes after its own for which a point is on trial
 

@@ -19,11 +19,11 @@ from torchslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
+from torchslam.map.map import NO_POINT, Map
+from torchslam.map.observation_index import first_of_each
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, matched, max_distance
-from torchslam.values import View
-from torchslam.world.map import NO_POINT, Map
-from torchslam.world.observers import first_of_each
+from torchslam.types import View
 
 
 def triangulate_against(

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.tracking.spread import SENIOR, evenly
-from torchslam.values import Anchor, Followed, Frame, Tracked, View
-from torchslam.world.compaction import Renumbering
-from torchslam.world.world import World
+from torchslam.map.compaction import Renumbering
+from torchslam.map.submap import World
+from torchslam.tracking.match_selection import SENIOR, evenly
+from torchslam.types import Anchor, Followed, Frame, Tracked, View
 
 LEAST = 20  # points: with fewer there is nothing to follow
 

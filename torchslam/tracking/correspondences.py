@@ -11,9 +11,9 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.features import match
 from torchslam.geometry import Camera, transform
+from torchslam.map.map import Map
 from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, Prior, matched, max_distance
-from torchslam.values import View
-from torchslam.world.map import Map
+from torchslam.types import View
 
 
 @dataclass(frozen=True)

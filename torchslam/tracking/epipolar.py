@@ -12,8 +12,8 @@ from torch.nn.functional import pad
 
 from torchslam.features import expand_runs, match_pairs
 from torchslam.geometry import Camera, Noise
-from torchslam.values import Features, View
-from torchslam.world.map import NO_POINT, Map
+from torchslam.map.map import NO_POINT, Map
+from torchslam.types import Features, View
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from torchslam.geometry import (
     transform,
     triangulate,
 )
-from torchslam.solvers import BundleProblem, bundle_adjust
+from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.tracking.matcher import Matcher, matched, matcher_of
-from torchslam.values import Start, View
+from torchslam.types import Start, View
 
 AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
 STILL_SHARE = 0.1  # of the matches, from which on it is asked whether they belong to the scene

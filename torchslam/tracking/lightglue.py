@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.regular_file import check_regular
 from torchslam.tracking.matcher import Prior
-from torchslam.values import Matches, View
+from torchslam.types import Matches, View
+from torchslam.utils.bounded_read import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights
 

@@ -19,13 +19,13 @@ from torchslam.geometry import (
     start_pose,
     transform,
 )
-from torchslam.solvers.frame_pose import FramePose, FrameProblem, RobustKernel
-from torchslam.solvers.nearby_pose import nearby_pose
+from torchslam.map.map import Map
+from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel
+from torchslam.optim.pose.nearby_pose import nearby_pose
 from torchslam.tracking.correspondences import Projected, match_near, project_points
+from torchslam.tracking.match_selection import SENIOR, coverage, explained, spread, trusted, voices
 from torchslam.tracking.matcher import DescriptorMatcher, Pairs
-from torchslam.tracking.spread import SENIOR, coverage, explained, spread, trusted, voices
-from torchslam.values import Tracked, View
-from torchslam.world.map import Map
+from torchslam.types import Tracked, View
 
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 

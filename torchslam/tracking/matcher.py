@@ -12,11 +12,11 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import match, match_projected
+from torchslam.features.matching.by_projection import match_within
 from torchslam.geometry import Camera
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
-from torchslam.tracking.near import match_within
-from torchslam.values import Frame, Matches, View
+from torchslam.types import Frame, Matches, View
 
 
 @dataclass(frozen=True)

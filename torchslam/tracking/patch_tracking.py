@@ -6,11 +6,11 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera
+from torchslam.map.compaction import Renumbering
+from torchslam.map.submap import World
 from torchslam.tracking.anchors import Anchors
 from torchslam.tracking.scout import Scout
-from torchslam.values import Anchor, Followed, Frame, Tracked, View
-from torchslam.world.compaction import Renumbering
-from torchslam.world.world import World
+from torchslam.types import Anchor, Followed, Frame, Tracked, View
 
 
 class PatchTracking:

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.map.tracking_state import Track
 from torchslam.tracking.correspondences import match_keyframe
-from torchslam.tracking.judge import why_doubt
 from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.pose_validation import why_doubt
 from torchslam.tracking.tracker import Tracker
-from torchslam.values import Tracked, View
-from torchslam.world.map import Map
-from torchslam.world.track import Track
-from torchslam.world.world import World
+from torchslam.types import Tracked, View
 
 Candidate = tuple[World, int]
 """A keyframe, by world and row, that may show the same place."""

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.features.patches import RADIUS, Aligned, Patches, Pyramid, align, cut, pyramid
-from torchslam.front_end import reduced
 from torchslam.geometry import Camera, fits, se3_inverse, transform
 from torchslam.geometry.motion import apart
 from torchslam.geometry.robust import Kernel
 from torchslam.geometry.whitening import times
-from torchslam.solvers import RefinedPose, refine_pose
-from torchslam.tracking.spread import voices
-from torchslam.values import Anchor, Followed, Frame
+from torchslam.optim import RefinedPose, refine_pose
+from torchslam.system.front_end import reduced
+from torchslam.tracking.match_selection import voices
+from torchslam.types import Anchor, Followed, Frame
 
 ATTEMPTS = 2  # a pose from some of the patches leads to the others
 LEAST = 20  # patches that a pose needs

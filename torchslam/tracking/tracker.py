@@ -14,13 +14,13 @@ from torchslam.geometry import (
     se3_inverse,
 )
 from torchslam.geometry.motion import reorthonormalized
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.map.tracking_state import Track
 from torchslam.tracking.correspondences import match_near, match_points
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.matcher import Matcher, Pairs, matcher_of
-from torchslam.values import Tracked, View
-from torchslam.world.map import Map
-from torchslam.world.track import Track
-from torchslam.world.world import World
+from torchslam.types import Tracked, View
 
 MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
 

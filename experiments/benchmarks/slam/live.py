@@ -16,13 +16,13 @@ import torch
 from experiments.common import DATA_DIR
 from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.data.live import LiveSequence
+from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import evaluate
-from torchslam.processes import helped
-from torchslam.run import run_sequence
-from torchslam.slam import SLAM
-from torchslam.values import StepResult, Trajectory
+from torchslam.parallel.workers import helped
+from torchslam.system.run import run_sequence
+from torchslam.system.slam import SLAM
+from torchslam.types import StepResult, Trajectory
 
 
 class Player:

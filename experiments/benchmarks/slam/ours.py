@@ -15,11 +15,11 @@ import torch
 
 from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.data.trajectory_file import write_trajectory
-from torchslam.processes import helped
-from torchslam.run import run_sequence
-from torchslam.slam import SLAM
-from torchslam.values import StepResult
+from torchslam.data.formats.trajectory_file import write_trajectory
+from torchslam.parallel.workers import helped
+from torchslam.system.run import run_sequence
+from torchslam.system.slam import SLAM
+from torchslam.types import StepResult
 
 
 def main() -> None:

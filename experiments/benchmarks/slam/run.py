@@ -15,7 +15,7 @@ from pathlib import Path
 from experiments.benchmarks.problems import PEERS
 from experiments.common import DATA_DIR, table, write_between
 from torchslam.data import open_sequence
-from torchslam.data.trajectory_file import read_trajectory
+from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.image_file import grey_to_tensor
+from torchslam.data.formats.image_file import grey_to_tensor
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
@@ -23,7 +23,7 @@ from torchslam.data.synthetic.storey import storey
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
-from torchslam.values import Trajectory
+from torchslam.types import Trajectory
 
 LOOKS_FOR = "synthetic:room"
 FRAME_RATE = 20.0

@@ -1,0 +1,111 @@
+"""`torchslam run` without a calibration, with one to refine, and the file of the camera that was found."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from tests.test_cli import FAST, write_tum_folder
+
+from torchslam.cli.main import main
+from torchslam.data import open_sequence
+from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.errors import ResultsError
+from torchslam.geometry import Camera
+from torchslam.io.calibration_file import check_replaceable, write_calibration
+
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images whose true focal length is 500 px, without a calibration."""
+    made = write_tum_folder(tmp_path_factory.mktemp("images") / "room", FRAMES)
+    (made / "calibration.txt").unlink()
+    return made
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_images_without_a_calibration(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They decide, the run says so and how certain it is, and the file it leaves is read by the next command."""
+    results = tmp_path / "results"
+    assert main(["run", str(folder), "-o", str(results), *FAST]) == 0
+    captured = capsys.readouterr()
+    assert "no calibration here: as with --camera auto" in captured.err
+    assert f"{FRAMES} frames with 544 px ask for" in captured.err
+    said = json.loads((results / "metrics.json").read_text())["camera"]
+    assert said in captured.out
+    assert said in captured.err
+    found = read_calibration(results / "calibration.txt")
+    sequence = open_sequence(folder, results / "calibration.txt")
+    assert sequence.camera.params.tolist() == list(found.params)
+    assert abs(found.params[0] / 500 - 1) < 0.25  # of so short a way
+    given = ["--overwrite", "--limit", "8", "--camera", "500,500,319.5,239.5"]
+    assert main(["run", str(folder), "-o", str(results), *given, *FAST]) == 0
+    assert json.loads((results / "metrics.json").read_text())["camera"] == ""
+    assert not (results / "calibration.txt").exists()
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_given_camera_that_is_wrong(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The summary names the better focal length, on the way to the true one of 500 px, and what helps."""
+    camera = "400,400,319.5,239.5"
+    assert main(["run", str(folder), "-o", str(tmp_path / "results"), "--camera", camera, *FAST]) == 0
+    said = json.loads((tmp_path / "results" / "metrics.json").read_text())["camera"]
+    assert said in capsys.readouterr().out
+    found = re.match(r"the images agree better with a focal length of (\d+) px or more than with 400;", said)
+    assert found is not None
+    assert abs(float(found[1]) - 500) < 50
+    assert said.endswith("--refine-camera looks for a better one")
+
+
+def test_a_calibration_that_is_not_ours_stays(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "calibration.txt").write_text("1 1 1 1\n")
+    assert main(["run", str(folder), "-o", str(tmp_path), "--camera", "auto", *FAST]) == 2
+    assert "not of an earlier run" in capsys.readouterr().err
+    assert (tmp_path / "calibration.txt").read_text() == "1 1 1 1\n"
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--features", "simulated"], "simulated features are made with the camera"),
+        (["--refine-camera", "--map", "nothing"], "a --map has the camera that it was made with"),
+    ],
+)
+def test_what_does_not_go_together(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], message: str
+) -> None:
+    assert main(["run", str(folder), "-o", str(tmp_path / "x"), "--camera", "auto", *extra]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera.pinhole(1.5, 2.25, 3.0, 4.0, size=(8, 6)),
+        Camera.radial_tangential(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
+        Camera.fisheye(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
+    ],
+)
+def test_the_file_is_read_as_it_was_written(camera: Camera, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.txt"
+    check_replaceable(path)
+    write_calibration(path, camera, ["focal length 1.5 ± 0.1 px"])
+    read = read_calibration(path).camera(camera.size)
+    assert read.model == camera.model
+    torch.testing.assert_close(read.params, camera.params)
+    assert "# focal length 1.5 ± 0.1 px\n" in path.read_text(encoding="utf-8")
+    check_replaceable(path)
+    path.write_text("1 1 1 1\n")
+    with pytest.raises(ResultsError, match="is not replaced"):
+        check_replaceable(path)

@@ -1,0 +1,191 @@
+"""`torchslam export` on a run over a few rendered frames: as a user has it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torchslam.cli.main import main
+from torchslam.data import read_trajectory
+from torchslam.geometry import squared_reprojection_errors, transform
+from torchslam.map.file import read_map, read_worlds, write_worlds
+
+ROOM = "synthetic:room?frames=16"
+FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    assert main(["run", ROOM, "--output", str(directory), *FAST]) == 0
+    return directory
+
+
+def export(results: Path, to: str, output: Path | None, *more: str) -> int:
+    where = [] if output is None else ["--output", str(output)]
+    return main(["export", str(results), "--to", to, *where, *more])
+
+
+def own_error(results: Path) -> float:
+    """Mean over the points of their mean error in the keyframes, from the map alone."""
+    slam_map, camera = read_map(results / "map.safetensors")
+    seen = slam_map.observations()
+    points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
+    errors = squared_reprojection_errors(points_c[:, 0], seen.pixels, camera).sqrt()
+    points, which = seen.point_index.unique(return_inverse=True)
+    total = torch.zeros(len(points), dtype=errors.dtype).index_add(0, which, errors)
+    return float((total / which.bincount()).mean())
+
+
+def test_colmap_finds_the_error_of_the_map(results: Path, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    assert export(results, "colmap", tmp_path / "model") == 0
+    made = pycolmap.Reconstruction(str(tmp_path / "model" / "sparse" / "0"))
+    made.update_point_3d_errors()
+    assert made.compute_mean_reprojection_error() == pytest.approx(own_error(results), abs=1e-3)
+    names = sorted(image.name for image in made.images.values())
+    assert names == sorted(path.name for path in (tmp_path / "model" / "images").iterdir())
+    slam_map, _ = read_map(results / "map.safetensors")
+    assert made.num_images() == slam_map.num_keyframes
+    assert made.num_points3D() == slam_map.num_points
+
+
+def test_colours_are_those_of_the_images(results: Path, tmp_path: Path) -> None:
+    """Where a point is seen, the image is as bright as the point, more or less: corners are where it changes."""
+    assert export(results, "colmap", tmp_path / "model") == 0
+    slam_map, _ = read_map(results / "map.safetensors")
+    seen, differences = slam_map.observations(), []
+    for keyframe in range(slam_map.num_keyframes):
+        frame = int(slam_map.keyframes["frame_index"][keyframe])
+        image = cv2.imread(str(tmp_path / "model" / "images" / f"{frame:06d}.png"))
+        rows = seen.keyframe_index == keyframe
+        u, v = seen.pixels[rows].round().long().T.numpy()
+        colours = slam_map.points["colors"][seen.point_index[rows]].numpy()
+        differences.append(np.abs(image[v, u, ::-1].astype(int) - colours))
+    assert np.median(np.concatenate(differences)) < 12
+    assert float(slam_map.points["colors"].float().std()) > 40
+
+
+def test_a_rerun_shows_every_frame(results: Path, tmp_path: Path) -> None:
+    chunks = pytest.importorskip(
+        "rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'"
+    )
+    assert export(results, "rerun", tmp_path / "it.rrd") == 0
+    poses = sum(
+        chunk.num_rows
+        for chunk in chunks.RrdReader(tmp_path / "it.rrd").store().stream()
+        if chunk.entity_path == "/world/camera" and not chunk.is_static
+    )
+    assert poses == len(read_trajectory(results / "trajectory.txt"))
+
+
+def test_everything_goes_into_the_folder_of_results(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for to, name in {
+        "colmap": "colmap/sparse/0/points3D.bin",
+        "nerfstudio": "nerfstudio/transforms.json",
+        "ply": "map.ply",
+        "tum": "trajectory.txt",
+        "kitti": "kitti/poses.txt",
+    }.items():
+        assert export(results, to, None) == 0
+        assert (results / "export" / name).is_file()
+        assert str(results / "export") in capsys.readouterr().out
+        assert export(results, to, None) == 2
+        assert "--overwrite replaces it" in capsys.readouterr().err
+        assert export(results, to, None, "--overwrite") == 0
+    assert (results / "export" / "map.ply").read_bytes() == (results / "map.ply").read_bytes()
+    written, own = (read_trajectory(folder / "trajectory.txt") for folder in (results / "export", results))
+    assert torch.equal(written.timestamps, own.timestamps)
+    torch.testing.assert_close(written.T_wc, own.T_wc, rtol=0, atol=3e-9)  # nine decimals, twice
+
+
+def test_the_same_results_give_the_same_bytes(results: Path, tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        assert export(results, "colmap", tmp_path / folder) == 0
+        assert export(results, "nerfstudio", tmp_path / folder / "nerfstudio") == 0
+    files = [path for path in (tmp_path / "one").rglob("*") if path.is_file()]
+    assert len(files) > 9
+    for path in files:
+        assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes(), path
+
+
+def test_frames_can_be_chosen(results: Path, tmp_path: Path) -> None:
+    posed, keyframes = (len(read_trajectory(results / f"{name}.txt")) for name in ("trajectory", "keyframes"))
+    assert posed > keyframes
+    for frames, count in (("all", posed), ("keyframes", keyframes)):
+        assert export(results, "tum", tmp_path / frames, "--frames", frames) == 0
+        assert len(read_trajectory(tmp_path / frames)) == count
+        folder = tmp_path / f"nerf_{frames}"
+        assert export(results, "nerfstudio", folder, "--frames", frames, "--no-images") == 0
+        assert len(json.loads((folder / "transforms.json").read_text())["frames"]) == count
+        assert not (folder / "images").exists()
+
+
+# --- what goes wrong -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    shutil.copytree(results, tmp_path / "copy", ignore=shutil.ignore_patterns("export", "plots"))
+    return tmp_path / "copy"
+
+
+def change(folder: Path, **figures: object) -> None:
+    path = folder / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | figures))
+
+
+def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(copy, source=str(tmp_path / "moved.mp4"))
+    assert export(copy, "colmap", tmp_path / "a") == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "moved.mp4: does not exist; --sequence says where it is now" in error
+    assert not (tmp_path / "a").exists()
+    assert export(copy, "colmap", tmp_path / "a", "--sequence", ROOM) == 0
+    assert export(copy, "colmap", tmp_path / "b", "--no-images") == 0
+    change(copy, source=None)
+    assert export(copy, "nerfstudio", tmp_path / "c") == 2
+    assert "does not say where the images" in capsys.readouterr().err
+
+
+def test_other_worlds(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    saved = read_worlds(copy / "map.safetensors")
+    (world,) = saved.worlds
+    world.number = 2
+    write_worlds(copy / "map.safetensors", [world], saved.camera)
+    assert export(copy, "ply", tmp_path / "a.ply") == 2
+    assert "no world 0: there are 2" in capsys.readouterr().err
+    assert export(copy, "ply", tmp_path / "a.ply", "--world", "2") == 0
+    shutil.copy(copy / "trajectory.txt", copy / "trajectory_2.txt")
+    (copy / "trajectory.txt").unlink()
+    assert export(copy, "tum", tmp_path / "a.txt", "--world", "2") == 0
+    write_worlds(copy / "map.safetensors", [], saved.camera)
+    change(copy, world=None, failure="the camera stood still")
+    assert export(copy, "colmap", tmp_path / "b") == 2
+    assert "there is no map: the camera stood still" in capsys.readouterr().err
+
+
+def test_a_run_that_only_localised_has_its_trajectory(
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(copy, session=1)
+    assert export(copy, "kitti", tmp_path / "kitti") == 0
+    assert export(copy, "colmap", tmp_path / "a") == 2
+    assert "only localised" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("to", ["ply", "tum", "kitti"])
+def test_there_is_nothing_to_undistort(
+    results: Path, to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(results, to, tmp_path / "a", "--undistort") == 2
+    assert "no images in an export to" in capsys.readouterr().err

@@ -1,0 +1,157 @@
+"""`torchslam refine`: poses of each kind come back in the form in which they came, better."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.test_cli import FAST, write_tum_folder
+from torch import Tensor
+
+from tests.refine.test_refine import disturbed
+from torchslam.cli.main import main
+from torchslam.data import open_sequence, read_trajectory
+from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.formats.given_poses import read_poses
+from torchslam.data.formats.trajectory_file import write_trajectory
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.conventions import opengl, quaternion_wxyz
+from torchslam.io.export.nerfstudio import nerfstudio_camera
+from torchslam.refine.alignment import back_to_given
+from torchslam.types import Trajectory
+
+FRAMES = 8
+WRONG = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))  # it is 500
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rendered images, each of a part of the room, in files `rgb/0.png` to `rgb/7.png`."""
+    return write_tum_folder(tmp_path_factory.mktemp("images") / "room", FRAMES)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Tensor:
+    sequence = open_sequence(f"synthetic:room?frames={FRAMES}")
+    return torch.stack([pose for i in range(FRAMES) if (pose := sequence.pose(i)) is not None])
+
+
+@pytest.fixture(scope="module")
+def given(truth: Tensor) -> Tensor:
+    return se3_inverse(disturbed(truth, centimetres=2.0, degrees=1.0).T_wc)
+
+
+def write(kind: str, given: Tensor, folder: Path) -> Path:
+    """The poses as another program would have written them, of the first seven images and of one that is not there."""
+    names = [f"{index}.png" for index in range(FRAMES - 1)] + ["100.png"]
+    if kind == "tum":
+        times = torch.arange(FRAMES, dtype=torch.float64) / 20 + 0.001
+        times[-1] = 100
+        write_trajectory(folder / "phone.txt", Trajectory(times, se3_inverse(given)))
+        return folder / "phone.txt"
+    if kind == "nerfstudio":
+        frames = [
+            {"file_path": f"images/{name}", "transform_matrix": T, "sharpness": 7}
+            for name, T in zip(names, opengl(se3_inverse(given)).tolist(), strict=True)
+        ]
+        content = nerfstudio_camera(WRONG) | {"applied_scale": 2.0, "camera_angle_x": 1.0, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return folder / "transforms.json"
+    model = folder / "sparse"
+    model.mkdir()
+    lines = [
+        " ".join(map(str, [index + 5, *quaternion, *translation, 1, name])) + "\n\n"
+        for index, (quaternion, translation, name) in enumerate(
+            zip(quaternion_wxyz(given[:, :3, :3]).tolist(), given[:, :3, 3].tolist(), names, strict=True)
+        )
+    ]
+    (model / "images.txt").write_text("# by hand\n" + "".join(lines))
+    (model / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 525 320 240\n")
+    return model
+
+
+@pytest.mark.parametrize("kind", ["tum", "nerfstudio", "colmap"])
+def test_poses_come_back_as_they_came(
+    kind: str, folder: Path, given: Tensor, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses, results = write(kind, given, tmp_path), tmp_path / "results"
+    camera = ["--camera", "525,525,319.5,239.5"] if kind == "tum" else []
+    arguments = ["refine", str(folder), "--poses", str(poses), "-o", str(results), "--refine-camera"]
+    assert main([*arguments, *camera, *FAST]) == 0
+    printed = capsys.readouterr().out
+    assert "8 from" in printed
+    assert "1 of no image here; 1 of 8 images have none" in printed
+    names = {"tum": "phone.txt", "nerfstudio": "transforms.json", "colmap": "."}
+    refined = read_poses(results / "refined" / names[kind])
+    assert refined.kind == kind
+    assert len(refined) == FRAMES - 1
+    before = read_poses(poses)
+    assert set(refined.names) == set(before.names) - {"100.png", "images/100.png"}
+    if before.timestamps is not None and refined.timestamps is not None:
+        torch.testing.assert_close(refined.timestamps, before.timestamps[:-1])
+    else:
+        assert refined.calibration is not None
+        found = refined.calibration.camera((640, 480))
+        written = read_calibration(results / "calibration.txt").camera((640, 480)).params[:4]
+        torch.testing.assert_close(found.params[:4], written)
+    off = shape_errors(refined.T_cw, truth[:-1])
+    assert off < 0.5 * shape_errors(given[:-1], truth[:-1])
+    figures = json.loads((results / "metrics.json").read_text())
+    assert figures["posed"] == FRAMES - 1
+    assert abs(figures["focal_px"][1] - 500) < abs(figures["focal_px"][0] - 500)
+    assert len(read_trajectory(results / "trajectory.txt")) == FRAMES - 1
+    lines = [
+        line for line in (results / "refined" / "covariances.txt").read_text().splitlines() if line[0] != "#"
+    ]
+    assert len(lines) == figures["keyframes"]
+    assert all(len(line.split()) == 22 for line in lines)
+    if kind == "nerfstudio":
+        content = json.loads((results / "refined" / "transforms.json").read_text())
+        assert content["applied_scale"] == 2.0
+        assert content["frames"][0]["sharpness"] == 7
+        assert "camera_angle_x" not in content
+
+
+def shape_errors(T_cw: Tensor, truth: Tensor) -> float:
+    """Root mean square of the distances of the centres, after a similarity."""
+    S = back_to_given(T_cw, truth)
+    centres = se3_inverse(T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
+    return float((centres - se3_inverse(truth)[:, :3, 3]).square().sum(-1).mean().sqrt())
+
+
+def test_what_users_get_wrong(
+    folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses, output = write("tum", given, tmp_path), str(tmp_path / "results")
+    cases = {
+        "--refine-distortion: --fix-camera": ["--poses", str(poses), "--fix-camera", "--refine-distortion"],
+        "nothing.txt: cannot be read": ["--poses", str(tmp_path / "nothing.txt")],
+        "neither images.bin": ["--poses", str(tmp_path)],
+    }
+    for message, arguments in cases.items():
+        assert main(["refine", str(folder), "-o", output, *arguments]) == 2
+        assert message in capsys.readouterr().err
+    late = read_trajectory(poses)
+    write_trajectory(tmp_path / "late.txt", Trajectory(late.timestamps + 1000, late.T_wc))
+    assert main(["refine", str(folder), "-o", output, "--poses", str(tmp_path / "late.txt")]) == 2
+    assert "are not those of the images" in capsys.readouterr().err
+
+
+def test_images_that_make_no_map(folder: Path, given: Tensor, tmp_path: Path) -> None:
+    """The results say why, there are no refined poses, and the status is 3."""
+    poses = write("tum", given, tmp_path)
+    arguments = [
+        "refine",
+        str(folder),
+        "--limit",
+        "1",
+        "--poses",
+        str(poses),
+        "-o",
+        str(tmp_path / "results"),
+    ]
+    assert main([*arguments, *FAST]) == 3
+    assert "too few" in json.loads((tmp_path / "results" / "metrics.json").read_text())["failure"]
+    assert not (tmp_path / "results" / "refined").exists()

@@ -1,0 +1,145 @@
+"""Poses of other programs: what our own writers wrote is read again, files made by hand, and what may be wrong."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.io.export.conftest import lens, scene
+from torchslam.data.formats.given_poses import GivenPoses, read_poses
+from torchslam.data.sequence import Sequence
+from torchslam.errors import CalibrationError, TorchslamError, TrajectoryError
+from torchslam.geometry import Camera
+from torchslam.io.export.colmap import write_colmap
+from torchslam.io.export.nerfstudio import write_nerfstudio
+from torchslam.io.export.scene import Scene
+
+__all__ = ["lens", "scene"]
+
+
+class Named(Sequence):
+    """Images of given names, a tenth of a second apart."""
+
+    def __init__(self, *names: str) -> None:
+        times = torch.arange(len(names), dtype=torch.float64) / 10
+        super().__init__("named", "names", Camera.pinhole(1, 1, 1, 1, size=(4, 4)), times)
+        self.names = names
+
+    def image(self, index: int) -> Tensor:
+        return torch.zeros(1, 1, 4, 4)
+
+    def image_name(self, index: int) -> str:
+        return self.names[index]
+
+
+def params_of(given: GivenPoses, camera: Camera) -> list[float]:
+    assert given.calibration is not None
+    assert given.calibration.camera(camera.size).model == camera.model
+    return given.calibration.camera(camera.size).params.tolist()
+
+
+@pytest.mark.parametrize("name", ["images.bin", "images.txt"])
+def test_colmap_is_read_as_it_was_written(scene: Scene, tmp_path: Path, name: str) -> None:
+    """Binary and text, by folder and by file; of a folder with both the binary."""
+    write_colmap(tmp_path, scene)
+    (tmp_path / ("images.txt" if name == "images.bin" else "images.bin")).unlink()
+    for path in (tmp_path, tmp_path / name):
+        given = read_poses(path)
+        assert given.names == tuple(scene.image_names)
+        torch.testing.assert_close(given.T_cw, scene.T_cw, atol=1e-12, rtol=0)
+        assert params_of(given, scene.camera) == pytest.approx(scene.camera.params.tolist())
+
+
+def test_nerfstudio_is_read_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
+    """From the file or its folder; the axes of its cameras are turned."""
+    write_nerfstudio(tmp_path, scene, torch.eye(3, dtype=torch.float64))
+    for path in (tmp_path, tmp_path / "transforms.json"):
+        given = read_poses(path)
+        assert given.names == tuple(f"images/{name}" for name in scene.image_names)
+        torch.testing.assert_close(given.T_cw, scene.T_cw, atol=1e-12, rtol=0)
+        assert params_of(given, scene.camera) == pytest.approx(scene.camera.params.tolist())
+
+
+def test_a_transforms_without_a_camera(tmp_path: Path) -> None:
+    """Then somebody else must know it; a camera at rest looks along -z of OpenGL, y up."""
+    frames = [{"file_path": "./train/r_0", "transform_matrix": torch.eye(4).tolist(), "fl_x": 3.0}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    given = read_poses(tmp_path)
+    assert given.calibration is None
+    assert given.T_cw[0].diagonal().tolist() == [1.0, -1.0, -1.0, 1.0]
+    assert given.rows(Named("data/train/r_0.png", "data/train/r_1.png")).tolist() == [0, -1]
+
+
+def test_images_are_known_by_the_end_of_their_names() -> None:
+    """As much of it as tells them apart; doubtful names are nobody's."""
+    T_cw = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+    given = GivenPoses("colmap", Path("model"), T_cw, names=("a/1.png", "b/1.png", "b/2.png"))
+    assert given.rows(Named("rgb/b/2.png", "rgb/a/1.png", "rgb/b/1.png", "rgb/c.png")).tolist() == [
+        2,
+        0,
+        1,
+        -1,
+    ]
+    assert given.rows(Named("x/2.png", "x/1.png")).tolist() == [2, -1]
+    with pytest.raises(TrajectoryError, match=r"no image is called as those in it, such as a/1\.png"):
+        given.rows(Named("x/3.png"))
+
+
+def test_images_are_known_by_their_times() -> None:
+    """Within 20 ms, and no pose is that of two images."""
+    T_cw = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+    times = torch.tensor([0.015, 0.2, 5.0], dtype=torch.float64)
+    given = GivenPoses("tum", Path("poses.txt"), T_cw, times)
+    assert given.rows(Named("0", "1", "2", "3")).tolist() == [0, -1, 1, -1]
+    late = GivenPoses("tum", Path("poses.txt"), T_cw, times + 100)
+    with pytest.raises(
+        TrajectoryError, match=r"from 100\.015 to 105\.0 s, are not those of the images, from 0\.0"
+    ):
+        late.rows(Named("0", "1", "2", "3"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("transforms.json", "{", "not the frames"),
+        ("transforms.json", '{"frames": []}', "transform_matrix of 4 x 4"),
+        ("transforms.json", '{"frames": [{"file_path": "a"}]}', "not the frames"),
+        (
+            "transforms.json",
+            json.dumps({"frames": [{"file_path": "a", "transform_matrix": (2 * torch.eye(4)).tolist()}]}),
+            "no rotation",
+        ),
+        ("images.txt", "1 1 0 0 0 0 0 0 1\n", "expected `id qw"),
+        ("images.txt", "1 3 0 0 0 0 0 0 1 a.png\n\n", "unit length"),
+        ("images.txt", "# nothing\n", "no images"),
+        ("images.bin", struct.pack("<Q", 2), "not COLMAP's images"),
+        ("nothing.txt", "", "neither images.bin"),
+    ],
+)
+def test_what_is_no_pose(tmp_path: Path, name: str, content: str | bytes, message: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(TrajectoryError, match=message):
+        read_poses(tmp_path)
+
+
+def test_several_cameras_are_too_many(tmp_path: Path) -> None:
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 4 4 1 1 2 2\n2 PINHOLE 4 4 1 1 2 2\n")
+    with pytest.raises(CalibrationError, match="2 cameras"):
+        read_poses(tmp_path)
+    (tmp_path / "images.txt").unlink()
+    (tmp_path / "images.bin").write_bytes(
+        struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0" + struct.pack("<Q", 0)
+    )
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2))
+    with pytest.raises(CalibrationError, match="2 cameras"):
+        read_poses(tmp_path)
+    (tmp_path / "cameras.bin").write_bytes(b"")
+    with pytest.raises(TorchslamError, match="not COLMAP's cameras"):
+        read_poses(tmp_path)

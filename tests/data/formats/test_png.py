@@ -1,0 +1,98 @@
+"""Plain PNG files have the pixels that OpenCV reads from them; all others are left to it."""
+
+from __future__ import annotations
+
+import io
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, PngImagePlugin
+
+from torchslam.data.formats.image_file import AS_GREY, decode_pixels
+from torchslam.data.formats.png import decode_grey
+
+
+def by_opencv(data: bytes) -> np.ndarray | None:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), AS_GREY)
+
+
+def encoded(image: np.ndarray, **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "PNG", **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((37, 53), np.uint8), ((37, 53), np.uint16), ((37, 53, 3), np.uint8)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_same_pixels_as_opencv(shape: tuple[int, ...], dtype: type, seed: int) -> None:
+    noise = np.random.default_rng(seed).integers(0, np.iinfo(dtype).max + 1, shape)
+    image: np.ndarray = noise.astype(dtype)
+    data = encoded(image)
+    grey = decode_grey(data)
+    assert grey is not None
+    assert grey.dtype == dtype
+    np.testing.assert_array_equal(grey, by_opencv(data))
+
+
+def test_every_mixture_of_colours_is_the_grey_that_opencv_makes_of_it() -> None:
+    levels = np.arange(0, 256, 5, dtype=np.uint8)
+    colours = np.stack(np.meshgrid(levels, levels, np.arange(256, dtype=np.uint8), indexing="ij"), -1)
+    data = encoded(colours.reshape(len(levels), -1, 3))
+    np.testing.assert_array_equal(decode_grey(data), by_opencv(data))
+
+
+def test_text_in_front_of_the_pixels_changes_nothing() -> None:
+    text = PngImagePlugin.PngInfo()
+    text.add_text("camera", "left")
+    image = np.arange(256, dtype=np.uint8).reshape(8, 32)
+    np.testing.assert_array_equal(decode_grey(encoded(image, pnginfo=text, dpi=(72, 72))), image)
+
+
+def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
+    colours = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
+    gamma = PngImagePlugin.PngInfo()
+    gamma.add(b"gAMA", (45455).to_bytes(4, "big"))
+    for data in (
+        encoded(colours, pnginfo=gamma),
+        encoded(np.dstack([colours, colours[..., :1]])),  # transparent
+        encoded(np.eye(8, dtype=bool)),  # of one bit
+        cv2.imencode(".jpg", colours)[1].tobytes(),
+        b"",
+    ):
+        assert decode_grey(data) is None
+    data = encoded(colours, pnginfo=gamma)
+    np.testing.assert_array_equal(decode_pixels(data), by_opencv(data))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(8, 400), st.integers(0, 255), st.integers(0, 400))
+def test_damage_is_never_read_as_something_else(at: int, value: int, lost: int) -> None:
+    data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
+    data[at % len(data)] = value
+    grey = decode_grey(bytes(data[: len(data) - lost % len(data)]))
+    if grey is not None:
+        theirs = by_opencv(bytes(data))
+        assert theirs is None or np.array_equal(grey, theirs)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 100), st.integers(0, 100), st.binary(min_size=5, max_size=5))
+def test_headers_that_promise_something_else_are_left_to_opencv(width: int, height: int, kind: bytes) -> None:
+    data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
+    data[16:29] = width.to_bytes(4, "big") + height.to_bytes(4, "big") + kind
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    grey, theirs = decode_grey(bytes(data)), by_opencv(bytes(data))
+    assert grey is None or theirs is None or np.array_equal(grey, theirs)
+
+
+def test_a_header_that_promises_too_much_is_not_decoded() -> None:
+    data = bytearray(encoded(np.zeros((8, 8), np.uint8)))
+    data[16:20] = (1 << 30).to_bytes(4, "big")
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    assert decode_pixels(bytes(data)) is None

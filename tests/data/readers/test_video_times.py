@@ -1,0 +1,81 @@
+"""Videos whose frames do not come at a constant rate, or are to be shown turned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data.mp4 import set_durations, set_rotation, write_mp4
+from torchslam.data import Calibrated, open_sequence
+from torchslam.data.readers.video import _rising
+from torchslam.errors import CalibrationError
+from torchslam.geometry.camera import Camera
+
+CAMERA = "60,60,32,24"
+MILLISECONDS = [40, 200, 17, 333, 5, 40, 81, 40]
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """Eight frames, each of its own brightness."""
+    path = tmp_path / "clip.mp4"
+    write_mp4(path, [np.full((48, 64, 3), 30 * index, np.uint8) for index in range(8)])
+    return path
+
+
+def test_times_of_a_varying_rate(clip: Path) -> None:
+    set_durations(clip, MILLISECONDS)
+    sequence = open_sequence(clip, CAMERA)
+    expected = np.cumsum([0, *MILLISECONDS[:-1]]) / 1000
+    assert np.abs(sequence.timestamps.numpy() - expected).max() < 1e-6
+    for index in (5, 2, 7):
+        assert sequence[index].timestamp == pytest.approx(expected[index], abs=1e-6)
+        assert float(sequence[index].image.mean()) == pytest.approx(30 * index / 255, abs=0.02)
+
+
+@pytest.mark.parametrize(("degrees", "corner"), [(0, (0, 0)), (90, (0, -1)), (180, (-1, -1)), (270, (-1, 0))])
+def test_rotation(tmp_path: Path, degrees: int, corner: tuple[int, int]) -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:12, :12] = 255
+    path = tmp_path / "turned.mp4"
+    write_mp4(path, [image] * 3)
+    set_rotation(path, degrees)
+    sequence = open_sequence(path, "f=0.8w")
+    assert sequence.size == ((64, 48) if degrees % 180 == 0 else (48, 64))
+    assert float(sequence.camera.fx) == pytest.approx(0.8 * sequence.size[0])
+    for index in (1, 0):  # going back opens the file anew
+        shown = sequence.image(index)[0, 0]
+        y, x = (4 if side == 0 else -5 for side in corner)
+        assert shown[y, x] > 0.8
+        assert float((shown > 0.5).float().mean()) == pytest.approx(144 / 3072, abs=0.02)
+
+
+def test_thinned_by_time(clip: Path) -> None:
+    set_durations(clip, MILLISECONDS)
+    sequence = open_sequence(clip, CAMERA, fps=10)
+    assert (sequence.timestamps * 1000).round().to(int).tolist() == [0, 240, 590, 716]
+    part = open_sequence(clip, CAMERA, start="0.24s", stop="0:00.595")
+    assert (part.timestamps * 1000).round().to(int).tolist() == [240, 257, 590]
+    assert float(part[0].image.mean()) == pytest.approx(60 / 255, abs=0.02)
+
+
+def test_a_video_is_read_without_a_camera(clip: Path) -> None:
+    sequence = open_sequence(clip)
+    assert sequence.calibrated is Calibrated.MISSING
+    assert sequence.describe()["camera"].startswith("missing")
+    assert open_sequence(clip, "fov=65").calibrated is Calibrated.GUESSED
+    assert open_sequence(clip, CAMERA).calibrated is Calibrated.GIVEN
+
+
+def test_a_camera_found_later(clip: Path) -> None:
+    sequence, given = open_sequence(clip), open_sequence(clip, CAMERA).camera
+    sequence.camera = given
+    assert (sequence.camera, sequence.calibrated) == (given, Calibrated.GIVEN)
+    with pytest.raises(CalibrationError, match="these are"):
+        sequence.camera = Camera.pinhole(1, 1, 1, 1, size=(2, 2))
+
+
+def test_times_that_do_not_rise_are_left_out() -> None:
+    assert _rising([0.0, 0.1, 0.1, 0.05, 0.2, float("nan"), 0.3]) == [0, 1, 4, 6]

@@ -1,0 +1,76 @@
+"""Points of the cloud fall on their keypoints by nerfstudio's formulas, which are written out here anew."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.io.export.conftest import reprojection_error
+from torchslam.geometry.conventions import upright_rotation
+from torchslam.io.export.nerfstudio import write_nerfstudio
+from torchslam.io.export.ply import VERTEX
+from torchslam.io.export.scene import Scene
+
+
+def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    k1, k2, k3, k4, p1, p2 = (about.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if about["camera_model"] == "OPENCV_FISHEYE":
+        r = np.hypot(x, y)
+        theta = np.arctan(r)
+        bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
+        return x * bent / r, y * bent / r
+    r2 = x * x + y * y
+    d = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    return d * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), d * y + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    return np.frombuffer(path.read_bytes().split(b"end_header\n", 1)[1], VERTEX)
+
+
+@pytest.fixture
+def folder(scene: Scene, tmp_path: Path) -> Path:
+    write_nerfstudio(tmp_path, scene, upright_rotation(scene.T_wc))
+    return tmp_path
+
+
+def test_points_fall_on_their_keypoints(scene: Scene, folder: Path) -> None:
+    about = json.loads((folder / "transforms.json").read_text())
+    cloud = read_cloud(folder / about["ply_file_path"])
+    points = np.stack([cloud[name] for name in "xyz"], axis=1).astype(float)
+    total, count = np.zeros(len(points)), np.zeros(len(points))
+    for row, frame in enumerate(about["frames"]):
+        seen = (scene.frame_index == row).numpy()
+        ids = scene.point_index.numpy()[seen]
+        T_wc = np.array(frame["transform_matrix"])
+        x, y, z = ((points[ids] - T_wc[:3, 3]) @ T_wc[:3, :3]).T
+        x, y = distort(about, x / -z, -y / -z)
+        u, v = about["fl_x"] * x + about["cx"], about["fl_y"] * y + about["cy"]
+        keypoints = scene.pixels.numpy()[seen] + 0.5  # nerfstudio's pixel centres
+        np.add.at(total, ids, np.hypot(u - keypoints[:, 0], v - keypoints[:, 1]))
+        np.add.at(count, ids, 1)
+    assert np.mean(total / count) == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
+
+
+def test_the_world_is_upright_and_says_how(scene: Scene, folder: Path) -> None:
+    about = json.loads((folder / "transforms.json").read_text())
+    up = np.mean([np.array(frame["transform_matrix"])[:3, 1] for frame in about["frames"]], axis=0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), (0, 0, 1), atol=1e-9)
+    R = torch.tensor(about["upright_from_map"], dtype=torch.float64)
+    torch.testing.assert_close(R, upright_rotation(scene.T_wc))
+    assert "applied_transform" not in about  # versions of nerfstudio differ in what they apply it to
+
+
+def test_the_cloud_has_the_colours_and_the_frames_their_images(scene: Scene, folder: Path) -> None:
+    about = json.loads((folder / "transforms.json").read_text())
+    cloud = read_cloud(folder / "sparse_pc.ply")
+    colours = np.stack([cloud[name] for name in ("red", "green", "blue")], axis=1)
+    np.testing.assert_array_equal(colours, scene.colors)
+    assert [frame["file_path"] for frame in about["frames"]] == [
+        f"images/{name}" for name in scene.image_names
+    ]
+    assert (about["w"], about["h"]) == scene.camera.size

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchslam.geometry import rigid, se3_inverse, so3_exp
+from torchslam.io.export.ply import CAMERA_COLOUR, VERTEX, write_map_cloud, write_ply
+from torchslam.map.map import Map
+
+
+def read(path: Path) -> np.ndarray:
+    return np.frombuffer(path.read_bytes().split(b"end_header\n", 1)[1], VERTEX)
+
+
+def columns(vertices: np.ndarray, *names: str) -> np.ndarray:
+    return np.stack([vertices[name] for name in names], axis=1)
+
+
+def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator) -> None:
+    points_w = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    normals_w = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    centres_w = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    colors = torch.randint(0, 256, (5, 3), generator=generator, dtype=torch.uint8)
+    observations = torch.tensor([2, 3, 5, 10, 40])
+    write_ply(tmp_path / "map.ply", points_w, colors, centres_w, normals_w, observations)
+    header = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")[0]
+    lines = header.decode("ascii").splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 7"]
+    assert lines[3:] == [
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        "property float observations",
+    ]
+    vertices = read(tmp_path / "map.ply")
+    positions = columns(vertices, "x", "y", "z")
+    np.testing.assert_allclose(positions, torch.cat([points_w, centres_w]).numpy(), rtol=1e-6)
+    np.testing.assert_allclose(columns(vertices, "nx", "ny", "nz")[:5], normals_w.numpy(), rtol=1e-6)
+    assert vertices["observations"].tolist() == [2, 3, 5, 10, 40, 0, 0]
+    seen = columns(vertices, "red", "green", "blue")
+    np.testing.assert_array_equal(seen[:5], colors.numpy())
+    assert seen[5:].tolist() == [list(CAMERA_COLOUR)] * 2
+
+
+def test_another_program_reads_it(tmp_path: Path, generator: torch.Generator) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    points_w = torch.randn(4, 3, generator=generator)
+    colors = torch.randint(0, 256, (4, 3), generator=generator, dtype=torch.uint8)
+    write_ply(tmp_path / "map.ply", points_w, colors, torch.zeros(0, 3))
+    made = pycolmap.Reconstruction()
+    made.import_PLY(str(tmp_path / "map.ply"))
+    assert len(made.points3D) == 4
+    for number, point in made.points3D.items():
+        np.testing.assert_allclose(point.xyz, points_w[number - 1], rtol=1e-6)
+        np.testing.assert_array_equal(point.color, colors[number - 1])
+
+
+def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
+    """By a rotation alone: up for the cameras is z, normals look at the observer as before."""
+    slam_map.points["colors"][:] = torch.arange(len(slam_map.points))[:, None].to(torch.uint8)
+    slam_map.keyframes["session"][4:] = 1
+    write_map_cloud(tmp_path / "map.ply", slam_map, session=0)
+    vertices, alive = read(tmp_path / "map.ply"), slam_map.living_points()
+    points, cameras = vertices[: len(alive)], vertices[len(alive) :]
+    assert points["red"].tolist() == alive.tolist()
+    assert points["observations"].tolist() == slam_map.points["times_observed"][alive].tolist()
+    R = torch.tensor(
+        ((1, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64
+    )  # y points down in the small run
+    for names, expected in (
+        (("x", "y", "z"), slam_map.positions_w[alive]),
+        (("nx", "ny", "nz"), -slam_map.points["normals_w"][alive]),
+    ):
+        np.testing.assert_allclose(columns(points, *names), expected @ R.mT, atol=1e-5)
+    centres_w = se3_inverse(slam_map.T_cw)[:4, :3, 3]
+    np.testing.assert_allclose(columns(cameras, "x", "y", "z"), centres_w @ R.mT, atol=1e-6)
+
+
+def test_the_same_map_in_a_turned_world_stands_as_high(tmp_path: Path, slam_map: Map) -> None:
+    write_map_cloud(tmp_path / "before.ply", slam_map, session=0)
+    turn = rigid(so3_exp(torch.tensor((0.4, 1.0, -2.0), dtype=torch.float64)), torch.zeros(3).double())
+    slam_map.keyframes["T_cw"][:] = slam_map.T_cw @ se3_inverse(turn)
+    slam_map.points["positions_w"][:] = slam_map.positions_w @ turn[:3, :3].mT
+    write_map_cloud(tmp_path / "after.ply", slam_map, session=0)
+    before, after = read(tmp_path / "before.ply"), read(tmp_path / "after.ply")
+    np.testing.assert_allclose(after["z"], before["z"], atol=1e-5)
+
+
+def test_an_empty_map_has_a_header(tmp_path: Path) -> None:
+    write_map_cloud(tmp_path / "map.ply", Map(), session=0)
+    assert (tmp_path / "map.ply").read_bytes().endswith(b"end_header\n")

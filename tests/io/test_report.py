@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchslam.evaluation import evaluate
+from torchslam.geometry import transform
+from torchslam.io.report import doubts, metrics, quality, summary, table
+from torchslam.map.submap import World
+from torchslam.system.run import Run
+from torchslam.types import State, Tracked, Trajectory
+
+
+def test_counts(run: Run) -> None:
+    figures = metrics(run)
+    assert figures["frames"] == 31
+    assert figures["posed"] == 23
+    assert figures["lost"] == 4
+    assert figures["initialised_at"] == 3
+    assert figures["posed_share_after_initialisation"] == pytest.approx(23 / 27)
+    assert figures["keyframes"] == 6
+    assert figures["points"] == 119
+    assert figures["skipped"] == ["image 31 is not an image"]
+    assert (figures["session"], figures["world"]) == (0, 0)
+    counts = {"world": 0, "keyframes": 6, "points": 119, "posed": 23, "uncertain": 0, "lost": 4}
+    assert figures["worlds"] == [counts]
+
+
+def test_quality(run: Run) -> None:
+    graph = run.history.graph(run.map, run.camera)
+    points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
+    pixels, valid = run.camera.project(points_c)
+    assert valid.any()
+    expected = float((pixels - graph.pixels).norm(dim=-1)[valid].mean())
+    seen = torch.bincount(graph.point_index)
+    found = quality(run)
+    assert found["reprojection_px"] == pytest.approx(expected)
+    assert found["track_length"] == pytest.approx(float(seen[seen > 0].double().mean()))
+    figures = metrics(run)
+    assert figures["uncertain"] == 0
+    assert summary(figures)["quality"] == (
+        f"{expected:.2f} px mean reprojection error, points seen in {found['track_length']:.1f} frames, "
+        "0.0% of the frames uncertain"
+    )
+    assert "quality" not in summary(figures | {"reprojection_px": None})
+    assert quality(replace(run, worlds=())) == quality(replace(run, session=7))
+    assert quality(replace(run, session=7)) == {"reprojection_px": None, "track_length": None}
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "posed", "said"), [(12, 23, True), (11, 23, False), (9, 9, False), (5, 10, True)]
+)
+def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: int, said: bool) -> None:
+    found = doubts(metrics(run) | {"keyframes": keyframes, "posed": posed})
+    assert [text.partition(":")[0] for text in found] == [
+        f"{keyframes} of {posed} posed frames are keyframes"
+    ] * said
+
+
+def test_counts_of_several_worlds_and_sessions(run: Run, world: World) -> None:
+    """Frames 10 to 14 uncertain in world 0; from frame 22 in world 3, which has as many frames of another session."""
+    other = World(3, world.track)
+    other.map.add_keyframe(replace(world.map.view(0), session=2), world.map.T_cw[0])
+    for index in range(30):
+        view = replace(world.map.view(0), index=index, session=int(index < 22))
+        tracked = Tracked(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
+        other.history.add(view, tracked, torch.eye(4, dtype=torch.float64), 0)
+    results = [
+        replace(
+            result,
+            state=State.UNCERTAIN if 10 <= result.index < 15 else result.state,
+            world=3 if result.index >= 22 else result.world,
+        )
+        for result in run.results
+    ]
+    figures = metrics(replace(run, worlds=(world, other), results=results))
+    assert figures["world"] == 0  # most frames of this session, not of all
+    assert [counts["posed"] for counts in figures["worlds"]] == [23, 8]
+    assert [counts["uncertain"] for counts in figures["worlds"]] == [5, 0]
+    assert [counts["lost"] for counts in figures["worlds"]] == [4, 0]
+    words = summary(figures)
+    assert words["world"] == "0, the main one of 2; world 3: 8 frames posed, 1 keyframes"
+    assert words["lost"] == "4 frames; 5 had an uncertain pose"
+    again = metrics(replace(run, worlds=(world, other), results=results, session=1))
+    assert again["world"] == 3
+    assert summary(again)["session"] == "1, which made 0 of the keyframes"
+
+
+def test_times(run: Run) -> None:
+    figures = metrics(run)
+    totals = torch.tensor([result.stage_ms["total"] for result in run.results], dtype=torch.float64)
+    assert figures["ms_median"] == pytest.approx(float(totals.quantile(0.5)))
+    assert figures["ms_p95"] == pytest.approx(float(totals.quantile(0.95)))
+    assert figures["fps"] == pytest.approx(1e3 / float(totals.mean()))
+    assert figures["stage_ms"]["mapping"] == {"median": 12.0, "mean": 12.0, "frames": 4}
+    assert figures["stage_ms"]["tracking"]["frames"] == 30
+
+
+def test_a_map_that_was_given_up_does_not_count_as_the_start(run: Run) -> None:
+    given_up = [replace(run.results[0], state=State.TRACKING), *run.results[1:]]
+    assert metrics(replace(run, results=given_up))["initialised_at"] == 3
+
+
+def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
+    doubled = trajectory.T_wc.clone()
+    doubled[:, :3, 3] *= 2
+    figures = metrics(run, evaluate(run.trajectory, Trajectory(trajectory.timestamps, doubled)))
+    assert figures["ate_m"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["scale"] == pytest.approx(2.0)
+    assert figures["ate_se3_m"] > 0.1
+    assert figures["path_length_m"] > 0
+    assert "online_ate_m" not in figures
+    truth = Trajectory(trajectory.timestamps, doubled)
+    both = metrics(run, evaluate(run.trajectory, truth), 1e-12)
+    assert both == figures | {"online_ate_m": pytest.approx(0.0, abs=1e-9)}
+    assert "online ATE" in summary(both)
+    assert {"translation_m", "rotation_deg"} <= figures["rpe"].keys()
+    assert json.loads(json.dumps(figures)) == figures
+    words = table(summary(figures))
+    for part in (
+        "31, 1 of them unreadable",
+        "23 (74.2%)",
+        "85.2% since the start at frame 3",
+        "2.0000 true metres",
+    ):
+        assert part in words
+
+
+def test_a_run_without_a_map(run: Run) -> None:
+    failed = replace(
+        run,
+        worlds=(),
+        results=run.results[:3],
+        failure="no map was initialised in 3 frames: the camera does not move",
+    )
+    figures = metrics(failed)
+    assert figures["initialised_at"] is None
+    assert figures["posed"] == figures["points"] == figures["keyframes"] == 0
+    assert figures["failure"].endswith("the camera does not move")
+    assert summary(figures) == {"frames": "4, 1 of them unreadable and skipped", "map": "none"}
+
+
+def test_no_frames_at_all(run: Run) -> None:
+    figures = metrics(replace(run, results=[], skipped=[], failure="the sequence has no frames"))
+    assert figures["fps"] == figures["ms_median"] == 0.0
+    assert figures["stage_ms"] == {}

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.walks import Walk, arc
+from torchslam.data import read_trajectory
+from torchslam.errors import ResultsError
+from torchslam.io.pictures import draw
+from torchslam.io.report import metrics
+from torchslam.io.results import read_results, results_in, write_results
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.map.file import read_worlds
+from torchslam.map.submap import World
+from torchslam.system.run import Run
+from torchslam.types import Tracked
+
+WALK = Walk(arc(30))
+
+
+def write(run: Run, directory: Path) -> None:
+    write_results(run, WALK, metrics(run), directory)
+
+
+@pytest.fixture
+def two(run: Run, world: World) -> Run:
+    """A second world with two frames."""
+    other = World(3, world.track)
+    other.map.add_keyframe(replace(world.map.view(0), index=18, timestamp=100.6), world.map.T_cw[0])
+    for index in (18, 19):
+        view = replace(world.map.view(0), index=index, timestamp=100 + index / 30)
+        seen = Tracked(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
+        other.history.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
+    return replace(run, worlds=(other, world))
+
+
+def test_what_is_written_reads_back(tmp_path: Path, run: Run) -> None:
+    assert results_in(tmp_path / "new") == []
+    write(run, tmp_path / "new")
+    assert {path.name for path in results_in(tmp_path / "new")} == {
+        path.name for path in (tmp_path / "new").iterdir()
+    }
+    results = read_results(tmp_path / "new")
+    torch.testing.assert_close(results.trajectory.T_wc, run.trajectory.T_wc, rtol=0, atol=1e-8)
+    assert len(results.keyframes) == 6
+    assert [frame.world for frame in results.frames] == [result.world for result in run.results]
+    assert results.session == 0
+
+
+def test_the_poses_as_they_were_given_have_a_file(tmp_path: Path, run: Run) -> None:
+    write(run, tmp_path)
+    online = read_trajectory(tmp_path / "online.txt")
+    assert len(online) == 23
+    assert torch.equal(online.T_wc, torch.eye(4, dtype=torch.float64).expand(23, 4, 4))
+
+
+def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
+    """Frames 3 to 9 given in world 5, 10 to 17 in 4; those became world 0. World 7, of 22 to 24, is another one."""
+    worlds = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
+    results = [replace(one, world=worlds.get(one.index, one.world)) for one in run.results]
+    recalls = (Recall(30, 9, 5, 4), Recall(40, 30, 0, 0), Recall(41, 20, 4, 0), Recall(42, 2, 7, 6))
+    joined = replace(run, results=results, recalls=recalls)
+    assert len(joined.online) == 5
+    assert [len(part) for part in joined.online_parts] == [5, 8, 7]
+    assert joined.online_parts[2].timestamps[0] == run.results[3].timestamp
+    assert [len(part) for part in replace(joined, recalls=()).online_parts] == [5]
+    assert replace(joined, worlds=()).online_parts == []
+
+
+def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
+    tmp_path: Path, two: Run, run: Run
+) -> None:
+    write(two, tmp_path)
+    assert len(read_trajectory(tmp_path / "trajectory.txt")) == 23
+    assert len(read_trajectory(tmp_path / "trajectory_3.txt")) == 2
+    assert json.loads((tmp_path / "metrics.json").read_text())["world"] == 0
+    assert [world.number for world in read_worlds(tmp_path / "map.safetensors").worlds] == [3, 0]
+    assert read_results(tmp_path).map.num_keyframes == 6
+    write(run, tmp_path)
+    assert not (tmp_path / "trajectory_3.txt").exists()
+
+
+def test_pictures_say_which_world_they_show(
+    tmp_path: Path, two: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchslam.io import plots
+
+    titles = {}
+    monkeypatch.setattr(
+        plots, "save", lambda figure, path: titles.__setitem__(path.stem, figure.get_suptitle())
+    )
+    write(two, tmp_path)
+    draw(read_results(tmp_path), tmp_path)
+    assert "world 0, the main one of 2" in titles["top_view"].replace("\n", " ")
+    write(replace(two, worlds=two.worlds[1:]), tmp_path)
+    draw(read_results(tmp_path), tmp_path)
+    assert "world" not in titles["top_view"]
+
+
+def test_a_run_that_only_localised_is_drawn(tmp_path: Path, run: Run, world: World) -> None:
+    world.history.frames["session"][:] = 1
+    localised = replace(run, session=1, sessions=1)
+    write(localised, tmp_path)
+    assert read_worlds(tmp_path / "map.safetensors").sessions == 1
+    results = read_results(tmp_path)
+    assert len(results.keyframes) == 0
+    assert len(results.trajectory) == 23
+    names = {path.stem for path in draw(results, tmp_path)}
+    assert names == {"tracking", "stages", "scene", "top_view"}
+
+
+def test_certainty_is_drawn_where_the_keyframe_is(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of the map are not in order of time: those found on the way back come later."""
+    from torchslam.io import plots
+
+    keyframes = run.map.keyframes
+    keyframes.keep(torch.tensor([2, 0, 1, 3, 4, 5]))
+    keyframes["covariances"][:] = torch.eye(6, dtype=torch.float64) * keyframes["timestamp"][:, None, None]
+    drawn = {}
+    monkeypatch.setattr(plots, "save", lambda figure, path: None)
+    original = plots.plot_top_view
+
+    def remember(*arguments: object, **more: object) -> object:
+        drawn.update(more, keyframes=arguments[3])
+        return original(*arguments, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(plots, "plot_top_view", remember)
+    write(run, tmp_path)
+    draw(read_results(tmp_path), tmp_path)
+    variances = drawn["keyframe_covariances_w"][:, 0, 0]  # type: ignore[index]
+    assert torch.allclose(variances, drawn["keyframes"].timestamps)  # type: ignore[attr-defined]
+
+
+def test_other_figures_are_refused(tmp_path: Path, run: Run) -> None:
+    write(run, tmp_path)
+    for content in ("[]", '{"frames": 3}'):
+        (tmp_path / "metrics.json").write_text(content)
+        with pytest.raises(ResultsError, match=r"metrics\.json: not the figures of a run: .*world"):
+            read_results(tmp_path)

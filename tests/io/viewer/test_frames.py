@@ -1,0 +1,219 @@
+"""Frames are shown as they pass: in a recording of rerun, and in a film."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.walks import Walk, arc
+from torchslam import SLAM, Run, load_config
+from torchslam.cli.main import main
+from torchslam.errors import ResultsError
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.io.export.undistortion import pinhole_within
+from torchslam.io.viewer.frames import BAR, Film, Glimpse, LiveView, Watching, film_of, tracked_pixels
+from torchslam.types import State, StepResult
+
+SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
+FRAMES = 12
+GREY = 90
+
+
+class Pictured(Walk):
+    """A walk with images, which counts how often each is read."""
+
+    def __init__(self) -> None:
+        super().__init__(arc(FRAMES))
+        self.reads = [0] * FRAMES
+
+    def image(self, index: int) -> torch.Tensor:
+        self.reads[index] += 1
+        width, height = self.size
+        return torch.full((1, 1, height, width), GREY / 255)
+
+
+class Kept:
+    """A screen that keeps what it is shown, with the pose of the frame and its pixels by the map of then."""
+
+    def __init__(self) -> None:
+        self.glimpses: list[Glimpse] = []
+        self.runs: list[Run] = []
+        self.closed = 0
+
+    def show(self, glimpse: Glimpse) -> None:
+        self.glimpses.append(glimpse)
+
+    def end(self, run: Run) -> None:
+        self.runs.append(run)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def watched(slam: SLAM, walk: Walk, *screens: Kept | LiveView | Film) -> Run:
+    with Watching(slam, walk, list(screens)) as watching:
+        run = slam.run(watching.sequence, watching.show)
+        watching.end(run)
+    return run
+
+
+def test_screens_see_every_frame_once() -> None:
+    walk, kept = Pictured(), Kept()
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    run = watched(slam, walk, kept)
+    assert walk.reads == [1] * FRAMES
+    assert [glimpse.result for glimpse in kept.glimpses] == run.results
+    assert all((glimpse.image == GREY).all() for glimpse in kept.glimpses)
+    assert (kept.runs, kept.closed) == ([run], 1)
+    for glimpse in kept.glimpses:
+        count = glimpse.result.inliers
+        assert len(glimpse.tracked) == count or glimpse.result.state is not State.TRACKING or count == 0
+        ours = (glimpse.tracked[:, None] == glimpse.keypoints).all(dim=-1).any(dim=-1)
+        assert ours.all()
+    assert len(kept.glimpses[-1].tracked) > 50
+    assert len(tracked_pixels(slam, FRAMES)) == 0
+
+
+def test_without_screens_the_sequence_is_run_as_it_is() -> None:
+    walk = Pictured()
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    with Watching(slam, walk, []) as watching:
+        assert watching.sequence is walk
+        watching.show(StepResult(0, 0.0, State.LOST, None))
+
+
+def test_what_is_watched_is_the_same_run() -> None:
+    runs = []
+    for screens in ([], [Kept()]):
+        walk = Pictured()
+        runs.append(watched(SLAM(walk.camera, load_config(None, SIMULATED)), walk, *screens))
+    assert torch.equal(runs[0].trajectory.T_wc, runs[1].trajectory.T_wc)
+    assert torch.equal(runs[0].map.positions_w, runs[1].map.positions_w)
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.2])
+def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, distortion: float) -> None:
+    rr = pytest.importorskip("rerun")
+    from tests.io.export.test_recording import read
+
+    walk = Pictured()
+    camera = walk.camera
+    if distortion:
+        walk.camera = Camera.radial_tangential(*camera.params, distortion, 0.02, 0, 0, size=camera.size)
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "live.rrd")
+    run = watched(slam, walk, LiveView(slam, recording))
+    rows = read(tmp_path / "live.rrd")
+    pinhole = pinhole_within(slam.camera)
+    images = rows["/world/camera", "EncodedImage:blob"]
+    assert [frame for frame, _ in images] == list(range(FRAMES))
+    image = cv2.imdecode(np.array(images[-1][1], np.uint8).reshape(-1), cv2.IMREAD_GRAYSCALE)
+    assert image.shape == (pinhole.height, pinhole.width)
+    posed = [result for result in run.results if result.T_cw is not None]
+    translations = rows["/world/camera", "Transform3D:translation"]
+    assert [frame for frame, _ in translations] == [result.index for result in posed]
+    centres = np.array([value for _, value in translations]).reshape(-1, 3)
+    given = torch.stack([result.T_cw for result in posed if result.T_cw is not None])
+    np.testing.assert_allclose(centres, se3_inverse(given)[:, :3, 3].numpy(), atol=1e-6)
+    ((_, points),) = rows["/world/points", "Points3D:positions"][-1:]
+    ids = run.map.living_points()
+    np.testing.assert_allclose(np.array(points), run.map.positions_w[ids].numpy(), atol=1e-5)
+    frame, keypoints = rows["/world/camera/keypoints", "Points2D:positions"][-1]
+    T_cw = run.results[frame].T_cw
+    assert T_cw is not None
+    pixels = pinhole.project(transform(T_cw, run.map.positions_w[ids]))[0].numpy() + 0.5
+    apart = np.linalg.norm(np.array(keypoints)[:, None] - pixels, axis=-1).min(axis=1)
+    assert np.median(apart) < 1.0
+    assert rows["/state", "TextLog:text"]
+
+
+def test_a_camera_no_pinhole_can_stand_for_is_refused() -> None:
+    pytest.importorskip("rerun")
+    wide = Camera.fisheye(90.0, 90.0, 600.0, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240))
+    with pytest.raises(ResultsError, match="too wide"):
+        LiveView(SLAM(wide, load_config(None, SIMULATED)), None)
+
+
+def test_a_window_that_was_closed_does_not_spoil_the_run() -> None:
+    class Gone:
+        def log(self, *what: object, **more: object) -> None: ...
+
+        def flush(self, timeout_sec: float) -> None:
+            raise RuntimeError("no connection")
+
+        def disconnect(self) -> None: ...
+
+    pytest.importorskip("rerun")
+    view = LiveView(SLAM(Walk(arc(3)).camera, load_config(None, SIMULATED)), Gone())
+    with pytest.warns(UserWarning, match="did not get everything: no connection"):
+        view.close()
+
+
+def test_a_viewer_that_does_not_start_has_a_word_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    rr = pytest.importorskip("rerun")
+
+    def fail(**options: object) -> None:
+        raise RuntimeError("no such program")
+
+    monkeypatch.setattr(rr, "spawn", fail)
+    with pytest.raises(ResultsError, match="does not start: no such program"):
+        LiveView.spawn(SLAM(Walk(arc(3)).camera, load_config(None, SIMULATED)))
+
+
+def test_without_rerun_the_run_does_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["run", "synthetic:room?frames=3", "-o", str(tmp_path / "new"), "--view"]) == 2
+    assert "pip install 'torchslam[rerun]'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    film = cv2.VideoCapture(str(path))
+    images = []
+    while (read := film.read())[0]:
+        images.append(read[1])
+    return images
+
+
+def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> None:
+    grey = np.full((120, 1920), GREY, np.uint8)
+    result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
+    glimpse = Glimpse(result, grey, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
+    film = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
+    for shown in (glimpse, replace(glimpse, tracked=torch.zeros(0, 2))):
+        film.show(shown)
+    film.close()
+    first, second = (image.astype(int) for image in frames_of(tmp_path / "it.mp4"))
+    assert first.shape == (60 + BAR, 960, 3)  # half of it
+    marked, unmarked = first[24:37, 494:507], second[24:37, 494:507]
+    green = marked[..., 1] - marked[..., 2]
+    assert green.max() > 30
+    assert abs(unmarked - GREY).max() < 15
+    assert (first[60:] > 120).any()  # the words
+
+
+def test_a_film_is_as_fast_as_its_sequence(tmp_path: Path) -> None:
+    walk = Pictured()
+    film_of(walk, tmp_path).close()
+    film = film_of(SimpleNamespace(known_length=None, timestamps=[], size=(64, 48)), tmp_path)  # type: ignore[arg-type]
+    film.close()
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    watched(slam, walk, film_of(walk, tmp_path))
+    written = cv2.VideoCapture(str(tmp_path / "tracked.mp4"))
+    assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(walk.frame_rate, rel=0.01)
+    assert len(frames_of(tmp_path / "tracked.mp4")) == FRAMES
+
+
+def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match="cannot write it"):
+        Film(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)

@@ -1,0 +1,76 @@
+"""A way around in a circle: its end sees what its start saw, as points of its own, and has drifted."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from tests.map.simulated import tracked_at
+from tests.scene import CAMERA, Scene, pose
+from torchslam.config import Config
+from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp
+from torchslam.map.submap import World
+from torchslam.tracking.tracker import Tracker
+
+KEYFRAMES = 30
+EARLY, LATE = 7, 18  # what the first seven see is made anew by those from the eighteenth on
+END = KEYFRAMES - 1
+
+
+def ring(points: int = 700) -> Scene:
+    """Points on a wall around the circle."""
+    scene = Scene.of(points)
+    generator = torch.Generator().manual_seed(4)
+    draw = torch.rand(points, 3, generator=generator, dtype=torch.float64)
+    angle, radius = 2 * math.pi * draw[:, 0], 5 + 2 * draw[:, 1]
+    points_w = torch.stack([radius * angle.sin(), 3 * draw[:, 2] - 1.5, radius * angle.cos()], -1)
+    return Scene(points_w, scene.sizes, scene.descriptors)
+
+
+def around(count: int = KEYFRAMES) -> Tensor:
+    """(K, 4, 4) T_cw of cameras on the circle that look at the wall."""
+    angle = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    zero = torch.zeros_like(angle)
+    R_wc = so3_exp(torch.stack([zero, angle, zero], -1))
+    return se3_inverse(rigid(R_wc, R_wc @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)))
+
+
+def ring_world(scale: float = 1.0, twist: float = 0.0) -> World:
+    """Once around in the frame of the first camera; per keyframe the unit shrinks by `scale` and the way bends."""
+    scene, T_cw = ring(), around()
+    world = World.empty(0, CAMERA.params)
+    rows: dict[tuple[int, bool], int] = {}
+    early: set[int] = set()
+    for keyframe, true in enumerate(T_cw):
+        view = scene.view(keyframe, true)
+        at = torch.nonzero(view.mask)[:, 0]
+        seen = scene.shows(keyframe)[at].tolist()
+        world.map.add_keyframe(view, true)
+        names = [(point, keyframe >= LATE and point in early) for point in seen]
+        fresh = [name for name in names if name not in rows]
+        rows |= {name: len(rows) + offset for offset, name in enumerate(fresh)}
+        if fresh:
+            born = torch.tensor([point for point, _ in fresh])
+            world.map.add_points(scene.points_w[born], scene.descriptors[born], keyframe)
+        if keyframe < EARLY:
+            early.update(seen)
+        ids = torch.tensor([rows[name] for name in names])
+        world.map.observe(keyframe, at, ids)
+        world.history.add(view, tracked_at(true, ids, at), pose(), keyframe)
+    world.map.refresh(torch.arange(KEYFRAMES))
+    world.correct(drifted(T_cw, scale, twist))
+    Tracker(CAMERA, Config()).follow(world, END)
+    return world
+
+
+def drifted(T_cw: Tensor, scale: float, twist: float) -> Tensor:
+    """(K, 4, 4) similarities of a way of which every step is a little wrong, the first one at the origin."""
+    step = se3_exp(torch.tensor([0, 0, 0, twist, 0.5 * twist, 0], dtype=torch.float64))
+    step[:3, :3] *= scale
+    S_cw = [torch.eye(4, dtype=torch.float64)]
+    for before, after in itertools.pairwise(T_cw):
+        S_cw.append(step @ after @ se3_inverse(before) @ S_cw[-1])
+    return torch.stack(S_cw)

@@ -1,0 +1,215 @@
+"""Places that are known are recognised, those that only look alike are not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.loop_closing.ring import END, KEYFRAMES, ring_world
+from tests.scene import CAMERA, Scene, centre, pose, sideways, world_in
+from torchslam.config import Config, LoopsConfig, load_config
+from torchslam.geometry import sim3_inverse
+from torchslam.loop_closing.keyframe_database import Places
+from torchslam.loop_closing.loop_detector import (
+    Recall,
+    Recognition,
+    Recognizer,
+    agree,
+    may_have_drifted,
+    two_steps_around,
+)
+from torchslam.loop_closing.relative_sim3 import Relation, rescaling
+from torchslam.map.atlas import Worlds
+from torchslam.map.submap import World
+
+SCENE = Scene.of(300)
+OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
+
+
+def recognizer(*held: World, overrides: tuple[str, ...] = ()) -> Recognizer:
+    """One that knows all keyframes of these worlds."""
+    worlds, places = Worlds(CAMERA.params), Places()
+    worlds._worlds = list(held)
+    for world in held:
+        for keyframe in range(world.map.num_keyframes):
+            view = world.map.view(keyframe)
+            places.add(world.map.key(keyframe), view.descriptors, view.mask)
+    return Recognizer(CAMERA, load_config(None, overrides), worlds, places)
+
+
+def two_worlds(S_21: Tensor) -> tuple[World, World]:
+    return world_in(SCENE, sideways(4)), world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+
+
+# --- recognising ------------------------------------------------------------------------------------------------
+
+
+def test_another_world_of_the_same_place_is_recognised(S_21: Tensor) -> None:
+    one, other = two_worlds(S_21)
+    found = recognizer(one, other).recognize(other, 3)
+    assert found is not None
+    assert (found.world, found.keyframe, found.other) == (other, 3, one)
+    assert not found.is_loop
+    torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
+    assert found.recall == Recall(frame=103, place=found.place, world=1, other=0)
+
+
+def test_a_loop_that_drifted_is_recognised() -> None:
+    world = ring_world(scale=1.01, twist=0.002)
+    found = recognizer(world).recognize(world, END)
+    assert found is not None
+    assert found.is_loop
+    assert found.place in (0, 1, 2)
+    # what the end sees is smaller by all the steps of the way
+    scale = float(found.relation.S_21[:3, :3].det()) ** (1 / 3)
+    assert scale == pytest.approx(1.01 ** (END - found.place), rel=0.02)
+
+
+def test_a_place_that_was_never_left_is_no_news() -> None:
+    world = world_in(SCENE, sideways(6))
+    assert recognizer(world).recognize(world, 5) is None
+
+
+def test_a_place_that_looks_alike_elsewhere_is_no_loop() -> None:
+    """A hundred metres on everything looks the same; no drift takes a camera that far on a way of a hundred metres."""
+    world = world_in(SCENE, sideways(4))
+    world.absorb(world_in(SCENE, OTHER, first=50), pose(0, 0, 100.0))
+    assert recognizer(world).recognize(world, 7) is None
+    found = recognizer(world, overrides=("loops.max_drift=1.1",)).recognize(world, 7)
+    assert found is not None
+    torch.testing.assert_close(found.relation.S_21, pose(0, 0, -100.0), atol=1e-5, rtol=0)
+
+
+def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
+    one, other = two_worlds(S_21)
+    other.map.keyframes["keypoints"][:3] += 40.0  # these see nothing where it should be
+    assert recognizer(one, other).recognize(other, 3) is None
+    alone = recognizer(one, other, overrides=("loops.min_confirming=0",))
+    assert alone.recognize(other, 3) is not None
+    one, other = two_worlds(S_21)
+    other.map.keyframes["keypoints"][:1] += 40.0
+    assert recognizer(one, other).recognize(other, 3) is not None
+    assert recognizer(one, other, overrides=("loops.min_confirming=3",)).recognize(other, 3) is None
+
+
+def test_what_two_steps_reach() -> None:
+    slam_map = ring_world().map
+    near = two_steps_around(slam_map, 10)
+    shared = slam_map.observers(slam_map.points_seen_by(torch.tensor([10])))
+    assert set(torch.nonzero(shared)[:, 0].tolist()) <= set(near.tolist())
+    furthest = int(torch.nonzero(shared)[-1])
+    assert int(near.max()) > furthest
+    assert len(near) < KEYFRAMES
+    assert torch.equal(near, torch.unique(near))
+    assert 10 in near
+
+
+# --- how far a way may drift --------------------------------------------------------------------------------------
+
+
+def way() -> World:
+    """Eleven keyframes, a metre apart, of which the first and the last are compared: ten metres."""
+    return world_in(Scene.of(50), sideways(11, step=1.0))
+
+
+def drifts(
+    S_21: Tensor, world: World | None = None, keyframe: int = 10, place: int = 0, **settings: float
+) -> bool:
+    relation = Relation(S_21, 0, 0, 0)
+    return may_have_drifted(world or way(), keyframe, place, relation, replace(LoopsConfig(), **settings))
+
+
+def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
+    assert drifts(pose(0, 1.99))
+    assert not drifts(pose(0, 2.01))
+    assert drifts(pose(0, 0, 0.99), place=5)
+    assert not drifts(pose(0, 0, 1.01), place=5)
+    assert drifts(pose(0, 0, 0.99), keyframe=0, place=5)
+    assert drifts(pose(0, 3.99), max_drift=0.4)
+
+
+def test_the_way_is_that_in_which_the_frames_came() -> None:
+    world = way()
+    world.map.keyframes["frame_index"][:] = torch.tensor([0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10])
+    # to and fro: 2, 2, 2, 2, then 7 back, 2, 2, 2, 2 and 1: 24 metres
+    assert drifts(pose(0, 4.79), world)
+    assert not drifts(pose(0, 4.81), world)
+
+
+def test_the_position_is_that_of_the_camera() -> None:
+    here = centre(way().map.T_cw[10])
+    about = pose(*here.tolist()) @ pose(0, 0, 0, 0, math.radians(19.0)) @ pose(*(-here).tolist())
+    assert drifts(about)
+    assert not drifts(pose(0, 0, 0, 0, math.radians(19.0)))  # about the origin the camera moves by 3.3 m
+
+
+def test_a_drift_of_direction_is_bounded() -> None:
+    here = centre(way().map.T_cw[10])
+    for degrees, may in ((19.9, True), (20.1, False)):
+        about = pose(*here.tolist()) @ pose(0, 0, 0, math.radians(degrees)) @ pose(*(-here).tolist())
+        assert drifts(about) is may
+
+
+@pytest.mark.parametrize(("scale", "may"), [(4.99, True), (5.01, False), (1 / 4.99, True), (1 / 5.01, False)])
+def test_a_drift_of_scale_is_bounded(scale: float, may: bool) -> None:
+    here = centre(way().map.T_cw[10])
+    grown = rescaling(torch.tensor(scale).double())
+    grown = pose(*here.tolist()) @ grown @ pose(*(-here).tolist())
+    assert drifts(grown) is may
+    turned = pose(0, 0, 0, 0, 0, math.radians(15.0))  # the scale is no rotation, nor the other way round
+    assert drifts(pose(*here.tolist()) @ turned @ pose(*(-here).tolist()) @ grown) is may
+
+
+# --- two answers --------------------------------------------------------------------------------------------------
+
+
+def answers(S_1: Tensor, S_2: Tensor, same: bool = True) -> bool:
+    one, other = world_in(SCENE, sideways(4)), world_in(SCENE, sideways(4), number=1)
+    third = other if same else world_in(SCENE, sideways(4), number=2)
+    first = Recognition(one, 2, other, 1, Relation(S_1, 0, 0, 0))
+    return agree(first, Recognition(one, 2, third, 1, Relation(S_2, 0, 0, 0)))
+
+
+def about(S: Tensor) -> Tensor:
+    """The same about the camera of keyframe 2."""
+    here = centre(sideways(4)[2])
+    return pose(*here.tolist()) @ S @ pose(*(-here).tolist())
+
+
+def test_answers_agree_that_say_nearly_the_same() -> None:
+    degree = math.pi / 180
+    assert answers(pose(), pose())
+    for near, far in (
+        (pose(0, 0.38), pose(0, 0.5)),  # a tenth of the depth, which is four
+        (pose(0, 0, 0, 4.9 * degree), pose(0, 0, 0, 5.1 * degree)),
+        (rescaling(torch.tensor(1.19).double()), rescaling(torch.tensor(1.21).double())),
+    ):
+        assert answers(about(near), pose())
+        assert answers(pose(), about(near))
+        assert not answers(about(far), pose())
+        assert not answers(pose(), about(far))
+
+
+def test_answers_are_compared_where_the_camera_is(S_21: Tensor) -> None:
+    assert answers(S_21, S_21)
+    turned = pose(0, 0, 0, 0, 0, 0.08)
+    assert answers(S_21, S_21 @ about(turned))
+    assert not answers(S_21, S_21 @ pose(3.0, 4.0) @ turned @ pose(-3.0, -4.0))
+
+
+def test_of_different_worlds_nothing_can_be_said() -> None:
+    assert answers(pose(5.0), pose(), same=False)
+
+
+def test_two_places_that_both_might_be_it_are_none(S_21: Tensor) -> None:
+    """A world with two corridors that look the same: which of them it is, nobody knows."""
+    twin = world_in(SCENE, sideways(4), first=0)
+    twin.absorb(world_in(SCENE, sideways(4), first=50), pose(100.0))
+    one = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+    assert recognizer(twin, one).recognize(one, 3) is None
+    assert recognizer(twin, one, overrides=("loops.candidates=1",)).recognize(one, 3) is not None
+    assert Config().loops.candidates == 3

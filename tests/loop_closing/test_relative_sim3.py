@@ -1,0 +1,216 @@
+"""Two maps of one scene, the second moved by a known similarity: it has to be found, or nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, world_in
+from torchslam.config import Config, load_config
+from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, transform
+from torchslam.geometry.similarity import Similarity
+from torchslam.loop_closing.relative_sim3 import (
+    Relation,
+    agreeing,
+    confirms,
+    find,
+    neighbourhood,
+    relate,
+    rescaling,
+    seen_from,
+)
+from torchslam.map.map import Map
+
+SCENE = Scene.of(300)
+ROWS = rows_of(SCENE)
+ONE = sideways(4)
+OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
+TWO = 100  # first frame of the second map
+
+
+def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
+    one = world_in(SCENE, ONE, noise=noise)
+    other = world_in(SCENE, OTHER, S_ws=S_21, first=TWO, number=1, noise=noise)
+    return one.map, other.map
+
+
+def related(map_1: Map, map_2: Map, *overrides: str) -> Relation | None:
+    return relate(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
+
+
+def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
+    map_1, map_2 = maps(S_21)
+    relation = related(map_1, map_2)
+    assert relation is not None
+    torch.testing.assert_close(relation.S_21, S_21, atol=1e-6, rtol=0)
+    seen = set(map_1.points_seen_by(torch.tensor([2])).tolist())
+    there = set(map_2.points_seen_by(torch.arange(4)).tolist())
+    assert relation.forward == relation.pairs == len(seen & there)  # rows are the same in both
+    back = set(map_2.points_seen_by(torch.tensor([1])).tolist())
+    here = set(map_1.points_seen_by(torch.arange(4)).tolist())
+    assert relation.backward == len(back & here)
+
+
+def test_the_other_way_round_it_is_the_inverse(S_21: Tensor) -> None:
+    map_1, map_2 = maps(S_21)
+    relation = relate(map_2, 1, map_1, 2, CAMERA, Config())
+    assert relation is not None
+    torch.testing.assert_close(relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
+
+
+def test_noise_moves_it_a_little(S_21: Tensor) -> None:
+    relation = related(*maps(S_21, noise=0.5))
+    assert relation is not None
+    points = SCENE.points_w[:50]
+    off = transform(relation.S_21, points) - transform(S_21, points)
+    assert float(off.norm(dim=-1).median()) < 0.03 * 4.0 * 1.6
+    assert relation.forward > 100
+
+
+@pytest.mark.parametrize(("known", "samples"), [(12, 1), (24, 69), (60, 1147), (120, 3000)])
+def test_no_more_samples_are_drawn_than_would_have_found_enough_matches(
+    S_21: Tensor, monkeypatch: pytest.MonkeyPatch, known: int, samples: int
+) -> None:
+    map_1, map_2 = maps(S_21)
+    shared = in_both(map_1, map_2)
+    drawn: list[int] = []
+
+    def estimate(*args: Tensor, **settings: Any) -> Similarity:
+        assert args[0].shape[1] == known
+        drawn.append(settings["max_samples"])
+        return estimate_similarity(*args, **settings)
+
+    monkeypatch.setattr("torchslam.loop_closing.relative_sim3.estimate_similarity", estimate)
+    related(thinned(map_1, shared[:known]), map_2)
+    assert drawn == [samples]
+
+
+def test_a_map_is_related_to_itself_by_nothing_at_all() -> None:
+    slam_map = world_in(SCENE, ONE).map
+    relation = relate(slam_map, 3, slam_map, 0, CAMERA, Config())
+    assert relation is not None
+    torch.testing.assert_close(relation.S_21, pose(), atol=1e-6, rtol=0)
+
+
+def test_another_scene_is_not_related(S_21: Tensor) -> None:
+    map_1, _ = maps(S_21)
+    elsewhere = world_in(Scene.of(300, seed=9), OTHER, first=TWO).map
+    assert related(map_1, elsewhere) is None
+
+
+def test_points_that_look_alike_but_lie_elsewhere_are_not_related(S_21: Tensor) -> None:
+    map_1, _ = maps(S_21)
+    looks = Scene(Scene.of(300, seed=9).points_w, SCENE.sizes, SCENE.descriptors)
+    assert related(map_1, world_in(looks, OTHER, first=TWO).map) is None
+
+
+def thinned(slam_map: Map, points: Tensor) -> Map:
+    """Only these points are left."""
+    living = slam_map.living_points()
+    slam_map.kill(living[~torch.isin(living, points)])
+    return slam_map
+
+
+def in_both(map_1: Map, map_2: Map) -> Tensor:
+    """(n,) points that all eight keyframes see."""
+    all_of_them = (map_1.points["times_observed"] == 4) & (map_2.points["times_observed"] == 4)
+    return torch.nonzero(all_of_them)[:, 0]
+
+
+def test_enough_points_of_the_other_map_must_be_seen(S_21: Tensor) -> None:
+    for count, found in ((40, True), (39, False)):
+        map_1, map_2 = maps(S_21)
+        thinned(map_2, in_both(map_1, map_2)[:count])
+        relation = related(map_1, map_2)
+        assert (relation is not None) is found
+        assert relation is None or relation.forward == 40
+        map_1, map_2 = maps(S_21)
+        thinned(map_2, in_both(map_1, map_2)[:count])
+        assert related(map_1, map_2, f"loops.min_matches={count}") is not None
+
+
+def test_enough_of_them_must_be_known_to_the_own_map(S_21: Tensor) -> None:
+    for count, found in ((20, True), (19, False)):
+        map_1, map_2 = maps(S_21)
+        thinned(map_1, in_both(map_1, map_2)[:count])
+        relation = related(map_1, map_2)
+        assert (relation is not None) is found
+        assert relation is None or (relation.pairs, relation.backward) == (20, 20)
+
+
+def test_half_as_many_must_be_seen_the_other_way(S_21: Tensor) -> None:
+    map_1, map_2 = maps(S_21)
+    both = in_both(map_1, map_2)[:30]
+    thinned(map_1, both)
+    assert related(map_1, map_2, "loops.min_matches=60") is not None
+    assert related(map_1, map_2, "loops.min_matches=62") is None
+
+
+def test_the_unit_is_that_of_most_depths(S_21: Tensor) -> None:
+    """A third of the points of the first map at twice their depth leave the pixels, and the scale, as they are."""
+    map_1, map_2 = maps(S_21)
+    T_cw = map_1.T_cw[2]
+    points_c = transform(T_cw, map_1.positions_w)
+    points_c[torch.arange(len(points_c)) % 3 == 0] *= 2
+    map_1.points["positions_w"][:] = transform(se3_inverse(T_cw), points_c)
+    relation = related(map_1, map_2)
+    assert relation is not None
+    torch.testing.assert_close(relation.S_21, S_21, atol=1e-3, rtol=0)
+
+
+def test_a_keyframe_confirms_what_it_sees_where_it_should_be(S_21: Tensor) -> None:
+    map_1, map_2 = maps(S_21)
+    near = torch.arange(4)
+    right = Relation(S_21, 0, 0, 0)
+    assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+    for wrong in (
+        pose(0.5) @ S_21,
+        pose(0, 0, 0, 0, 0.1) @ S_21,
+        rescaling(torch.tensor(1.3).double()) @ S_21,
+    ):
+        assert not confirms(Relation(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
+    thinned(map_2, in_both(map_1, map_2)[:20])
+    assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+    thinned(map_2, in_both(map_1, map_2)[:19])
+    assert not confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+
+
+@pytest.mark.parametrize(("offset", "agrees"), [(4.85, True), (4.95, False)])
+def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees: bool) -> None:
+    map_1, map_2 = maps(S_21)
+    T_12 = moved(ONE[2], S_21)
+    keypoints, scales = map_1.keyframes["keypoints"], map_1.keyframes["scales"]
+    keypoints[2, :, 0] += offset * scales[2]
+    ids, _ = find(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
+    good, at = agreeing(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
+    assert len(ids) > 100
+    assert (len(good) > 100) is agrees
+    assert len(good) > 100 or len(good) < 0.1 * len(ids)  # a stray one is near another's place
+    order = SCENE.shows(2)
+    assert torch.equal(ROWS[order[at]], good)
+
+
+def test_points_are_looked_for_eight_pixels_around(S_21: Tensor) -> None:
+    for offset, found in ((7.8, True), (8.2, False)):
+        map_1, map_2 = maps(S_21)
+        map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
+        T_12 = moved(ONE[2], S_21)
+        ids, _ = find(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
+        assert (len(ids) > 100) is found
+
+
+def test_a_neighbourhood_is_a_keyframe_and_those_that_share_most_with_it() -> None:
+    slam_map = world_in(SCENE, sideways(5)).map
+    assert neighbourhood(slam_map, 4, 2).tolist() == [4, 3, 2]
+    assert neighbourhood(slam_map, 0).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_camera_is_seen_from_the_other_map(S_21: Tensor) -> None:
+    torch.testing.assert_close(seen_from(moved(ONE[1], S_21), S_21), ONE[1])
+    torch.testing.assert_close(seen_from(ONE[1], sim3_inverse(S_21)), moved(ONE[1], S_21))
+    points = SCENE.points_w[:5]
+    twice = transform(rescaling(torch.tensor(2.0).double()), points)
+    torch.testing.assert_close(twice, 2 * points)

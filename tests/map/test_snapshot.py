@@ -1,0 +1,62 @@
+"""A map that is returned to is byte by byte what it was, whatever was added and changed since."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tests.map.simulated import simulated_world, view_of
+from torchslam.geometry import se3_exp
+from torchslam.map.map import Map
+from torchslam.map.snapshot import Bookmark
+
+
+def columns(slam_map: Map) -> list[Tensor]:
+    tables = (slam_map.points, slam_map.keyframes)
+    return [column.clone() for table in tables for column in table.columns().values()]
+
+
+def disturb(slam_map: Map, keyframes: int, points: int) -> None:
+    """Add keyframes with points of their own, and change all that later keyframes may change."""
+    generator = torch.Generator().manual_seed(1)
+    around_w = torch.rand(points, 3, generator=generator, dtype=torch.float64)
+    for k in range(keyframes):
+        T_cw = se3_exp(0.1 * torch.randn(6, generator=generator, dtype=torch.float64))
+        view = view_of(100 + k, T_cw, around_w, generator)
+        keyframe = slam_map.add_keyframe(view, T_cw)
+        ids = slam_map.add_points(around_w, view.descriptors, keyframe)
+        slam_map.observe(keyframe, torch.arange(points), ids)
+        slam_map.images[slam_map.key(keyframe)] = torch.zeros(1)
+    slam_map.keyframes["T_cw"][:, :3, 3] += 1.0
+    slam_map.keyframes["covariances"][:] *= 2.0
+    slam_map.points["positions_w"][:] += 1.0
+    slam_map.points["times_found"][:] += 3
+    living = slam_map.living_points()
+    slam_map.replace(living[:4], living[-4:])
+    slam_map.kill(living[5:9])
+    seen = slam_map.observations(slam_map.ids(0))
+    slam_map.forget(seen.keyframe_index[:2], seen.keypoint_index[:2])
+    slam_map.refresh(torch.arange(slam_map.num_keyframes))
+
+
+def test_a_map_is_what_it_was() -> None:
+    slam_map, asked = simulated_world().map, torch.arange(10)
+    slam_map.images[slam_map.key(0)] = torch.ones(1)
+    before, observers = columns(slam_map), slam_map.observers(asked)
+    bookmark = Bookmark.of(slam_map)
+    assert bookmark.num_keyframes == slam_map.num_keyframes
+    for _ in range(2):  # a bookmark can be returned to as often as one likes
+        disturb(slam_map, keyframes=70, points=40)  # more than there is room for
+        assert slam_map.num_keyframes == bookmark.num_keyframes + 70
+        bookmark.return_to(slam_map)
+        assert all(torch.equal(now, then) for now, then in zip(columns(slam_map), before, strict=True))
+        assert torch.equal(slam_map.observers(asked), observers)
+        assert list(slam_map.images) == [slam_map.key(0)]
+
+
+def test_a_bookmark_is_a_copy() -> None:
+    slam_map = simulated_world().map
+    bookmark = Bookmark.of(slam_map)
+    positions = slam_map.positions_w.clone()
+    slam_map.positions_w[:] = 0.0
+    assert torch.equal(bookmark.points["positions_w"], positions)

@@ -1,0 +1,228 @@
+"""An adjustment that is asked for now and taken over later, here or with another process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from torchslam.config import load_config
+from torchslam.geometry import se3_exp
+from torchslam.map.map import Map
+from torchslam.mapping.async_bundle import Adjusting, Answer, solve_here
+from torchslam.mapping.local_bundle import adjust
+from torchslam.optim import BundleProblem
+from torchslam.parallel.bundle_worker import Beside
+
+SCENE = Scene.of(150)
+ROWS = rows_of(SCENE)
+SETTINGS = load_config(None, ["bundle.window=3"]).bundle
+PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
+
+
+def shaken(seed: int = 0) -> Map:
+    """A row of keyframes, the last ones not where they should be."""
+    slam_map = world_in(SCENE, sideways(5)).map
+    generator = torch.Generator().manual_seed(seed)
+    for keyframe in (3, 4):
+        twist = 0.003 * torch.randn(6, generator=generator, dtype=torch.float64)
+        slam_map.keyframes["T_cw"][keyframe] = se3_exp(twist) @ slam_map.T_cw[keyframe]
+    return slam_map
+
+
+def columns(slam_map: Map) -> list[Tensor]:
+    """All that an adjustment may change."""
+    kept, points = slam_map.keyframes, slam_map.points
+    return [kept["T_cw"], kept["covariances"], kept["point_ids"], *(points[name] for name in CHANGED)]
+
+
+CHANGED = ("positions_w", "covariances_w", "normals_w", "alive", "times_observed")
+
+
+def check_same(mine: Map, other: Map) -> None:
+    assert all(torch.equal(a, b) for a, b in zip(columns(mine), columns(other), strict=True))
+
+
+def adjusted(seed: int = 0) -> Map:
+    """What it should come to."""
+    slam_map = shaken(seed)
+    adjust(slam_map, 4, CAMERA, SETTINGS, covariances=True)
+    return slam_map
+
+
+def test_nothing_happens_before_it_is_taken_over() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    assert not adjusting
+    assert adjusting.due is None
+    assert not adjusting.is_due(100)
+    adjusting.ask(slam_map, 4, due=12)
+    assert adjusting
+    assert adjusting.due == 12
+    assert [adjusting.is_due(frame) for frame in (11, 12, 13)] == [False, True, True]
+    check_same(slam_map, shaken())
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted())
+    assert not adjusting
+    adjusting.take_over(slam_map)  # there is nothing more
+    check_same(slam_map, adjusted())
+
+
+def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    begun: list[BundleProblem] = []
+
+    def solver(problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+        begun.append(problem)
+        return solve_here(problem, iterations, covariances)
+
+    adjusting.solver = solver
+    adjusting.begin()  # nothing was asked for
+    adjusting.ask(slam_map, 4, due=12)
+    assert not begun
+    adjusting.begin()
+    adjusting.begin()
+    assert len(begun) == 1
+    check_same(slam_map, shaken())
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted())
+    adjusting.begin()
+    assert len(begun) == 1
+    adjusting.ask(slam_map, 3, due=20)
+    adjusting.take_over(slam_map)  # who was not begun begins now
+    assert len(begun) == 2
+    adjusting.ask(slam_map, 4, due=30)
+    adjusting.begin()
+    adjusting.drop()
+    before = [column.clone() for column in columns(slam_map)]
+    adjusting.take_over(slam_map)
+    assert all(torch.equal(a, b) for a, b in zip(columns(slam_map), before, strict=True))
+
+
+def test_it_can_be_hurried_or_dropped() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting.hurry(3)
+    assert not adjusting
+    adjusting.ask(slam_map, 4, due=12)
+    adjusting.hurry(9)
+    assert adjusting.due == 9
+    adjusting.drop()
+    adjusting.take_over(slam_map)
+    check_same(slam_map, shaken())
+
+
+def test_it_may_be_due_before_the_next_frame() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    assert not adjusting.is_due_first
+    adjusting.ask(slam_map, 4, due=12)
+    assert not adjusting.is_due_first
+    adjusting.drop()
+    adjusting.ask(slam_map, 4, due=None)
+    assert adjusting
+    assert adjusting.is_due_first
+    assert adjusting.due is None
+    assert adjusting.is_due(0)  # after whatever frame, at the latest
+    check_same(slam_map, shaken())
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted())
+    assert not adjusting.is_due_first
+
+
+def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    slam_map.keyframes["point_ids"][:] = -1
+    adjusting.ask(slam_map, 4, due=12)
+    assert adjusting.is_due(12)
+    before = slam_map.T_cw.clone()
+    adjusting.take_over(slam_map)
+    assert torch.equal(slam_map.T_cw, before)
+    assert not adjusting
+
+
+@pytest.fixture(scope="module", params=["copied", "begun anew"])
+def beside(request: pytest.FixtureRequest) -> Iterator[Beside]:
+    """A process that has started, however it was."""
+    is_copied = request.param == "copied"
+    if is_copied and sys.platform != "linux":
+        pytest.skip("processes are copied on Linux alone")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchslam.parallel.worker.starts_at_once", lambda: is_copied)
+        with Beside(CAMERA) as solver:
+            assert solver._worker._ours.poll(PATIENCE)
+            yield solver
+
+
+def test_another_process_finds_the_same(beside: Beside, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_around", None)  # here nothing is solved
+    adjusting = Adjusting(CAMERA, SETTINGS, covariances=True)
+    adjusting.solver = beside
+    for seed in (0, 1):
+        expected = adjusted(seed)
+        slam_map = shaken(seed)
+        adjusting.ask(slam_map, 4, due=12)
+        adjusting.take_over(slam_map)
+        check_same(slam_map, expected)
+    adjusting.ask(shaken(2), 4, due=12)
+    adjusting.drop()  # its answer comes all the same, and is not mistaken for the next one
+    slam_map = shaken(3)
+    adjusting.ask(slam_map, 4, due=12)
+    adjusting.take_over(slam_map)
+    check_same(slam_map, adjusted(3))
+
+
+def test_without_covariances(beside: Beside) -> None:
+    adjusting, slam_map, expected = Adjusting(CAMERA, SETTINGS, covariances=False), shaken(), shaken()
+    adjusting.solver = beside
+    adjusting.ask(slam_map, 4, due=12)
+    adjusting.take_over(slam_map)
+    adjust(expected, 4, CAMERA, SETTINGS)
+    check_same(slam_map, expected)
+
+
+def test_what_goes_wrong_there_is_raised_here(beside: Beside) -> None:
+    slam_map = shaken()
+    adjusting = Adjusting(CAMERA, SETTINGS, covariances=False)
+
+    def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
+        problem.frame_index[0] = 99
+        return beside(problem, iterations, covariances)
+
+    adjusting.solver = wrong
+    adjusting.ask(slam_map, 4, due=12)
+    with pytest.raises(ValueError, match="frame_index") as raised:
+        adjusting.take_over(slam_map)
+    assert "in the process that adjusts" in raised.value.__notes__[0]
+
+
+def test_a_process_that_is_killed_is_done_without() -> None:
+    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    with Beside(CAMERA) as solver:
+        assert solver._worker._ours.poll(PATIENCE)
+        adjusting.solver = solver
+        adjusting.ask(slam_map, 4, due=12)
+        os.kill(solver._worker._process.pid or 0, signal.SIGKILL)
+        solver._worker._process.join()
+        solver._worker._ours.close()  # what it may have answered before
+        with pytest.warns(UserWarning, match="has ended"):
+            adjusting.take_over(slam_map)
+        check_same(slam_map, adjusted())
+        slam_map = shaken(1)
+        adjusting.ask(slam_map, 4, due=12)
+        adjusting.take_over(slam_map)
+        check_same(slam_map, adjusted(1))
+
+
+def test_a_process_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
+    with Beside(CAMERA) as solver:
+        monkeypatch.setattr(solver._worker, "receive", None)
+        adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+        adjusting.solver = solver
+        adjusting.ask(slam_map, 4, due=12)
+        adjusting.take_over(slam_map)
+        check_same(slam_map, adjusted())

@@ -1,0 +1,189 @@
+"""The lean adjustment of a window, against `bundle_adjust`, which takes the long way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.geometry import se3_inverse, se3_log
+from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.bundle.local_numpy import Adjusted, adjust_window
+
+SCALE = 2.0  # of the kernel
+
+
+def both(
+    problem: BundleProblem, iterations: int = 30, tolerance: float = 1e-10
+) -> tuple[Adjusted, BundleSolution]:
+    wanted = bundle_adjust(
+        problem, "huber", SCALE, backward="detached", iterations=iterations, tolerance=tolerance, check=False
+    )
+    return adjust_window(problem, SCALE, iterations, tolerance), wanted
+
+
+def astray(problem: BundleProblem, every: int = 9) -> BundleProblem:
+    """With observations that are far off."""
+    off = torch.arange(len(problem.pixels)) % every == 0
+    pixels = problem.pixels + 30 * off[:, None] * torch.tensor([1.0, -0.7]).double()
+    return replace(problem, pixels=pixels)
+
+
+def weights_of(problem: BundleProblem, kind: str) -> Tensor | None:
+    rows = torch.arange(len(problem.pixels)).double()
+    if kind == "none":
+        return None
+    scalar = 0.5 + rows % 3
+    if kind == "numbers":
+        return scalar
+    root = torch.tensor([[1.0, 0.3], [0.0, 0.8]]).double() * scalar.sqrt()[:, None, None]
+    return root.mT @ root
+
+
+def assert_same(found: Adjusted, wanted: BundleSolution, atol: float = 1e-8) -> None:
+    torch.testing.assert_close(found.T_cw, wanted.T_cw, rtol=0, atol=atol)
+    torch.testing.assert_close(found.points_w, wanted.points_w, rtol=0, atol=10 * atol)
+    assert found.cost == pytest.approx(float(wanted.cost), rel=1e-6)
+
+
+@pytest.mark.parametrize("weights", ["none", "numbers", "matrices"])
+@pytest.mark.parametrize("fixed", [(0, 1), (0,), (3, 1), ()])
+def test_it_finds_what_bundle_adjust_finds(bundle_scene, fixed, weights) -> None:
+    """Whatever is fixed: what that leaves open stays where it is, in the same sense."""
+    problem = astray(bundle_scene(frames=6, points=60, fixed_frames=fixed).problem)
+    problem = replace(problem, weights=weights_of(problem, weights))
+    found, wanted = both(problem)
+    assert bool(wanted.success)
+    assert_same(found, wanted, atol=1e-7)
+    assert torch.equal(found.T_cw[list(fixed)], problem.T_cw[list(fixed)])
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 4])
+def test_its_steps_are_those_of_bundle_adjust(bundle_scene, iterations) -> None:
+    """One by one, without a kernel's curvature at first and then with it."""
+    problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
+    found, wanted = both(problem, iterations, 1e-14)
+    assert int(wanted.convergence.iterations) == iterations
+    assert_same(found, wanted, atol=1e-9)
+
+
+def test_it_stops_where_steps_promise_little(bundle_scene) -> None:
+    problem = astray(bundle_scene(frames=6, points=60).problem)
+    found, wanted = both(problem, 30, 1e-3)
+    exact, _ = both(problem)
+    assert_same(found, wanted, atol=1e-9)
+    assert exact.cost < found.cost < 1.001 * exact.cost
+
+
+def test_what_steps_promise_is_what_bundle_adjust_says(bundle_scene) -> None:
+    """So that both stop together, whatever the tolerance."""
+    problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
+    costs = set()
+    for power in range(30):
+        found, wanted = both(problem, 30, 0.3 * 0.64**power)
+        assert found.cost == pytest.approx(float(wanted.cost), rel=1e-9)
+        costs.add(found.cost)
+    assert len(costs) > 4
+
+
+def test_a_distortion_is_passed_once(bundle_scene, model) -> None:
+    """Errors of pixels are small enough for the slope at the keypoint."""
+    problem = bundle_scene(frames=6, points=80, model=model).problem
+    found, wanted = both(problem)
+    moved = float(se3_log(wanted.T_cw @ se3_inverse(problem.T_cw)).norm(dim=-1).max())
+    off = float(se3_log(found.T_cw @ se3_inverse(wanted.T_cw)).norm(dim=-1).max())
+    assert off < (1e-7 if model == "pinhole" else 0.02 * moved)
+
+
+def test_points_behind_a_camera_pull_nowhere(bundle_scene) -> None:
+    scene = bundle_scene(frames=6, points=60, noise=0.1)
+    points_w = scene.problem.points_w.clone()
+    points_w[:3, 2] = -4.0
+    problem = replace(scene.problem, points_w=points_w)
+    found, wanted = both(problem)
+    assert_same(found, wanted)
+    assert torch.equal(found.points_w[:3], points_w[:3])
+    assert float(se3_log(found.T_cw @ se3_inverse(scene.T_cw)).norm(dim=-1).max()) < 0.01
+
+
+def test_frames_and_points_that_nobody_sees_stay(bundle_scene) -> None:
+    problem = bundle_scene(frames=7, points=50).problem
+    nobody = torch.tensor([11, 49])
+    seen = (problem.frame_index != 4) & ~torch.isin(problem.point_index, nobody)
+    problem = replace(
+        problem,
+        frame_index=problem.frame_index[seen],
+        point_index=problem.point_index[seen],
+        pixels=problem.pixels[seen],
+    )
+    found, wanted = both(problem)
+    assert_same(found, wanted)
+    assert torch.equal(found.T_cw[4], problem.T_cw[4])
+    assert torch.equal(found.points_w[nobody], problem.points_w[nobody])
+
+
+def test_points_alone_are_adjusted_too(bundle_scene) -> None:
+    found, wanted = both(bundle_scene(frames=4, points=20, fixed_frames=(0, 1, 2, 3)).problem)
+    assert_same(found, wanted)
+
+
+def test_the_order_of_what_is_given_does_not_matter(bundle_scene) -> None:
+    problem = astray(bundle_scene(frames=6, points=60).problem)
+    order = torch.randperm(len(problem.pixels), generator=torch.Generator().manual_seed(0))
+    shuffled = replace(
+        problem,
+        frame_index=problem.frame_index[order],
+        point_index=problem.point_index[order],
+        pixels=problem.pixels[order],
+    )
+    one, other = (adjust_window(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
+    torch.testing.assert_close(one.T_cw, other.T_cw, rtol=0, atol=1e-10)
+    torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
+
+
+def test_exact_observations_leave_nothing(bundle_scene) -> None:
+    scene = bundle_scene(noise=0.0)
+    found = adjust_window(scene.problem, SCALE, 20, 1e-8)
+    assert found.cost < 1e-12
+    torch.testing.assert_close(found.T_cw, scene.T_cw, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "size"), [("frame_index", 5), ("point_index", 30)])
+@pytest.mark.parametrize("wrong", [-1, 30])
+def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong) -> None:
+    problem = bundle_scene().problem
+    index = getattr(problem, name).clone()
+    index[3] = wrong
+    with pytest.raises(ValueError, match=rf"{name} must lie in 0 \.\.\. {size - 1}"):
+        adjust_window(replace(problem, **{name: index}), SCALE, 1, 1e-6)
+
+
+@pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
+def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
+    problem = bundle_scene().problem
+    rows = torch.zeros(len(problem.T_cw), dtype=torch.int64)
+    given = {"mask": problem.frame_index > 0, "camera_index": rows, "fixed_points": rows[:1]}
+    if name == "batch":
+        problem = replace(problem, T_cw=problem.T_cw[None])
+    else:
+        problem = replace(problem, **{name: given[name]})
+    with pytest.raises(ValueError, match=r"a window is one problem, without .*: use bundle_adjust"):
+        adjust_window(problem, SCALE, 1, 1e-6)
+
+
+def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
+    problem = bundle_scene().problem
+    single = BundleProblem(
+        *(tensor.to(device, torch.float32) for tensor in (problem.T_cw, problem.points_w)),
+        problem.frame_index.to(device),
+        problem.point_index.to(device),
+        problem.pixels.to(device, torch.float32),
+        problem.camera.to(torch.float32).to(device),
+        fixed_frames=torch.tensor([0, 1], device=device),
+    )
+    found, exact = adjust_window(single, SCALE, 10, 1e-6), adjust_window(problem, SCALE, 10, 1e-6)
+    assert found.T_cw.dtype == found.points_w.dtype == torch.float32
+    assert found.T_cw.device.type == device.type
+    torch.testing.assert_close(found.T_cw.cpu().double(), exact.T_cw, rtol=0, atol=1e-4)

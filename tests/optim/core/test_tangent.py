@@ -1,0 +1,38 @@
+import torch
+
+from torchslam.geometry import se3_exp, transform
+from torchslam.optim.core.tangent import move, point_jacobian, pull_back, retract
+
+
+def test_retraction_agrees_with_the_exponential_and_stays_rigid(generator):
+    T = se3_exp(torch.randn(7, 6, generator=generator, dtype=torch.float64))
+    xi = torch.randn(7, 6, generator=generator, dtype=torch.float64)
+    R = retract(T, xi)[:, :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand(7, 3, 3)
+    torch.testing.assert_close(R @ R.mT, eye, atol=1e-14, rtol=0)
+    torch.testing.assert_close(retract(T, 1e-6 * xi), se3_exp(1e-6 * xi) @ T, atol=1e-11, rtol=0)
+    assert torch.equal(retract(T, 0 * xi), T)
+
+
+def test_gradient_of_retraction_at_zero():
+    T = se3_exp(torch.full((2, 6), 0.3, dtype=torch.float64))
+    xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda xi: retract(T, xi), (xi,))
+
+
+def test_pull_back_is_the_gradient_in_the_tangent(generator):
+    T = se3_exp(torch.randn(3, 6, generator=generator, dtype=torch.float64))
+    G = torch.randn(3, 4, 4, generator=generator, dtype=torch.float64)
+    xi = torch.zeros(3, 6, dtype=torch.float64, requires_grad=True)
+    (expected,) = torch.autograd.grad((retract(T, xi) * G).sum(), xi)
+    torch.testing.assert_close(pull_back(T, G), expected)
+
+
+def test_motion_of_points(generator):
+    points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    direction = torch.randn(6, generator=generator, dtype=torch.float64)
+    eye = torch.eye(4, dtype=torch.float64)
+    step = torch.zeros((), dtype=torch.float64)
+    moved = torch.autograd.functional.jacobian(lambda h: transform(retract(eye, h * direction), points), step)
+    torch.testing.assert_close(move(points, direction.expand(5, 6)), moved)
+    torch.testing.assert_close((point_jacobian(points) @ direction), moved)

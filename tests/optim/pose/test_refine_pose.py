@@ -1,0 +1,246 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchslam.geometry import se3_exp, se3_inverse, se3_log
+from torchslam.optim import PosePrior, refine_pose
+
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
+
+
+def errors(T_cw, truth):
+    return se3_log(T_cw @ se3_inverse(truth)).norm(dim=-1)
+
+
+def test_exact_data_gives_the_exact_pose(pose_scene, model):
+    scene = pose_scene(noise=0.0, model=model)
+    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel="none")
+    assert refined.success.all()
+    assert errors(refined.T_cw, scene.T_cw).max() < 1e-9
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure", "truncated"])
+def test_robust_kernels_survive_outliers(pose_scene, kernel):
+    scene = pose_scene(count=200, outliers=0.3, noise=0.3, perturbation=0.01)
+    scale = 8.0 if kernel == "truncated" else 2.0
+    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel=kernel, scale=scale)
+    plain = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel="none")
+    assert (errors(refined.T_cw, scene.T_cw) < 0.3 * errors(plain.T_cw, scene.T_cw)).all()
+
+
+def test_the_gradient_of_the_cost_vanishes_at_the_answer(pose_scene, model):
+    scene = pose_scene(outliers=0.2, model=model)
+    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, scale=2.0, **CONVERGED)
+    xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
+    points_c = scene.points_w @ (se3_exp(xi) @ refined.T_cw)[:, :3, :3].mT
+    points_c = points_c + (se3_exp(xi) @ refined.T_cw)[:, None, :3, 3]
+    squared = (scene.camera.project(points_c)[0] - scene.pixels).square().sum(-1)
+    cost = 2.0 * torch.log1p(squared / 4).sum(-1)
+    torch.testing.assert_close(refined.cost, cost.detach())
+    (gradient,) = torch.autograd.grad(cost.sum(), xi)
+    assert gradient.abs().max() < 1e-5
+
+
+def test_batch_is_the_same_as_a_loop(pose_scene):
+    scene = pose_scene(batch=3, outliers=0.2)
+    scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    together = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, scale=scale)
+    for row in range(3):
+        one = slice(row, row + 1)
+        alone = refine_pose(
+            scene.start[one], scene.points_w[one], scene.pixels[one], scene.camera, scale=scale[one]
+        )
+        torch.testing.assert_close(alone.T_cw[0], together.T_cw[row], atol=1e-12, rtol=0)
+        torch.testing.assert_close(alone.covariance[0], together.covariance[row])
+        assert alone.convergence.iterations[0] == together.convergence.iterations[row]
+
+
+def test_same_input_same_bytes_with_and_without_gradient(pose_scene):
+    scene = pose_scene(outliers=0.2)
+    pixels = scene.pixels.clone().requires_grad_()
+    first = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera)
+    second = refine_pose(scene.start, scene.points_w, pixels, scene.camera)
+    assert torch.equal(first.T_cw, second.T_cw)
+    assert second.T_cw.requires_grad
+
+
+def test_masked_and_broken_rows_do_not_count(pose_scene):
+    scene = pose_scene(count=40)
+    mask = torch.arange(40).expand(2, 40) >= 5
+    pixels, points, weights = scene.pixels.clone(), scene.points_w.clone(), torch.ones(2, 40).double()
+    pixels[:, 0], points[:, 1], weights[:, 2], pixels[:, 3], weights[:, 4] = (
+        torch.nan,
+        torch.inf,
+        torch.nan,
+        1e9,
+        -1,
+    )
+    tensors = [tensor.requires_grad_() for tensor in (points, pixels, weights)]
+    refined = refine_pose(scene.start, points, pixels, scene.camera, weights, mask)
+    expected = refine_pose(scene.start, scene.points_w[:, 5:], scene.pixels[:, 5:], scene.camera)
+    torch.testing.assert_close(refined.T_cw, expected.T_cw)
+    refined.T_cw.sum().backward()
+    for tensor in tensors:
+        assert tensor.grad.isfinite().all()
+        assert (tensor.grad[:, :5] == 0).all()
+        assert (tensor.grad[:, 5:] != 0).any()
+
+
+def test_points_behind_the_camera_do_not_count(pose_scene):
+    scene = pose_scene(count=40)
+    points = scene.points_w.clone()
+    centre = se3_inverse(scene.T_cw)[:, None, :3, 3]
+    points[:, :5] = 2 * centre - points[:, :5]
+    refined = refine_pose(scene.start, points, scene.pixels, scene.camera, kernel="none")
+    expected = refine_pose(
+        scene.start, scene.points_w[:, 5:], scene.pixels[:, 5:], scene.camera, kernel="none"
+    )
+    torch.testing.assert_close(refined.T_cw, expected.T_cw, atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unroll", "truncated", "detached"])
+def test_failure_is_a_flag_and_no_gradient(pose_scene, backward):
+    scene = pose_scene(batch=5, count=20)
+    points, start = scene.points_w.clone(), scene.start.clone()
+    points[2] = points[2, :1]  # one point, twenty times
+    start[3] = torch.nan
+    mask = torch.ones(5, 20, dtype=torch.bool)
+    mask[1, 2:] = False
+    line = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
+    points[4] = (1 - line) * points[4, :1] + line * points[4, 1:2]  # the pose may turn about the line
+    points.requires_grad_()
+    pixels = scene.pixels.clone().requires_grad_()
+    refined = refine_pose(start, points, pixels, scene.camera, mask=mask, kernel="none", backward=backward)
+    assert refined.success.tolist()[:3] == [True, False, False]
+    assert not refined.success[4]
+    assert refined.T_cw.isfinite().all()
+    assert refined.covariance.isfinite().all()
+    assert torch.equal(refined.T_cw[1], start[1])
+    if backward == "detached":
+        assert not refined.T_cw.requires_grad
+        return
+    refined.T_cw.sum().backward()
+    for tensor in (points, pixels):
+        assert tensor.grad.isfinite().all()
+        assert (tensor.grad[[1, 2, 4]] == 0).all()
+        assert (tensor.grad[0] != 0).any()
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_implicit_gradient_by_gradcheck(pose_scene, model, with_prior, generator):
+    scene = pose_scene(batch=2, count=8, noise=2.0, outliers=0.2, model=model, perturbation=0.005)
+    mask = torch.ones(2, 8, dtype=torch.bool)
+    mask[1, 7] = False
+    A = 20 * torch.randn(2, 6, 6, generator=generator, dtype=torch.float64)
+
+    def solve(points_w, pixels, weights, params, scale, twist, root):
+        prior = PosePrior(se3_exp(twist) @ scene.start, root @ root.mT) if with_prior else None
+        return refine_pose(
+            scene.start,
+            points_w,
+            pixels,
+            replace(scene.camera, params=params),
+            weights,
+            mask,
+            "cauchy",
+            scale,
+            prior,
+            **CONVERGED,
+        ).T_cw[:, :3]
+
+    weights = 0.5 + torch.rand(2, 8, generator=generator, dtype=torch.float64)
+    twist = 0.01 * torch.randn(2, 6, generator=generator, dtype=torch.float64)
+    scale = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    inputs = (scene.points_w, scene.pixels, weights, scene.camera.params, scale, twist, A)
+    leaves = [tensor.clone().requires_grad_(with_prior or index < 5) for index, tensor in enumerate(inputs)]
+    assert torch.autograd.gradcheck(solve, leaves, eps=1e-6, atol=1e-6, rtol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber", "geman_mcclure", "truncated"])
+def test_implicit_gradient_of_every_kernel(pose_scene, kernel):
+    scene = pose_scene(batch=1, count=12, noise=1.0, outliers=0.2)
+
+    def solve(pixels):
+        return refine_pose(
+            scene.start, scene.points_w, pixels, scene.camera, kernel=kernel, scale=3.0, **CONVERGED
+        ).T_cw[:, :3]
+
+    pixels = scene.pixels.clone().requires_grad_()
+    assert torch.autograd.gradcheck(solve, (pixels,), eps=1e-6, atol=1e-6, rtol=1e-4, fast_mode=True)
+
+
+def gradient_to_pixels(scene, backward):
+    pixels = scene.pixels.clone().requires_grad_()
+    refined = refine_pose(
+        scene.start, scene.points_w, pixels, scene.camera, scale=2.0, backward=backward, **CONVERGED
+    )
+    (refined.T_cw[:, :3] * torch.linspace(-1, 1, 12).view(3, 4)).sum().backward()
+    return pixels.grad
+
+
+def test_backward_modes_agree_where_they_should(pose_scene):
+    scene = pose_scene(noise=1.0, outliers=0.1)
+    implicit = gradient_to_pixels(scene, "implicit")
+    torch.testing.assert_close(gradient_to_pixels(scene, "unroll"), implicit, rtol=1e-6, atol=1e-10)
+    bias = (gradient_to_pixels(scene, "truncated") - implicit).norm() / implicit.norm()
+    assert 0.01 < bias < 1
+
+
+def test_unroll_reaches_the_start(pose_scene):
+    scene = pose_scene()
+    start = scene.start.clone().requires_grad_()
+    options = {"kernel": "none", "backward": "unroll", "iterations": 1, "tolerance": 0.0}
+    refine_pose(start, scene.points_w, scene.pixels, scene.camera, **options).T_cw.sum().backward()
+    assert start.grad.isfinite().all()
+    assert (start.grad != 0).any()
+
+
+@pytest.mark.parametrize("kernel", ["none", "cauchy"])
+def test_covariance_is_calibrated(pose_scene, kernel):
+    """The normalised error squared, over many noisy views, averages to its six degrees of freedom."""
+    scene = pose_scene(batch=400, count=100, noise=1.3)
+    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel=kernel, scale=2.0)
+    error = se3_log(scene.T_cw @ se3_inverse(refined.T_cw))
+    squared = (error * torch.linalg.solve(refined.covariance, error)).sum(-1)
+    assert 0.9 < squared.mean() / 6 < 1.1
+
+
+def test_prior_alone_and_prior_against_data(pose_scene):
+    scene = pose_scene()
+    eye = torch.eye(6, dtype=torch.float64).expand(2, 6, 6)
+    nothing = torch.zeros(2, 40, dtype=torch.bool)
+    alone = refine_pose(
+        scene.start,
+        scene.points_w,
+        scene.pixels,
+        scene.camera,
+        mask=nothing,
+        prior=PosePrior(scene.T_cw, 4 * eye),
+    )
+    assert alone.success.all()
+    torch.testing.assert_close(alone.T_cw, scene.T_cw, atol=1e-5, rtol=0)
+    torch.testing.assert_close(alone.covariance, eye / 4)
+    stiff = refine_pose(
+        scene.start, scene.points_w, scene.pixels, scene.camera, prior=PosePrior(scene.start, 1e12 * eye)
+    )
+    torch.testing.assert_close(stiff.T_cw, scene.start, atol=1e-6, rtol=0)
+
+
+def test_dtype_and_device_come_from_the_inputs(pose_scene, dtype, device):
+    scene = pose_scene(outliers=0.1)
+    inputs = [tensor.to(device, dtype) for tensor in (scene.start, scene.points_w, scene.pixels)]
+    refined = refine_pose(*inputs, scene.camera.to(device).to(dtype))
+    for tensor in (refined.T_cw, refined.covariance, refined.cost):
+        assert tensor.dtype == dtype
+        assert tensor.device.type == device.type
+    assert refined.success.all()
+    assert errors(refined.T_cw.cpu().double(), scene.T_cw).max() < 0.02
+
+
+def test_wrong_input_is_named(pose_scene):
+    scene = pose_scene()
+    with pytest.raises(ValueError, match=r"\(B, 4, 4\)"):
+        refine_pose(scene.start[0], scene.points_w, scene.pixels, scene.camera)
+    with pytest.raises(ValueError, match="'exact'"):
+        refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, backward="exact")

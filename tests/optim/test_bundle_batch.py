@@ -1,0 +1,319 @@
+"""Bundle adjustments in batches: what the problems alone would give, without work for what is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import vmap
+
+from torchslam.geometry import se3_exp
+from torchslam.optim import BundleProblem, CameraPrior, PosePrior, bundle_adjust
+from torchslam.optim.bundle import minimization
+from torchslam.optim.bundle.dense import GridBundle
+from torchslam.optim.bundle.problem import sanitized
+from torchslam.optim.bundle.sparse_layout import what_moves
+
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
+EQUAL = {"rtol": 1e-8, "atol": 1e-10}
+
+
+def padded(tensor: Tensor, size: int, value: float) -> Tensor:
+    return torch.cat((tensor, tensor.new_full((size - len(tensor), *tensor.shape[1:]), value)))
+
+
+def batch_of(problems: Sequence[BundleProblem]) -> BundleProblem:
+    """One problem of all, filled up with NaN."""
+    sizes = {
+        name: max(len(getattr(problem, name)) for problem in problems)
+        for name in ("T_cw", "points_w", "pixels", "frame_index", "point_index")
+    }
+    stacked = {
+        name: torch.stack(
+            [padded(getattr(p, name), size, 0 if "index" in name else torch.nan) for p in problems]
+        )
+        for name, size in sizes.items()
+    }
+    mask = torch.stack([torch.arange(sizes["pixels"]) < len(problem.pixels) for problem in problems])
+    weights = None
+    if problems[0].weights is not None:
+        weights = torch.stack([padded(p.weights, sizes["pixels"], -1.0) for p in problems])
+    fixed_frames, fixed_points = (
+        torch.stack([as_mask(getattr(p, name), size) for p in problems])
+        for name, size in (("fixed_frames", sizes["T_cw"]), ("fixed_points", sizes["points_w"]))
+    )
+    return replace(
+        problems[0],
+        **stacked,
+        weights=weights,
+        mask=mask,
+        fixed_frames=fixed_frames,
+        fixed_points=fixed_points,
+    )
+
+
+def as_mask(rows: Sequence[int] | None, size: int) -> Tensor:
+    mask = torch.zeros(size, dtype=torch.bool)
+    mask[list(rows or ())] = True
+    return mask
+
+
+def assert_as_alone(batch: BundleProblem, problems: Sequence[BundleProblem], *arguments, **options) -> None:
+    together = bundle_adjust(batch, *arguments, **options)
+    covariance = together.covariance()
+    for row, problem in enumerate(problems):
+        alone = bundle_adjust(problem, *arguments, **options)
+        frames, points = len(problem.T_cw), len(problem.points_w)
+        torch.testing.assert_close(together.T_cw[row, :frames], alone.T_cw, **EQUAL)
+        torch.testing.assert_close(together.points_w[row, :points], alone.points_w, **EQUAL)
+        torch.testing.assert_close(together.cost[row], alone.cost, **EQUAL)
+        if options.get("free_camera") is not None:
+            torch.testing.assert_close(together.camera.params[row], alone.camera.params, rtol=1e-7, atol=1e-7)
+        assert together.success[row] == alone.success
+        assert torch.equal(together.moved_frames[row, :frames], alone.moved_frames)
+        assert torch.equal(together.moved_points[row, :points], alone.moved_points)
+        assert together.convergence.iterations[row] == alone.convergence.iterations[0]
+        if not alone.success:
+            continue
+        expected = alone.covariance()
+        torch.testing.assert_close(covariance.frames[row, :frames], expected.frames, rtol=1e-6, atol=1e-14)
+        torch.testing.assert_close(covariance.points[row, :points], expected.points, rtol=1e-6, atol=1e-12)
+        torch.testing.assert_close(covariance.camera[row], expected.camera, rtol=1e-5, atol=1e-10)
+
+
+def mixed(bundle_scene, **options) -> list[BundleProblem]:
+    """Problems of different sizes, with two, one or no fixed frame, or a fixed point."""
+    return [
+        bundle_scene(frames=5, points=30, seed=0, **options).problem,
+        bundle_scene(frames=6, points=25, seed=1, fixed_frames=(0, 2), **options).problem,
+        bundle_scene(frames=4, points=28, seed=2, fixed_frames=(), fixed_points=(1, 2, 7), **options).problem,
+    ]
+
+
+@pytest.mark.parametrize("grids", [True, False])
+def test_a_batch_is_the_loop(bundle_scene, model, grids, monkeypatch):
+    if not grids:
+        monkeypatch.setattr(minimization, "fits_grids", lambda *_: False)
+    problems = mixed(bundle_scene, model=model)
+    assert_as_alone(batch_of(problems), problems, "cauchy", 2.0)
+
+
+def test_exact_data_end_where_rounding_begins(bundle_scene, model):
+    """Alone and in a batch; steps after that would only shuffle it."""
+    problems = [bundle_scene(noise=0.0, frames=f, seed=f, model=model).problem for f in (4, 5)]
+    together = bundle_adjust(batch_of(problems), iterations=100, tolerance=0.0)
+    for row, problem in enumerate(problems):
+        alone = bundle_adjust(problem, iterations=100, tolerance=0.0)
+        assert alone.convergence.converged
+        assert together.convergence.converged[row]
+        assert max(int(alone.convergence.iterations), int(together.convergence.iterations[row])) < 20
+        assert float(alone.cost) < 1e-18
+        torch.testing.assert_close(together.T_cw[row, : len(problem.T_cw)], alone.T_cw, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("fixed_frames", [(0,), ()])
+def test_an_open_gauge_keeps_what_it_keeps_alone(bundle_scene, fixed_frames):
+    problems = [
+        bundle_scene(frames=5, points=30, seed=seed, fixed_frames=fixed_frames).problem for seed in (0, 1)
+    ]
+    problems.append(bundle_scene(frames=5, points=30, seed=2, fixed_frames=(0, 1)).problem)
+    problems.append(bundle_scene(frames=7, points=30, seed=3, fixed_frames=fixed_frames).problem)
+    assert_as_alone(batch_of(problems), problems)
+
+
+@pytest.mark.parametrize("directions", [True, torch.tensor([[1.0], [1.1], [0.0], [0.0]]).double()])
+def test_every_problem_finds_a_camera_of_its_own(bundle_scene, directions):
+    problems = [bundle_scene(frames=7, points=60, seed=seed).problem for seed in (0, 1)]
+    batch = batch_of(problems)
+    factors = torch.tensor([[0.97], [1.03]], dtype=torch.float64)
+    camera = batch.camera.with_params(factors * batch.camera.params)
+    alone = [replace(p, camera=camera[row]) for row, p in enumerate(problems)]
+    assert_as_alone(replace(batch, camera=camera), alone, free_camera=directions, iterations=40)
+
+
+def test_many_at_once_or_few(bundle_scene, monkeypatch):
+    problems = mixed(bundle_scene)
+    monkeypatch.setattr(minimization, "_CELLS_AT_ONCE", 400)
+    told = []
+    batch = batch_of(problems)
+    bundle_adjust(batch, progress=lambda now, most: told.append((now, most)))
+    given = sanitized(batch, 1.0)
+    assert len(minimization._parts(given, what_moves(given))) == 2
+    assert told == sorted(told)
+    assert {most for _, most in told} == {60}
+    assert_as_alone(batch, problems)
+
+
+def test_what_has_converged_does_no_more_work(bundle_scene, monkeypatch):
+    """An element that starts at its minimum leaves after the first step; what is left is evaluated alone."""
+    problems = [bundle_scene(seed=seed, noise=0.5).problem for seed in range(3)]
+    done = bundle_adjust(problems[1], tolerance=1e-14, iterations=50)
+    problems[1] = replace(problems[1], T_cw=done.T_cw, points_w=done.points_w)
+    sizes = []
+    evaluate = GridBundle.evaluate
+    monkeypatch.setattr(
+        GridBundle, "evaluate", lambda self, at, near: sizes.append(len(near)) or evaluate(self, at, near)
+    )
+    solution = bundle_adjust(batch_of(problems), tolerance=1e-8)
+    iterations = solution.convergence.iterations
+    assert iterations[1] == 1
+    assert solution.convergence.converged.all()
+    assert sizes[:3] == [3, 3, 2]
+    assert sum(sizes) == 3 + int(iterations.sum())
+
+
+def test_a_failure_is_its_own(bundle_scene):
+    """A frame that is not finite, and two maps without a common point, beside a problem that is fine."""
+    problems = [bundle_scene(frames=6, points=60, visible=1.0, seed=seed).problem for seed in range(3)]
+    T_cw = problems[1].T_cw.clone()
+    T_cw[3, 0, 3] = torch.nan
+    problems[1] = replace(problems[1], T_cw=T_cw)
+    apart = (problems[2].frame_index < 3) == (problems[2].point_index < 30)
+    names = ("frame_index", "point_index", "pixels")
+    problems[2] = replace(problems[2], **{name: getattr(problems[2], name)[apart] for name in names})
+    batch = batch_of(problems)
+    pixels = batch.pixels.clone().requires_grad_()
+    solution = bundle_adjust(replace(batch, pixels=pixels))
+    assert solution.success.tolist() == [True, False, False]
+    assert bundle_adjust(batch, check=False).success.tolist() == [True, False, True]
+    assert solution.T_cw.isfinite().all()
+    assert solution.points_w.isfinite().all()
+    (solution.T_cw.sum() + solution.points_w.sum()).backward()
+    assert pixels.grad.isfinite().all()
+    assert (pixels.grad[1:] == 0).all()
+    expected = problems[0].pixels.clone().requires_grad_()
+    alone = bundle_adjust(replace(problems[0], pixels=expected))
+    (alone.T_cw.sum() + alone.points_w.sum()).backward()
+    torch.testing.assert_close(pixels.grad[0, : len(expected)], expected.grad, **EQUAL)
+
+
+def test_a_point_seen_twice_in_a_frame_counts_twice(bundle_scene):
+    problems = [bundle_scene(seed=seed).problem for seed in (0, 1)]
+    twice = [
+        replace(
+            problem,
+            frame_index=torch.cat((problem.frame_index, problem.frame_index[:4])),
+            point_index=torch.cat((problem.point_index, problem.point_index[:4])),
+            pixels=torch.cat((problem.pixels, problem.pixels[:4] + 2.0)),
+        )
+        for problem in problems
+    ]
+    assert_as_alone(batch_of(twice), twice)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unroll", "truncated"])
+def test_gradients_are_those_of_the_loop(bundle_scene, backward):
+    problems = mixed(bundle_scene, noise=1.0)
+    batch = batch_of(problems)
+
+    def gradient(problem: BundleProblem) -> Tensor:
+        pixels = problem.pixels.clone().requires_grad_()
+        solution = bundle_adjust(replace(problem, pixels=pixels), "cauchy", 2.0, backward=backward)
+        loss = (solution.points_w * torch.tensor([0.3, -0.5, 0.7], dtype=torch.float64)).nansum()
+        (loss + solution.T_cw[..., :3, :].nansum()).backward()
+        return pixels.grad
+
+    found = gradient(batch)
+    for row, problem in enumerate(problems):
+        expected = gradient(problem)
+        torch.testing.assert_close(found[row, : len(expected)], expected, rtol=1e-6, atol=1e-9)
+        assert (found[row, len(expected) :] == 0).all()
+
+
+@pytest.mark.parametrize("free_camera", [False, True])
+def test_gradients_of_a_batch_by_gradcheck(bundle_scene, generator, free_camera):
+    """To all that may have a gradient, two cameras, priors, and rows that do not count among it."""
+    scenes = [bundle_scene(frames=5, points=14, noise=1.0, perturbation=1e-3, seed=seed) for seed in (0, 3)]
+    batch = batch_of([scene.problem for scene in scenes])
+    batch = replace(
+        batch,
+        camera=batch.camera.with_params(batch.camera.params.expand(2, 4)),
+        camera_index=torch.tensor([0, 0, 1, 0, 1]),
+        mask=batch.mask & (torch.rand(batch.mask.shape, generator=generator) < 0.95),
+    )
+    weights = 0.5 + torch.rand(batch.mask.shape, generator=generator, dtype=torch.float64)
+    scale, twist = torch.tensor([2.0, 3.0]).double(), torch.zeros(2, 5, 6, dtype=torch.float64)
+    information = (
+        100
+        * torch.eye(6, dtype=torch.float64).expand(2, 5, 6, 6)
+        * torch.tensor([1.0, 1, 1, 0, 0], dtype=torch.float64).view(5, 1, 1)
+    )
+    tight = 0.1 * torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
+    params = batch.camera.params.expand(2, 2, 4)
+
+    def solve(pixels, weights, params, scale, twist, information, mean, tight):
+        T_cw = se3_exp(twist) @ batch.T_cw
+        moved = replace(
+            batch,
+            T_cw=torch.cat((T_cw[:, :2], batch.T_cw[:, 2:]), dim=1),
+            pixels=pixels,
+            weights=weights,
+            camera=batch.camera.with_params(params),
+            pose_prior=PosePrior(T_cw, 0.5 * (information + information.mT)),
+            camera_prior=CameraPrior(mean, 0.5 * (tight + tight.mT)),
+        )
+        solution = bundle_adjust(moved, "cauchy", scale, free_camera, **CONVERGED)
+        return solution.T_cw[..., :3, :], solution.points_w, solution.camera.params
+
+    pixels = torch.where(batch.pixels.isnan(), 7.0, batch.pixels)
+    inputs = (pixels, weights, params, scale, twist, information, params - 2.0, tight)
+    leaves = [x.clone().requires_grad_(not (free_camera and index == 2)) for index, x in enumerate(inputs)]
+    assert torch.autograd.gradcheck(solve, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
+    if not free_camera:
+        solution = bundle_adjust(replace(batch, pixels=leaves[0]))
+        solution.points_w.sum().backward()
+        assert (leaves[0].grad[~batch.mask] == 0).all()
+
+
+def test_dtype_and_device_of_a_batch(bundle_scene, dtype, device):
+    scenes = [bundle_scene(frames=6, points=60, seed=seed) for seed in (0, 1)]
+    batch = batch_of([scene.problem for scene in scenes])
+    moved = {name: getattr(batch, name).to(device, dtype) for name in ("T_cw", "points_w", "pixels")}
+    kept = ("frame_index", "point_index", "mask", "fixed_frames", "fixed_points")
+    moved |= {name: getattr(batch, name).to(device) for name in kept}
+    solution = bundle_adjust(replace(batch, **moved, camera=batch.camera.to(device).to(dtype)))
+    assert solution.success.all()
+    for tensor in (solution.T_cw, solution.points_w, solution.cost, solution.covariance().points):
+        assert tensor.dtype == dtype
+        assert tensor.device.type == device.type
+    for row, scene in enumerate(scenes):
+        torch.testing.assert_close(solution.T_cw[row].cpu().double(), scene.T_cw, atol=0.03, rtol=0)
+
+
+def test_a_wrong_batch_is_named(bundle_scene):
+    problems = [bundle_scene(seed=seed).problem for seed in (0, 1)]
+    batch = batch_of(problems)
+    with pytest.raises(ValueError, match=r"mask must be \(O,\)"):
+        bundle_adjust(replace(batch, mask=batch.mask[:, :-1]))
+    with pytest.raises(ValueError, match=r"camera.params must be \(K,\) = \(4,\), not \(3, 4\)"):
+        bundle_adjust(replace(batch, camera=batch.camera.with_params(torch.ones(3, 4).double())))
+    with pytest.raises(ValueError, match="camera_index must have one row per frame, 5"):
+        bundle_adjust(replace(problems[0], camera_index=torch.zeros(4, dtype=torch.int64)))
+    with pytest.raises(ValueError, match="a batch must have a problem"):
+        bundle_adjust(replace(batch, T_cw=batch.T_cw[:0]))
+
+
+def test_vmap_over_batches(bundle_scene):
+    batch = batch_of([bundle_scene(seed=seed).problem for seed in (0, 1)])
+    pixels = torch.stack([batch.pixels, batch.pixels + 0.3])
+
+    def points(pixels: Tensor) -> Tensor:
+        return bundle_adjust(replace(batch, pixels=pixels)).points_w
+
+    expected = torch.stack([points(pixels[0]), points(pixels[1])])
+    torch.testing.assert_close(vmap(points)(pixels), expected, **EQUAL)
+
+
+def test_autocast_changes_no_bit_of_a_batch(bundle_scene):
+    batch = batch_of([bundle_scene(seed=seed).problem for seed in (0, 1)])
+    batch = replace(
+        batch, points_w=batch.points_w.float(), T_cw=batch.T_cw.float(), pixels=batch.pixels.float()
+    )
+    batch = replace(batch, camera=batch.camera.to(torch.float32))
+    expected = bundle_adjust(batch)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = bundle_adjust(batch)
+    assert torch.equal(found.points_w, expected.points_w)

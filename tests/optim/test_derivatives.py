@@ -1,0 +1,269 @@
+"""Derivatives of minimisers in both directions, twice, and under `torch.func`'s transforms, against one another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.optim.test_graph import simulated
+from tests.optim.test_pose_graph import make_scene
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.func import jacfwd, jacrev, jvp, vmap
+
+from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
+from torchslam.optim import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
+from torchslam.optim.run_graph import solve
+
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
+EXACT = {"rtol": 0.0, "atol": 1e-10}
+Problem = tuple[Callable[[Tensor], Tensor], Tensor]
+
+
+def pose_problem(pose_scene, model="pinhole", with_prior=False) -> Problem:
+    scene = pose_scene(batch=2, count=6, noise=2.0, model=model, perturbation=0.005)
+    eye = torch.eye(6, dtype=torch.float64).expand(2, 6, 6)
+
+    def poses(x: Tensor) -> Tensor:
+        """Of what all enter: pixels, points, weights, camera, scale and prior."""
+        pixels = scene.pixels + x[:2]
+        points = torch.cat((scene.points_w[:, :1] + 0.01 * x[None, None, 2:5], scene.points_w[:, 1:]), dim=1)
+        weights = 1 + x[5].square() * torch.linspace(0, 1, 12, dtype=torch.float64).view(2, 6)
+        camera = scene.camera.with_params(scene.camera.params * (1 + 0.01 * x[6]))
+        prior = None
+        if with_prior:
+            prior = PosePrior(se3_exp(0.01 * x[:6]) @ scene.start, (1 + x[0]).square() * 400 * eye)
+        return refine_pose(
+            scene.start, points, pixels, camera, weights, scale=2 + x[7], prior=prior, **CONVERGED
+        ).T_cw[:, :3]
+
+    return poses, torch.linspace(-0.5, 0.5, 8, dtype=torch.float64)
+
+
+def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
+    problem = bundle_scene(frames=3, points=10, noise=1.0, **options).problem
+
+    def estimate(x: Tensor) -> Tensor:
+        ramp = torch.linspace(-1, 1, len(problem.pixels), dtype=torch.float64)[:, None]
+        solution = bundle_adjust(
+            replace(
+                problem,
+                T_cw=se3_exp(torch.nn.functional.pad(0.01 * x[:1], (0, 5))) @ problem.T_cw,
+                pixels=problem.pixels + x[:2] * ramp,
+                weights=1 + x[2] * ramp[:, 0].square(),
+                camera=problem.camera.with_params(problem.camera.params * (1 + 0.01 * x[3])),
+            ),
+            "cauchy",
+            3 + x[4],
+            free_camera,
+            **CONVERGED,
+        )
+        parts = solution.T_cw[:, :3], solution.points_w, 1e-3 * solution.camera.params
+        return torch.cat([part.flatten() for part in parts])
+
+    return estimate, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
+
+
+def graph_problem() -> Problem:
+    _, graph = simulated(frames=7, points=16)
+
+    def poses(x: Tensor) -> Tensor:
+        ramp = torch.linspace(-1, 1, len(graph.pixels), dtype=torch.float64)[:, None]
+        moved = replace(
+            graph,
+            pixels=graph.pixels + x[:2] * ramp,
+            weights=graph.weights * (1 + x[2] * ramp[:, 0].square()),
+            camera=graph.camera.with_params(graph.camera.params * (1 + 0.01 * x[3])),
+        )
+        T_cw = solve(moved, "cauchy", 3.0, **CONVERGED).T_cw
+        centres = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
+        return torch.cat((T_cw[:, :3, :3].flatten(), (centres / centres.norm()).flatten()))
+
+    return poses, torch.linspace(-0.3, 0.4, 4, dtype=torch.float64)
+
+
+def pose_graph_problem(with_scale=True) -> Problem:
+    graph = make_scene(nodes=4, with_scale=with_scale).graph
+
+    def nodes(x: Tensor) -> Tensor:
+        twist = torch.nn.functional.pad(x[:3] * torch.ones(len(graph.edges), 1, dtype=torch.float64), (1, 3))
+        twist = 0.01 * twist * torch.linspace(-1, 1, len(graph.edges), dtype=torch.float64)[:, None]
+        start = sim3_exp(torch.nn.functional.pad(0.01 * x[:1], (0, 6))) @ graph.S_cw[:, :1]
+        moved = replace(
+            graph,
+            S_cw=torch.cat((start, graph.S_cw[:, 1:]), dim=1),
+            S_ji=sim3_exp(twist) @ graph.S_ji,
+            information=graph.information * (1 + x[3].square()),
+        )
+        return pose_graph_optimize(moved, "cauchy", 3 + x[4], iterations=100, tolerance=1e-26).S_cw[
+            ..., :3, :
+        ]
+
+    return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
+
+
+@pytest.fixture(
+    params=["pose", "fisheye", "prior", "bundle", "free camera", "graph", "pose graph", "rigid pose graph"]
+)
+def problem(request, pose_scene, bundle_scene) -> Problem:
+    makers: dict[str, Callable[[], Problem]] = {
+        "pose": lambda: pose_problem(pose_scene),
+        "fisheye": lambda: pose_problem(pose_scene, model="fisheye"),
+        "prior": lambda: pose_problem(pose_scene, with_prior=True),
+        "bundle": lambda: bundle_problem(bundle_scene),
+        "free camera": lambda: bundle_problem(bundle_scene, free_camera=True),
+        "graph": graph_problem,
+        "pose graph": pose_graph_problem,
+        "rigid pose graph": lambda: pose_graph_problem(with_scale=False),
+    }
+    return makers[request.param]()
+
+
+def penalty(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """A number that depends on all of the output, not linearly."""
+
+    def of(x: Tensor) -> Tensor:
+        value = function(x).flatten()
+        return (value * torch.linspace(-1, 1, len(value), dtype=value.dtype)).square().sum()
+
+    return of
+
+
+def mixed(function: Callable[[Tensor], Tensor], count: int = 6) -> Callable[[Tensor], Tensor]:
+    """A few sums over all of the output, each with weights of its own, as a Jacobian row by row takes long."""
+
+    def of(x: Tensor) -> Tensor:
+        value = function(x).flatten()
+        return torch.cos(torch.arange(count * len(value), dtype=value.dtype)).view(count, -1) @ value
+
+    return of
+
+
+def test_a_gradient_of_a_gradient(problem):
+    function, x = problem
+    x = x.clone().requires_grad_()
+    assert torch.autograd.gradgradcheck(function, (x,), eps=1e-4, atol=1e-7, rtol=1e-3, fast_mode=True)
+
+
+def test_a_gradient_penalty_is_that_of_finite_differences(problem):
+    """Of a loss linear in the answer, too, whose gradient once came without a graph."""
+    function, x = problem
+    weights = torch.linspace(-1, 1, function(x).numel(), dtype=torch.float64)
+
+    def squared_gradient(x: Tensor) -> Tensor:
+        leaf = x if x.requires_grad else x.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad((function(leaf).flatten() * weights).sum(), leaf, create_graph=True)
+        return gradient.square().sum()
+
+    leaf = x.clone().requires_grad_()
+    (found,) = torch.autograd.grad(squared_gradient(leaf), leaf)
+    step = 1e-4 * torch.nn.functional.normalize(torch.cos(torch.arange(len(x), dtype=x.dtype)), dim=0)
+    expected = (squared_gradient(x + step) - squared_gradient(x - step)) / 2
+    assert float(found @ step) == pytest.approx(float(expected.detach()), rel=1e-4)
+
+
+def test_both_directions_are_the_same(problem):
+    function, x = mixed(problem[0]), problem[1]
+    expected = torch.autograd.functional.jacobian(function, x)
+    for found in (jacrev(function)(x), jacfwd(function)(x)):
+        torch.testing.assert_close(found, expected, **EXACT)
+    change = torch.cos(torch.arange(len(x), dtype=x.dtype))
+    torch.testing.assert_close(jvp(function, (x,), (change,))[1], expected @ change, **EXACT)
+    with forward_ad.dual_level():
+        tangent = forward_ad.unpack_dual(function(forward_ad.make_dual(x, change))).tangent
+    torch.testing.assert_close(tangent, expected @ change, **EXACT)
+
+
+def test_vmap_is_the_loop(problem):
+    function, x = problem
+    batch = torch.stack((x, 0.5 * x.flip(0)))
+    for mapped in (function, jacrev(function), jacfwd(function)):
+        torch.testing.assert_close(vmap(mapped)(batch), torch.stack([mapped(x) for x in batch]), **EXACT)
+    torch.testing.assert_close(
+        jacrev(vmap(function))(batch)[1, ..., 1, :], jacrev(function)(batch[1]), **EXACT
+    )
+
+
+def test_second_derivatives_are_the_same_in_every_order(problem):
+    function, x = problem
+    loss = penalty(function)
+    expected = torch.autograd.functional.hessian(loss, x)
+    for found in (jacfwd(jacrev(loss))(x), jacrev(jacrev(loss))(x), jacrev(jacfwd(loss))(x)):
+        torch.testing.assert_close(found, expected, **EXACT)
+    with pytest.raises(RuntimeError, match="forward mode within forward mode"):
+        jacfwd(jacfwd(loss))(x)
+
+
+def test_vmap_over_every_input_of_a_pose(pose_scene):
+    scene = pose_scene(batch=6, outliers=0.1)
+    scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    mask = torch.rand(3, 2, 40, generator=torch.Generator().manual_seed(1)) < 0.8
+    params = scene.camera.params * torch.tensor([[1.0], [1.01], [1.02]], dtype=torch.float64)
+    inputs = [x.unflatten(0, (3, 2)) for x in (scene.start, scene.points_w, scene.pixels)]
+
+    def refine(start, points, pixels, mask, scale, params):
+        camera = scene.camera.with_params(params)
+        refined = refine_pose(start, points, pixels, camera, mask=mask, scale=scale)
+        return refined.T_cw, refined.success, refined.cost, refined.convergence.iterations
+
+    arguments = (*inputs, mask, scale, params)
+    together = vmap(refine)(*arguments)
+    alone = [refine(*(x[row] for x in arguments)) for row in range(3)]
+    for found, *expected in zip(together, *alone, strict=True):
+        torch.testing.assert_close(found, torch.stack(expected), **EXACT)
+    last = vmap(refine, in_dims=(1, 1, 1, 1, None, None))(
+        *(x.transpose(0, 1) for x in arguments[:4]), scale[0], params[0]
+    )
+    first = refine(*(x[0] for x in arguments))
+    torch.testing.assert_close(last[0][0], first[0], **EXACT)
+
+
+def test_failures_have_no_derivative_under_any_transform(pose_scene):
+    scene = pose_scene(batch=2, count=20)
+    start, mask = scene.start.clone(), torch.ones(2, 20, dtype=torch.bool)
+    start[0, 0, 0] = torch.nan
+    mask[1, 2:] = False
+
+    def poses(pixels):
+        refined = refine_pose(start, scene.points_w, pixels, scene.camera, mask=mask)
+        return refined.T_cw, refined.success
+
+    T_cw, success = poses(scene.pixels)
+    assert not success.any()
+    assert torch.equal(T_cw[0], torch.eye(4, dtype=torch.float64))
+    for transform in (jacrev, jacfwd):
+        assert (transform(lambda x: poses(x)[0])(scene.pixels) == 0).all()
+
+
+def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
+    problem = bundle_scene().problem
+    T_cw = problem.T_cw.clone()
+    T_cw[3, 0, 3] = torch.nan
+    solution = bundle_adjust(replace(problem, T_cw=T_cw))
+    assert not solution.success
+    assert solution.T_cw.isfinite().all()
+    _, graph = simulated()
+    T_cw = graph.T_cw.clone()
+    T_cw[4, 0, 3] = torch.nan
+    success = solve(replace(graph, T_cw=T_cw)).success
+    assert success.tolist() == [row != 4 for row in range(len(T_cw))]
+
+
+def test_inputs_that_do_not_go_together_are_named(pose_scene, bundle_scene):
+    scene = pose_scene()
+    with pytest.raises(ValueError, match=r"pixels is torch.float32, but T_cw is torch.float64"):
+        refine_pose(scene.start, scene.points_w, scene.pixels.float(), scene.camera)
+    with pytest.raises(ValueError, match=r"T_cw must be float32 or float64, not torch.bfloat16"):
+        refine_pose(scene.start.bfloat16(), scene.points_w, scene.pixels, scene.camera)
+    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or .*, not \(40,\)"):
+        refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, torch.ones(40).double())
+    problem = bundle_scene().problem
+    with pytest.raises(ValueError, match=r"camera_params is torch.float32"):
+        bundle_adjust(replace(problem, camera=problem.camera.to(torch.float32)))
+    with pytest.raises(ValueError, match=r"weights must be \(O,\)"):
+        bundle_adjust(replace(problem, weights=torch.ones(3, dtype=torch.float64)))
+    graph = make_scene().graph
+    with pytest.raises(ValueError, match=r"S_ji is torch.float32"):
+        pose_graph_optimize(replace(graph, S_ji=graph.S_ji.float()))

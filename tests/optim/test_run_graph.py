@@ -1,0 +1,305 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from torchslam.errors import TorchslamError
+from torchslam.evaluation import ate
+from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
+from torchslam.map.posed_frames import RunGraph
+from torchslam.optim.run_graph import ObservationGraph, join, solve
+
+CONVERGED = {"iterations": 25, "tolerance": 0.0}
+
+
+def simulated(noise=0.5, frames=10, points=50, seed=0):
+    """Truth (F, 4, 4), and a graph near it: every third frame is a keyframe, the rows are shuffled."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    camera = Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.1, 0.02, 1e-3, -1e-3, size=(640, 480))
+    twists = 0.05 * normal(frames, 6)
+    twists[:, 0] += torch.linspace(-1, 1, frames, dtype=torch.float64)
+    T_cw = se3_exp(twists)
+    points_w = torch.stack((1.2 * normal(points), normal(points), 5 + normal(points).clamp(-2, 2)), -1)
+    frame_index, point_index = (torch.rand(frames, points, generator=generator) < 0.8).nonzero().unbind(-1)
+    order = torch.randperm(len(frame_index), generator=generator)
+    frame_index, point_index = frame_index[order], point_index[order]
+    points_c = transform(T_cw[frame_index], points_w[point_index][:, None])[:, 0]
+    perturbation = 0.005 * normal(frames, 6)
+    perturbation[0] = 0
+    return T_cw, ObservationGraph(
+        torch.arange(frames, dtype=torch.float64) / 30,
+        se3_exp(perturbation) @ T_cw,
+        points_w + 0.01 * normal(points, 3),
+        frame_index,
+        point_index,
+        camera.project(points_c)[0] + noise * normal(len(frame_index), 2),
+        0.5 + torch.rand(len(frame_index), generator=generator, dtype=torch.float64),
+        camera,
+        torch.arange(frames) % 3 == 0,
+    )
+
+
+def aligned_error(solution, truth):
+    """RMSE of the camera centres after the best similarity: independent of the gauge."""
+    centres, target = solution.trajectory.positions_w, se3_inverse(truth)[:, :3, 3]
+    s, R, t = umeyama(centres, target)
+    return (s * centres @ R.mT + t - target).square().sum(-1).mean().sqrt()
+
+
+def test_exact_data_gives_the_exact_trajectory():
+    truth, graph = simulated(noise=0.0)
+    solution = solve(graph)
+    assert solution.success.all()
+    assert aligned_error(solution, truth) < 1e-8
+
+
+def test_noisy_data_improves_on_the_start():
+    truth, graph = simulated()
+    solution = solve(graph)
+    before = se3_log(graph.T_cw @ se3_inverse(truth)).norm()
+    assert aligned_error(solution, truth) < 0.3 * before
+
+
+def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
+    """Central differences along a random direction of each input, through keyframes and the frames in between."""
+    truth, graph = simulated(noise=1.0)
+
+    def loss(pixels, weights, params):
+        camera = graph.camera.with_params(params)
+        solution = solve(
+            replace(graph, pixels=pixels, weights=weights, camera=camera), "cauchy", 2.0, **CONVERGED
+        )
+        return aligned_error(solution, truth)
+
+    inputs = [graph.pixels, graph.weights, graph.camera.params]
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    loss(*leaves).backward()
+    generator = torch.Generator().manual_seed(1)
+    units = (1.0, 0.1, torch.tensor([1.0, 1, 1, 1, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3], dtype=torch.float64))
+    for position, unit in enumerate(units):
+        direction = unit * torch.randn(inputs[position].shape, generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            ahead, behind = (
+                loss(*(x + sign * 1e-4 * direction if i == position else x for i, x in enumerate(inputs)))
+                for sign in (1, -1)
+            )
+        expected = (ahead - behind) / 2e-4
+        torch.testing.assert_close((leaves[position].grad * direction).sum(), expected, rtol=1e-5, atol=0)
+
+
+def test_every_observation_has_a_gradient_and_free_camera_ends_it():
+    truth, graph = simulated()
+    pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
+    graph = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
+    solution = solve(graph)
+    aligned_error(solution, truth).backward()
+    counted = solution.moved_points[graph.point_index]  # points that at least two keyframes see
+    assert counted.sum() > 0.7 * len(counted)
+    assert torch.equal((pixels.grad != 0).any(-1), counted)
+    assert (params.grad != 0).all()
+    params.grad = None
+    solution = solve(graph, free_camera=True)
+    aligned_error(solution, truth).backward()
+    assert params.grad is None or (params.grad == 0).all()
+    assert not torch.equal(solution.camera.params, params)
+
+
+def test_a_frame_that_sees_nothing_stays_and_is_flagged():
+    _, graph = simulated()
+    keep = graph.frame_index != 4
+    pixels = graph.pixels[keep].requires_grad_()
+    blind = replace(
+        graph,
+        frame_index=graph.frame_index[keep],
+        point_index=graph.point_index[keep],
+        pixels=pixels,
+        weights=graph.weights[keep],
+    )
+    solution = solve(blind)
+    assert solution.success.tolist() == [row != 4 for row in range(10)]
+    assert torch.equal(solution.T_cw[4], graph.T_cw[4])
+    solution.T_cw.sum().backward()
+    assert pixels.grad.isfinite().all()
+
+
+def test_a_graph_without_observations_fails_without_an_error():
+    _, graph = simulated()
+    names = ("frame_index", "point_index", "pixels", "weights")
+    solution = solve(replace(graph, **{name: getattr(graph, name)[:0] for name in names}))
+    assert not solution.success.any()
+    assert torch.equal(solution.T_cw, graph.T_cw)
+    assert torch.equal(solution.points_w, graph.points_w)
+    (bundle,) = solution.keyframes
+    assert bundle.covariance().points.shape == (0, 3, 3)
+
+
+def test_frames_say_whether_they_are_at_a_minimum():
+    _, graph = simulated()
+    first = solve(graph, iterations=1)
+    assert not first.converged.any()  # without points there, no frame is where it belongs
+    there = replace(graph, T_cw=solve(graph).T_cw, points_w=solve(graph).points_w)
+    off = replace(there, T_cw=torch.where(graph.is_keyframe[:, None, None], there.T_cw, graph.T_cw))
+    assert solve(there, iterations=2).converged.all()
+    assert torch.equal(solve(off, iterations=2).converged, graph.is_keyframe)
+
+
+def test_keyframes_only_and_no_keyframe():
+    _, graph = simulated()
+    everyone = replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))
+    assert solve(everyone).success.all()
+    with pytest.raises(ValueError, match="no keyframe"):
+        solve(replace(graph, is_keyframe=torch.zeros(10, dtype=torch.bool)))
+
+
+def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
+    _, graph = simulated()
+    graph.save(tmp_path / "graph.safetensors")
+    loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
+    assert loaded.camera.size == (640, 480)
+    assert torch.equal(solve(loaded).T_cw, solve(graph).T_cw)
+
+
+def run_graph(graph, start=0):
+    """The graph with names of its rows."""
+    columns = {name: getattr(graph, name) for name in graph.columns()}
+    return RunGraph(
+        **columns,
+        camera=graph.camera,
+        frame_ids=start + torch.arange(len(graph.T_cw)),
+        sessions=torch.arange(len(graph.T_cw)) % 2,
+        point_ids=2 * torch.arange(len(graph.points_w)),
+        keypoint_index=7 + torch.arange(len(graph.pixels)),
+    )
+
+
+def test_a_run_graph_keeps_its_row_numbers(tmp_path):
+    path = tmp_path / "graph.safetensors"
+    graph = run_graph(replace(simulated()[1], world=torch.full((10,), 3)), start=5)
+    graph.save(path)
+    loaded = RunGraph.load(path)
+    assert type(loaded) is RunGraph
+    for name in graph.columns():
+        assert torch.equal(getattr(loaded, name), getattr(graph, name)), name
+    plain = ObservationGraph.load(path)
+    assert type(plain) is ObservationGraph
+    assert torch.equal(plain.world, graph.world)
+    plain.save(path)
+    with pytest.raises(TorchslamError, match="is not an observation graph"):
+        RunGraph.load(path)
+
+
+def test_a_file_from_before_there_were_worlds_has_one(tmp_path):
+    _, graph = simulated()
+    graph.save(tmp_path / "new")
+    with safe_open(tmp_path / "new", framework="pt") as file:
+        metadata, names = file.metadata(), set(file.keys()) - {"world"}
+        save_file({name: file.get_tensor(name) for name in names}, tmp_path / "old", metadata)
+    assert torch.equal(ObservationGraph.load(tmp_path / "old").world, torch.zeros(10, dtype=torch.int64))
+
+
+def two_worlds():
+    """Truths and graphs of two worlds that share a camera, and both as one graph in an order of its own."""
+    (truth_1, one), (truth_2, two) = simulated(seed=0), simulated(frames=7, points=30, seed=1)
+    one, two = replace(one, world=torch.full((10,), 4)), replace(two, world=torch.full((7,), 1))
+    return (truth_1, truth_2), (one, two), join([one, two])
+
+
+def close(found, expected):
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+
+
+def test_worlds_are_solved_each_on_its_own():
+    _, (one, two), both = two_worlds()
+    assert both.worlds == [1, 4]
+    solution, first, second = solve(both), solve(one), solve(two)
+    # Frames in between are refined in one batch: on some processors that moves their last digits.
+    close(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
+    keyframes = both.is_keyframe
+    assert torch.equal(solution.T_cw[keyframes], torch.cat([first.T_cw, second.T_cw])[keyframes])
+    assert torch.equal(solution.points_w, torch.cat([first.points_w, second.points_w]))
+    assert torch.equal(solution.success, torch.cat([first.success, second.success]))
+    assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
+    assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
+    assert torch.equal(solution.world, both.world)
+    for world, alone in ((4, first), (1, second)):
+        found = solution.trajectory_in(world).T_wc
+        torch.testing.assert_close(found, alone.trajectory.T_wc, atol=1e-12, rtol=0)
+    assert torch.equal(solution.trajectory.T_wc, solution.trajectory_in(4).T_wc)  # ten frames against seven
+    assert torch.equal(solution.T_cw[0], both.T_cw[0])
+    assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either
+    assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)
+
+
+def test_rows_of_worlds_may_be_mixed():
+    _, _, both = two_worlds()
+    generator = torch.Generator().manual_seed(3)
+    # Frames stay in order within their world: the first keyframe is the one that is fixed.
+    order = torch.cat([torch.arange(5), torch.arange(10, 14), torch.arange(5, 10), torch.arange(14, 17)])
+    place, rows = torch.argsort(order), torch.randperm(len(both.pixels), generator=generator)
+    shuffled = replace(
+        both,
+        timestamps=both.timestamps[order],
+        T_cw=both.T_cw[order],
+        world=both.world[order],
+        is_keyframe=both.is_keyframe[order],
+        frame_index=place[both.frame_index[rows]],
+        **{name: getattr(both, name)[rows] for name in ("point_index", "pixels", "weights")},
+    )
+    solution, expected = solve(shuffled), solve(both)
+    assert torch.allclose(solution.T_cw, expected.T_cw[order], atol=1e-9)
+    assert torch.allclose(solution.points_w, expected.points_w, atol=1e-8)
+
+
+def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
+    (truth_1, truth_2), (one, two), both = two_worlds()
+
+    def gradients(graph, loss):
+        pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
+        moved = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
+        loss(solve(moved, **CONVERGED).T_cw).backward()
+        return pixels.grad, params.grad
+
+    pixels, params = gradients(both, lambda T_cw: ate(T_cw[:10], truth_1) + ate(T_cw[10:], truth_2))
+    pixels_1, params_1 = gradients(one, lambda T_cw: ate(T_cw, truth_1))
+    pixels_2, params_2 = gradients(two, lambda T_cw: ate(T_cw, truth_2))
+    torch.testing.assert_close(pixels, torch.cat([pixels_1, pixels_2]))
+    torch.testing.assert_close(params, params_1 + params_2)
+    assert (params_1 != 0).all()
+    assert (params_2 != 0).all()
+
+
+def test_worlds_that_cannot_be_solved_are_refused():
+    _, _, both = two_worlds()
+    with pytest.raises(ValueError, match="free camera"):
+        solve(both, free_camera=True)
+    with pytest.raises(ValueError, match="no keyframe"):
+        solve(replace(both, is_keyframe=both.is_keyframe & (both.world == 1)))
+    shared = both.point_index.clone()
+    shared[both.frame_index == 10] = 0
+    with pytest.raises(ValueError, match="seen in two worlds"):
+        solve(replace(both, point_index=shared))
+
+
+def test_joined_run_graphs_keep_their_names():
+    _, graph = simulated()
+    both = join(
+        [run_graph(graph), replace(run_graph(graph, start=100), world=torch.ones(10, dtype=torch.int64))]
+    )
+    assert type(both) is RunGraph
+    assert both.frame_ids.tolist() == [*range(10), *range(100, 110)]
+    assert torch.equal(both.point_ids, torch.cat([2 * torch.arange(50)] * 2))
+    assert torch.equal(both.frame_index[len(graph.pixels) :], graph.frame_index + 10)
+    assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
+
+
+def test_another_file_is_refused(tmp_path):
+    path = tmp_path / "graph.safetensors"
+    path.write_bytes(b"something else")
+    with pytest.raises(TorchslamError, match=r"graph\.safetensors is not an observation graph"):
+        ObservationGraph.load(path)

@@ -1,0 +1,119 @@
+"""Frames of a live source that another process looks at while they wait."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from tests.test_ahead import PATIENCE, SIZE, picture
+
+from torchslam import Features, Frame, load_config
+from torchslam.data.readers.live import LiveSequence
+from torchslam.data.sequence import EndOfSequence
+from torchslam.errors import FrameError
+from torchslam.geometry import Camera
+from torchslam.parallel.live_prefetch import LiveAhead
+from torchslam.system.front_end import image_extractor
+from torchslam.utils.timing import Stopwatch
+
+CONFIG = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
+CAMERA = Camera.pinhole(100.0, 100.0, 79.5, 59.5, size=SIZE)
+SMALL = 3  # a frame of another size
+
+
+class Source:
+    """A camera that gives its frames as fast as they are taken, or one at a time."""
+
+    def __init__(self, frames: int, pause: float = 0.0) -> None:
+        self.frames, self.pause, self.frame = frames, pause, -1
+
+    def grab(self) -> bool:
+        time.sleep(self.pause)
+        self.frame += 1
+        return self.frame < self.frames
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        image = picture(self.frame)
+        return True, image[:50] if self.frame == SMALL else image
+
+    def get(self, property_id: int) -> float:
+        return 0.0
+
+    def release(self) -> None:
+        pass
+
+
+def live(frames: int, pause: float = 0.0) -> LiveSequence:
+    sequence = LiveSequence("camera", Source(frames, pause), CAMERA, backlog=frames)
+    if not pause:
+        sequence._begin()  # as the first frame does that is asked for
+    while not pause and sequence.waiting < frames:
+        time.sleep(0.01)
+    return sequence
+
+
+@pytest.fixture
+def reader() -> Iterator[LiveAhead]:
+    clock = Stopwatch()
+    with LiveAhead(live(8), CAMERA, CONFIG, clock) as frames:
+        assert frames._worker._ours.poll(PATIENCE)
+        yield frames
+
+
+def expected(index: int) -> Features:
+    image = torch.from_numpy(picture(index)).float()[None, None] / 255
+    return image_extractor(CONFIG)(Frame(index, 0.0, image))
+
+
+def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LiveAhead) -> None:
+    found = []
+    for index in range(8):
+        if index == SMALL:
+            with pytest.raises(FrameError, match="another size"):
+                reader[index]
+            continue
+        frame = reader[index]
+        assert frame.index == index
+        assert frame.waiting == 7 - index  # also with one of them taken from the source before its turn
+        assert frame.image.shape[-1] == SIZE[0]  # for those who want it
+        found.append(frame.features is not None)
+        if frame.features is not None:
+            right = expected(index)
+            for name in ("keypoints", "descriptors", "mask"):
+                assert torch.equal(getattr(frame.features, name), getattr(right, name))
+    # Nothing is known of the first one before it is asked for, nor of the one behind the frame that failed.
+    assert found == [False, True, True, False, True, True, True]
+    assert reader._clock.take()["features"] > 0
+    with pytest.raises(EndOfSequence):
+        reader[8]
+
+
+def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.data.readers.live.STALE", PATIENCE)
+    with LiveAhead(live(4, pause=0.05), CAMERA, CONFIG, Stopwatch()) as frames:
+        assert frames._worker._ours.poll(PATIENCE)
+        frames[0], frames[1]
+        deadline = time.monotonic() + 10
+        while frames._sequence.waiting == 0 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert frames._next is None or frames._is_sent  # nothing was taken that is not looked at
+        assert frames[2].index == 2
+
+
+def test_without_the_process_it_goes_on(reader: LiveAhead) -> None:
+    reader[0], reader[1]
+    os.kill(reader._worker._process.pid or 0, signal.SIGKILL)
+    reader._worker._process.join()
+    reader._worker._ours.close()  # what it may have answered before
+    with pytest.warns(UserWarning, match="has ended"):
+        frame = reader[2]
+    assert frame.index == 2
+    assert frame.features is None
+    with pytest.raises(FrameError):
+        reader[SMALL]
+    assert [reader[index].features for index in (4, 5)] == [None, None]

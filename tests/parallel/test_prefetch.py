@@ -1,0 +1,309 @@
+"""Frames that other processes read: the same as without them, whatever happens to these processes."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tests.test_cli import write_tum_folder
+
+from tests.data.mp4 import write_mp4
+from torchslam import Features, Frame, load_config
+from torchslam.cli.main import main
+from torchslam.data import open_sequence
+from torchslam.data.sequence import Sequence
+from torchslam.errors import FrameError
+from torchslam.parallel.prefetch import Ahead
+from torchslam.system.front_end import image_extractor
+from torchslam.utils.timing import Stopwatch
+
+SETTINGS = ["features.kind=opencv-orb", "features.num_keypoints=300"]
+CONFIG = load_config(None, SETTINGS)
+SET = [part for setting in SETTINGS for part in ("--set", setting)]
+SIZE = (160, 120)
+FRAMES = 14
+BAD, SMALL = 6, 9
+PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
+
+
+@pytest.fixture
+def sequence(tmp_path: Path) -> Sequence:
+    """Pictures, one damaged and one too small, with a mask, as a TUM folder."""
+    folder = tmp_path / "pictures"
+    (folder / "rgb").mkdir(parents=True)
+    for index in range(FRAMES):
+        cv2.imwrite(str(folder / "rgb" / f"{index:02}.png"), picture(index))
+    (folder / "rgb" / f"{BAD:02}.png").write_bytes(b"not an image")
+    cv2.imwrite(str(folder / "rgb" / f"{SMALL:02}.png"), picture(0)[:50])
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, :50] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    return open_sequence(folder, "100,100,79.5,59.5", mask=tmp_path / "mask.png")
+
+
+@pytest.fixture(params=["copied", "begun anew"])
+def patient(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the processes, however they start, so that a short sequence is theirs."""
+    is_copied = request.param == "copied"
+    if is_copied and sys.platform != "linux":
+        pytest.skip("processes are copied on Linux alone")
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: is_copied)
+    enter = Ahead.__enter__
+
+    def wait(self: Ahead) -> Ahead:
+        enter(self)
+        assert all(worker._ours.poll(PATIENCE) for worker in self._workers)
+        return self
+
+    monkeypatch.setattr(Ahead, "__enter__", wait)
+
+
+def picture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, SIZE[::-1], dtype=np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX)
+
+
+def look(frames: Ahead | Sequence, index: int) -> tuple[Frame, Features] | str:
+    """A frame and its features, or the error in words."""
+    try:
+        frame = frames[index]
+    except FrameError as error:
+        return str(error)
+    return frame, image_extractor(CONFIG)(frame) if frame.features is None else frame.features
+
+
+def check_same(frames: Ahead, sequence: Sequence, index: int) -> bool:
+    """The frame is the one without other processes; returns whether it came from one of them."""
+    found, expected = look(frames, index), look(sequence, index)
+    if isinstance(found, str) or isinstance(expected, str):
+        assert found == expected
+        return False
+    assert (found[0].index, found[0].timestamp, found[0].name) == (
+        expected[0].index,
+        expected[0].timestamp,
+        expected[0].name,
+    )
+    for name in Features.__dataclass_fields__:
+        mine, other = getattr(found[1], name), getattr(expected[1], name)
+        if other is None:
+            assert mine is None, name
+            continue
+        assert mine.dtype == other.dtype
+        assert torch.equal(mine, other), name
+    return found[0].features is not None
+
+
+def ahead(sequence: Sequence, clock: Stopwatch | None = None, processes: int = 1) -> Ahead:
+    return Ahead(sequence, sequence.camera, CONFIG, clock or Stopwatch(), processes)
+
+
+@pytest.mark.usefixtures("patient")
+def test_others_find_what_would_be_found_here(sequence: Sequence) -> None:
+    clock = Stopwatch()
+    with ahead(sequence, clock, processes=2) as frames:
+        # The first one is read here, while the others are asked for: here the run begins at frame 2.
+        theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
+        assert len(frames._asked) == 0
+    assert theirs == [index not in (2, BAD, SMALL) for index in range(2, FRAMES)]
+    assert clock.take()["features"] > 0
+    assert isinstance(look(sequence, BAD), str)
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.usefixtures("patient")
+def test_no_more_than_a_few_frames_are_asked_for() -> None:
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+        assert frames[10].features is None
+        assert sorted(frames._asked) == [*range(11, 19)]
+        assert frames[11].features is not None
+        assert sorted(frames._asked) == [*range(12, 20)]
+
+
+@pytest.mark.usefixtures("patient")
+def test_what_comes_after_the_first_frame_is_read_while_the_run_is_prepared() -> None:
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+        frames.begin(5)
+        assert sorted(frames._asked) == [*range(6, 14)]
+        assert frames[5].features is None
+        assert sorted(frames._asked) == [*range(6, 14)]
+        assert frames[6].features is not None
+
+
+def test_a_process_that_has_not_started_is_asked_for_nothing(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
+    with ahead(sequence) as frames:
+        frames.begin(0)
+        assert frames._asked == {}
+        assert frames._next is None  # so that it still may be
+
+
+def test_a_process_that_has_not_started_is_not_waited_for(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
+    with ahead(sequence) as frames:
+        start = time.monotonic()
+        assert not check_same(frames, sequence, 0)
+        assert time.monotonic() - start < 1  # torch alone takes longer to import
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_process_that_is_killed_is_done_without(sequence: Sequence) -> None:
+    with ahead(sequence) as frames:
+        check_same(frames, sequence, 0)
+        assert check_same(frames, sequence, 1)
+        os.kill(frames._workers[0]._process.pid or 0, signal.SIGKILL)
+        frames._workers[0]._process.join()
+        with pytest.warns(UserWarning, match=r"has ended \(-9\): going on without it"):
+            theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
+    assert not all(theirs[4:])
+
+
+class Broken(Sequence):
+    """Fails as no frame should."""
+
+    def image(self, index: int) -> torch.Tensor:
+        if index == 2:
+            raise ZeroDivisionError("what is this?")
+        return torch.zeros(1, 1, *SIZE[::-1])
+
+    def image_name(self, index: int) -> str:
+        return f"broken#{index}"
+
+
+@pytest.mark.usefixtures("patient")
+def test_other_errors_are_raised_at_their_frame_and_the_process_ends(sequence: Sequence) -> None:
+    broken = Broken("broken", "test", sequence.camera, torch.arange(5.0, dtype=torch.float64))
+    with ahead(broken) as frames:
+        assert [frames[index].index for index in range(2)] == [0, 1]
+        with pytest.raises(ZeroDivisionError) as raised:
+            frames[2]
+    assert "in the process that reads ahead" in raised.value.__notes__[0]
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.usefixtures("patient", "without_pictures")
+def test_same_bytes_with_one_process_or_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    outputs, folder = [tmp_path / "one", tmp_path / "two"], write_tum_folder(tmp_path / "room", frames=16)
+    for processes, output in enumerate(outputs, start=1):
+        assert main(["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]) == 0
+    assert "one process" not in capsys.readouterr().err
+    for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply"):
+        assert (outputs[0] / name).read_bytes() == (outputs[1] / name).read_bytes(), name
+    assert multiprocessing.active_children() == []
+
+
+def test_videos_and_archives_travel(tmp_path: Path, sequence: Sequence) -> None:
+    images = [cv2.cvtColor(picture(index), cv2.COLOR_GRAY2BGR) for index in range(5)]
+    write_mp4(tmp_path / "film.mp4", images)
+    (tmp_path / "pictures" / "rgb" / f"{BAD:02}.png").unlink()
+    shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path / "pictures")
+    for path in (tmp_path / "film.mp4", tmp_path / "packed.zip"):
+        opened = open_sequence(path, "100,100,79.5,59.5", stride=2)
+        first = opened.image(2)
+        copy = pickle.loads(pickle.dumps(opened))
+        assert torch.equal(copy.image(2), first)
+        assert torch.equal(copy.image(1), opened.image(1))
+        assert not torch.equal(copy.image(1), first)
+        del copy
+        assert torch.equal(opened.image(2), first)  # the files are still there
+
+
+# --- processes that are ended ---------------------------------------------------------------------------------
+
+ORPHAN = """
+import os, signal
+from tests.test_ahead import PATIENCE, ahead
+from torchslam.data import open_sequence
+
+if __name__ == "__main__":
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+        assert frames._workers[0]._ours.poll(PATIENCE)
+        frames[0], frames[1]
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def running(group: int) -> list[int]:
+    """The processes of a group that have not ended."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, its_group = (process / "stat").read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue  # gone meanwhile
+        if int(its_group) == group and state != "Z":
+            found.append(int(process.name))
+    return found
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+
+
+def wait_for_end(group: int) -> None:
+    until = time.monotonic() + 30
+    while running(group):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+@needs_proc
+def test_a_process_ends_with_the_one_that_asks() -> None:
+    asking = subprocess.Popen([sys.executable, "-c", ORPHAN], start_new_session=True)
+    assert asking.wait(PATIENCE) == -signal.SIGKILL
+    wait_for_end(asking.pid)
+
+
+@needs_proc
+@pytest.mark.parametrize(
+    ("number", "status", "when"),
+    [
+        (signal.SIGINT, 130, "initializing"),
+        (signal.SIGTERM, 143, "? frames/s"),  # before the other process has started
+        pytest.param(signal.SIGINT, 130, "? frames/s", marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
+    ],
+)
+def test_a_signal_to_all_ends_the_run_with_results(
+    tmp_path: Path, number: int, status: int, when: str
+) -> None:
+    line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]
+    command = [
+        sys.executable,
+        "-m",
+        "torchslam.cli.main",
+        *line,
+        "--processes",
+        "2",
+        "--set",
+        "bundle.final=false",
+    ]
+    with (tmp_path / "err").open("w+") as errors:
+        child = subprocess.Popen(command, stderr=errors, stdout=errors, start_new_session=True)
+        until = time.monotonic() + PATIENCE
+        while when not in (tmp_path / "err").read_text():
+            assert child.poll() is None, (tmp_path / "err").read_text()
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        os.killpg(child.pid, number)  # as a terminal does with Ctrl-C
+        assert child.wait(PATIENCE) == status
+    said = (tmp_path / "err").read_text()
+    assert "Traceback" not in said
+    assert "interrupted; the results up to here are written" in said
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["interrupted"]
+    wait_for_end(child.pid)

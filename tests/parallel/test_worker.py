@@ -1,0 +1,130 @@
+"""What goes wrong in another process is told in one way, wherever it was asked for."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+
+import pytest
+import torch
+
+from torchslam.errors import FrameError
+from torchslam.parallel.worker import READY, Worker, attempt, outcome, questions, reply, serve, task
+
+
+def fail(error: Exception) -> None:
+    raise error
+
+
+def test_an_answer_is_itself_and_is_found_in_inference_mode() -> None:
+    assert outcome(attempt("adds", lambda a, b: a + b, 1, 2)) == 3
+    assert attempt("looks", torch.is_inference_mode_enabled) is True
+
+
+def test_an_error_is_raised_where_it_is_wanted_with_where_it_was() -> None:
+    answer = pickle.loads(pickle.dumps(attempt("reads ahead", fail, ZeroDivisionError("what is this?"))))
+    with pytest.raises(ZeroDivisionError, match="what is this") as raised:
+        outcome(answer)
+    (note,) = raised.value.__notes__
+    assert note.startswith("in the process that reads ahead:\nTraceback")
+    assert "in fail" in note
+
+
+def test_errors_of_our_own_say_all_by_themselves() -> None:
+    with pytest.raises(FrameError) as raised:
+        outcome(attempt("reads ahead", fail, FrameError("frame 3 is damaged")))
+    assert not hasattr(raised.value, "__notes__")
+
+
+def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    ours.send_bytes(task("twice", 2))
+    for number in (3, 4):
+        ours.send_bytes(pickle.dumps(number))
+    heard: list[object] = []
+
+    def work(connection: Connection, name: str, factor: int) -> None:
+        heard.append(ours.recv_bytes())
+        for number in questions(connection):
+            reply(connection, (name, factor * number))
+            heard.append(pickle.loads(ours.recv_bytes()))
+            if number == 4:
+                ours.close()
+
+    serve(work, theirs)
+    assert heard == [READY, ("twice", 6), ("twice", 8)]
+
+
+def multiply(connection: Connection, factor: int) -> None:
+    """What a process of these tests does; asked for nothing, it ends as if somebody had killed it."""
+    for number in questions(connection):
+        if number is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        reply(connection, (factor * number, torch.get_num_threads()))
+
+
+@pytest.fixture(params=[True, False], ids=["copied", "spawned"])
+def worker(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
+    if request.param and sys.platform != "linux":
+        pytest.skip("processes are copied on Linux alone")
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: request.param)
+    found = Worker(multiply)
+    yield found
+    found.end()
+
+
+def helpers() -> list[BaseProcess]:
+    return [process for process in multiprocessing.active_children() if process.name == "torchslam helper"]
+
+
+def come(worker: Worker) -> None:
+    end = time.monotonic() + 120
+    while not worker.is_there():
+        assert worker._process.exitcode is None, "it died"
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.01)
+
+
+def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
+    (process,) = helpers()
+    assert process.daemon  # none outlives this one
+    come(worker)
+    assert worker.send(task(3))
+    for number in (1, 2):
+        assert worker.send(pickle.dumps(number))
+        assert worker.receive() == (3 * number, torch.get_num_threads())
+    worker.end()
+    assert not helpers()
+
+
+def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker) -> None:
+    come(worker)
+    assert worker.send(task(3))
+    assert worker.send(pickle.dumps(None))
+    with pytest.warns(UserWarning, match=r"has ended \(-9\): going on without it"):
+        assert worker.receive() is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not worker.is_there()
+        assert not worker.send(pickle.dumps(1))
+        assert worker.receive() is None
+
+
+def test_nothing_is_sent_to_a_process_that_was_not_seen_to_be_there() -> None:
+    worker = Worker(multiply)
+    try:
+        assert not worker.send(task(3))
+        come(worker)
+        assert worker.send(task(4))
+        assert worker.send(pickle.dumps(1))
+        assert worker.receive() == (4, torch.get_num_threads())
+    finally:
+        worker.end()

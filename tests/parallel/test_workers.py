@@ -1,0 +1,178 @@
+"""How many processes a run has, and what each of them does."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torchslam import load_config, open_sequence
+from torchslam.data.sequence import Sequence
+from torchslam.features import OpenCVORB
+from torchslam.geometry import Camera
+from torchslam.mapping.async_bundle import solve_here
+from torchslam.parallel.bundle_worker import Beside
+from torchslam.parallel.live_prefetch import LiveAhead
+from torchslam.parallel.patch_worker import Scouting
+from torchslam.parallel.prefetch import Ahead
+from torchslam.parallel.workers import WORTH, WORTH_AT_ONCE, best_number, helped, processors, why_alone
+from torchslam.system.slam import SLAM
+
+CONFIG = load_config(None, ["features.kind=opencv-orb"])
+
+
+def room(frames: int) -> Sequence:
+    return open_sequence(f"synthetic:room?frames={frames}&blank=1")
+
+
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is started: only who would be is looked at."""
+    for kind in (Ahead, LiveAhead, Scouting, Beside):
+        monkeypatch.setattr(kind, "__enter__", lambda self: self)
+        monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
+    monkeypatch.setattr(Ahead, "begin", lambda self, start: None)
+
+
+def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
+    """Where the frames come from, and whether adjustments are found beside."""
+    with helped(sequence, slam, processes, start) as frames:
+        is_beside = isinstance(slam.mapper.adjusting.solver, Beside)
+    assert slam.mapper.adjusting.solver is solve_here
+    return type(frames).__name__, is_beside
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_who_does_what(capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, CONFIG)
+    here = type(sequence).__name__
+    assert who(sequence, slam, 1) == (here, False)
+    assert who(sequence, slam, 2) == ("Ahead", False)
+    assert who(sequence, slam, 3) == ("Ahead", True)
+    for processes, readers in ((2, 1), (3, 1), (4, 2), (6, 4)):
+        with helped(sequence, slam, processes) as frames:
+            assert isinstance(frames, Ahead)
+            assert frames._count == readers
+    fast = SLAM(sequence.camera, load_config(None, ["patches.enabled=true"]))
+    assert who(sequence, fast, 2) == ("Scouting", False)
+    assert who(sequence, fast, 3) == ("Scouting", True)
+    slam.mapping = False
+    assert who(sequence, slam, 3) == ("Ahead", False)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = room(20)
+    here = type(sequence).__name__
+    simulated = SLAM(sequence.camera, load_config(None, ["features.kind=simulated"]))
+    assert who(sequence, simulated, 2) == (here, True)
+    assert "frames are read here: simulated features need no images" in capsys.readouterr().err
+    slam, fast = (
+        SLAM(sequence.camera, load_config(None, [*settings])) for settings in ((), ["patches.enabled=true"])
+    )
+    sequence.timestamps = sequence.timestamps[:0]
+    monkeypatch.setattr("torchslam.parallel.workers.best_number", lambda *arguments: 3)
+    assert who(sequence, slam, None) == ("LiveAhead", True)
+    assert why_alone(sequence, slam) == ""
+    assert who(sequence, fast, None) == (here, True)
+    assert "live source" in why_alone(sequence, fast)
+    assert capsys.readouterr().err == ""  # nobody asked for more
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_all_is_done_here_on_another_device(capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, CONFIG)
+    camera = sequence.camera
+    slam.camera = Camera(camera.model, camera.params.to("meta"), camera.size)
+    assert who(sequence, slam, 3) == (type(sequence).__name__, False)
+    assert "one process: the meta does it all" in capsys.readouterr().err
+
+
+def test_how_many_are_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    long, short = room(WORTH), room(WORTH - 1)
+    few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
+    for count, several in ((1, 1), (2, 3), (8, 3)):
+        monkeypatch.setattr("torchslam.parallel.workers.processors", lambda known=count: known)
+        for at_once in (False, True):
+            monkeypatch.setattr("torchslam.parallel.workers.starts_at_once", lambda is_copy=at_once: is_copy)
+            assert best_number(long, 0) == several
+            assert best_number(short, 0) == (several if at_once else 1)
+            assert best_number(short, few) == (several if at_once else 1)
+            assert best_number(short, few + 1) == 1
+    assert processors() >= 1
+
+
+def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
+    code = (
+        "import threading; from torchslam.parallel.worker import starts_at_once; alone = starts_at_once(); "
+        "wait = threading.Event(); threading.Thread(target=wait.wait).start(); "
+        "print(alone, starts_at_once()); wait.set()"
+    )
+    one_thread = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=one_thread, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [str(sys.platform == "linux"), "False"]
+    assert torch.get_num_threads() == 1
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_parts_of_ones_own_stay_here() -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
+    assert who(sequence, slam, 3) == (type(sequence).__name__, True)
+    assert "of your own" in why_alone(sequence, slam)
+
+
+def test_a_run_with_more_processes_is_the_same() -> None:
+    """In a program of one's own, too."""
+    sequence = open_sequence("synthetic:room?frames=160").part(20, 38)
+    config = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
+    alone = SLAM(sequence.camera, config).run(sequence)
+    assert alone.map.num_keyframes > 1
+    several = SLAM(sequence.camera, config).run(sequence, processes=3)
+    assert [result.reason for result in several.results] == [result.reason for result in alone.results]
+    assert torch.equal(several.trajectory.T_wc, alone.trajectory.T_wc)
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
+    sequence = room(20)
+    slam = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]))
+    extract, seen = slam.extractor, []
+    assert extract is not None
+    slam.extractor = lambda frame: (seen.append(frame.image), extract(frame))[1]
+    with helped(sequence, slam, 1):
+        (image,) = seen
+        assert image.shape[-2:] == (sequence.camera.height, sequence.camera.width)
+        assert not image.any()
+    other = SLAM(sequence.camera, CONFIG)
+    other.extractor = lambda frame: pytest.fail("other front ends are shown frames alone")
+    with helped(sequence, other, 1):
+        pass
+    own = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]), extractor=OpenCVORB(100))
+    own.extractor = lambda frame: pytest.fail("what somebody else made is shown frames alone")
+    with helped(sequence, own, 1):
+        pass
+    assert slam.last_frame is None
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_the_first_frame_that_is_tracked_does_not_wait_for_a_table() -> None:
+    sequence = room(20)
+    width, height = sequence.camera.size
+    slam = SLAM(
+        Camera.fisheye(150, 150, width / 2, height / 2, 0.02, -0.01, 0, 0, size=(width, height)), CONFIG
+    )
+    undistorted = slam.tracker.localizer.undistorted
+    assert "_table" not in vars(undistorted)
+    with helped(sequence, slam, 1):
+        assert "_table" in vars(undistorted)

@@ -1,0 +1,116 @@
+"""Images of any size: large ones are looked at reduced, and what is said in pixels grows with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import pytest
+import torch
+
+from torchslam import SLAM
+from torchslam.config import Config, FeaturesConfig
+from torchslam.config.schema import enlarged
+from torchslam.data import open_sequence
+from torchslam.data.formats.transforms import resize
+from torchslam.features import match
+from torchslam.system.front_end import image_extractor
+from torchslam.system.run import Run
+from torchslam.types import Features
+
+WALK = "synthetic:room?frames=20"
+GROWING = {
+    "initialization": {"min_motion_px", "still_px", "threshold_px"},
+    "tracking": {"threshold_px"},
+    "stillness": {"min_motion_px", "radius_px", "cell_px"},
+    "independent_motion": {"threshold_px", "search_px"},
+}
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"),
+    [
+        ((320, 240), 1), ((640, 480), 1), ((1241, 376), 1), ((768, 640), 1), ((769, 640), 1.265734),
+        ((1280, 960), 2), ((1920, 1440), 3), ((1920, 1080), 2.598076),
+    ],
+)  # fmt: skip
+def test_only_much_larger_images_are_reduced(size: tuple[int, int], factor: float) -> None:
+    assert FeaturesConfig().reduction(size) == pytest.approx(factor, rel=1e-5)
+    assert FeaturesConfig(image_pixels=0).reduction(size) == 1
+    assert FeaturesConfig(kind="simulated").reduction(size) == 1
+    assert FeaturesConfig(image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
+
+
+def test_what_is_not_said_in_units_of_a_scale_grows() -> None:
+    config = Config()
+    assert config.for_size((1241, 376)) == config
+    large = config.for_size((1920, 1440))
+    assert large == enlarged(config, 3.0)
+    for section in config.__dataclass_fields__:
+        before, after = getattr(config, section), getattr(large, section)
+        names = getattr(before, "__dataclass_fields__", {})
+        changed = {name for name in names if getattr(before, name) != getattr(after, name)}
+        assert changed == GROWING.get(section, set())
+        assert all(getattr(after, name) == 3 * getattr(before, name) for name in changed)
+
+
+@lru_cache
+def seen(width: int, height: int, image_pixels: int = 640 * 480) -> Features:
+    """The features of a rendered image at another size."""
+    frame = resize(open_sequence(WALK), f"{width}x{height}")[0]
+    return image_extractor(Config(features=FeaturesConfig(image_pixels=image_pixels)))(frame)
+
+
+@pytest.mark.parametrize("size", [(1280, 960), (1920, 1440), (1500, 1000)])
+def test_a_large_image_shows_what_a_small_one_does(size: tuple[int, int]) -> None:
+    small, large = seen(640, 480), seen(*size)
+    matches = match(small, large)
+    first, second = matches.indices_1[0][matches.mask[0]], matches.indices_2[0][matches.mask[0]]
+    ratio = torch.tensor(size) / torch.tensor([640, 480])
+    assert len(first) > 0.6 * int(small.mask.sum())
+    off = (large.keypoints[0][second] + 0.5) / ratio - 0.5 - small.keypoints[0][first]
+    off = off[off.norm(dim=-1) < 3]
+    assert len(off) > 0.55 * int(small.mask.sum())
+    assert float(off.mean(0).abs().max()) < 0.06
+    assert float(off.norm(dim=-1).median()) < 0.4
+    scale = large.scales[0][second] / small.scales[0][first]
+    assert float(scale.median()) == pytest.approx(float(ratio.prod().sqrt()), rel=0.01)
+    assert bool((large.keypoints[0][:, 0] > 0.9 * size[0]).any())
+
+
+def test_images_that_are_not_reduced_are_taken_as_they_are() -> None:
+    assert float(seen(1280, 960, 0).scales.min()) == 1
+    assert float(seen(1280, 960).scales[0][seen(1280, 960).mask[0]].min()) == 2
+
+
+def test_a_mask_holds_for_the_large_image() -> None:
+    frame = resize(open_sequence(WALK), "1280x960")[0]
+    wanted = (torch.arange(1280) < 333).expand(frame.image.shape)
+    found = image_extractor(Config())(replace(frame, mask=wanted))
+    x = found.keypoints[found.mask][:, 0]
+    assert 300 < float(x.max()) <= 332.5
+    assert int(found.mask.sum()) > 300  # the budget goes there
+
+
+def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
+    slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
+    told = Config().for_size((1280, 960))
+    assert slam.config == Config()
+    initializer = slam._following.beginning.initializer
+    assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, initializer))
+    assert slam.tracker.settings == told.tracking
+    assert slam.foreign.stillness.evidence.shape == (121, 161)
+
+
+def run(size: str) -> Run:
+    walk = resize(open_sequence(WALK), size)
+    return SLAM(walk.camera).run(walk)
+
+
+def test_a_walk_comes_out_alike_at_another_size() -> None:
+    small, large = run("640x480"), run("1920x1440")
+    assert all(result.T_cw is not None for result in large.results[5:])
+    keyframes = [one.map.num_keyframes for one in (small, large)]
+    assert max(keyframes) <= 1.3 * min(keyframes)
+    assert large.camera.size == (1920, 1440)
+    assert float(large.graph.pixels[:, 0].max()) > 1280

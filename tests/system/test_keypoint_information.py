@@ -1,0 +1,183 @@
+"""What a front end says of its keypoints' errors, through whole runs, their files and their gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc
+from torchslam import SLAM, ClipSLAM, Features, Run, evaluate, load_config, solve
+from torchslam.data.sequence import Sequence
+from torchslam.errors import ConfigError
+from torchslam.evaluation import ate
+from torchslam.features import SimulatedFeatures
+from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
+from torchslam.system.front_end import Simulated, WithFeatures
+from torchslam.system.run import Progressed, run_sequence
+from torchslam.types import Frame
+
+CONFIG = load_config(
+    None,
+    [
+        "features.kind=simulated",
+        "features.num_keypoints=250",
+        "simulated.points_per_view=150",
+        "simulated.noise_px=0.3",
+        "simulated.scales=true",
+        "bundle.delay=0",  # young or not, a world grows alike
+    ],
+)
+WALK = Walk(arc(30)[:16])
+Say = Callable[[Features], Tensor | None]
+
+
+def by_number(features: Features) -> Tensor:
+    return features.scales**-2
+
+
+def by_matrix(features: Features) -> Tensor:
+    return features.scales[..., None, None] ** -2 * torch.eye(2, dtype=torch.float64)
+
+
+def told_by(say: Say) -> Sequence:
+    """Simulated features that say something of their errors."""
+    seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
+
+    def extract(frame: Frame) -> Features:
+        features = seen(frame)
+        return replace(features, information=say(features))
+
+    return WithFeatures(WALK, extract)
+
+
+def run_with(say: Say) -> tuple[SLAM, Run]:
+    slam = SLAM(WALK.camera, CONFIG)
+    return slam, slam.run(told_by(say))
+
+
+@pytest.fixture(scope="module", params=[by_number, by_matrix], ids=["number", "matrix"])
+def told(request: pytest.FixtureRequest) -> tuple[SLAM, Run, Say]:
+    return *run_with(request.param), request.param
+
+
+def test_a_run_carries_what_is_said(told: tuple[SLAM, Run, Say]) -> None:
+    _, run, say = told
+    assert len(run.trajectory) == len(WALK)
+    assert evaluate(run.trajectory, WALK.groundtruth).ate_m < 0.003
+    graph, kept = run.graph, run.map.keyframes
+    of_keyframes = graph.frame_index < run.map.num_keyframes
+    scales = kept["scales"][graph.frame_index[of_keyframes], graph.keypoint_index[of_keyframes]]
+    wanted = scales**-2
+    if say is by_matrix:
+        wanted = wanted[:, None, None] * torch.eye(2, dtype=torch.float64)
+    torch.testing.assert_close(graph.weights[of_keyframes], wanted)
+    assert solve(graph).success.all()
+
+
+def test_a_number_is_the_matrix_that_it_stands_for(told: tuple[SLAM, Run, Say]) -> None:
+    other = run_with(by_matrix if told[2] is by_number else by_number)[1]
+    torch.testing.assert_close(told[1].trajectory.T_wc, other.trajectory.T_wc, atol=1e-6, rtol=0)
+
+
+def test_a_map_keeps_what_is_said(told: tuple[SLAM, Run, Say], tmp_path: Path) -> None:
+    slam, _, say = told
+    slam.save(tmp_path / "map")
+    loaded = SLAM.load(tmp_path / "map", CONFIG, mapping=False)
+    loaded.save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "map").read_bytes()
+    assert len(loaded.run(told_by(say)).trajectory) > 10
+    mute = SLAM.load(tmp_path / "map", CONFIG)
+    with pytest.raises(ConfigError, match=r"its keypoints have .* as information, the frame's none"):
+        mute.step(told_by(lambda features: None)[0])
+
+
+SAID = told_by(by_matrix)
+
+
+def test_a_checkpoint_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    whole = run_with(by_matrix)[1]
+    slam, so_far = SLAM(WALK.camera, CONFIG), Progressed()
+    for index in range(12):
+        so_far.results.append(slam.step(SAID[index]))
+        so_far.next = index + 1
+    slam.settle()
+    write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
+    slam, so_far = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
+    resumed = run_sequence(slam, SAID, so_far=so_far)
+    assert resumed.map.keyframes["information"].shape[-1] == 3
+    torch.testing.assert_close(resumed.trajectory.T_wc, whole.trajectory.T_wc, atol=1e-3, rtol=0)
+
+
+def test_keypoints_of_which_some_are_known_badly_are_worth_what_is_said() -> None:
+    """Every third keypoint is several times as far off as the others; who says so comes out twice as well."""
+    errors = {}
+    for name in ("told", "hidden"):
+
+        def blurred(features: Features, told: bool = name == "told") -> Features:
+            bad = features.descriptors[..., 0].remainder(3) == 0
+            generator = torch.Generator().manual_seed(int(1e3 * float(features.keypoints.sum()) % 2**30))
+            shift = 2.0 * torch.randn(features.keypoints.shape, generator=generator, dtype=torch.float64)
+            keypoints = torch.where(bad[..., None], features.keypoints + shift, features.keypoints)
+            information = 1 / ((0.3 * features.scales) ** 2 + torch.where(bad, 4.0, 0.0))
+            return replace(features, keypoints=keypoints, information=information if told else None)
+
+        seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
+        run = SLAM(WALK.camera, CONFIG).run(
+            WithFeatures(WALK, lambda frame, seen=seen, blurred=blurred: blurred(seen(frame)))
+        )
+        assert len(run.trajectory) == len(WALK), name
+        errors[name] = evaluate(run.trajectory, WALK.groundtruth).ate_m
+    assert errors["told"] < 0.6 * errors["hidden"]
+
+
+class Doubtful(nn.Module):
+    """A front end that knows the scene, and believes the more in a keypoint the nearer it is to a place to learn."""
+
+    def __init__(self, walk: Walk, kind: str) -> None:
+        super().__init__()
+        self.falloff = nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
+        self.kind = kind
+        poses = true_T_cw(walk)
+        scene = SimulatedFeatures(
+            poses,
+            walk.camera,
+            num_keypoints=200,
+            points_per_view=120,
+            depth_near=1,
+            depth_far=5,
+            noise_px=0.3,
+        )
+        self.seen = Features.cat([scene(pose, index) for index, pose in enumerate(poses)])
+
+    def forward(self, images: Tensor) -> Features:
+        away = (self.seen.keypoints - self.seen.keypoints.new_tensor([159.5, 119.5])) / 200
+        if self.kind == "number":
+            return replace(self.seen, information=torch.exp(-self.falloff * away.square().sum(-1)))
+        return replace(self.seen, information=torch.diag_embed(torch.exp(-self.falloff * away.square())))
+
+
+@pytest.mark.parametrize("kind", ["number", "matrix"])
+def test_gradients_reach_what_says_the_information(kind: str) -> None:
+    walk = Walk(arc(6, length=1.0))
+    images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
+    eyes = Doubtful(walk, kind)
+    clip_slam = ClipSLAM(eyes, config=load_config(None, ["bundle.final_iterations=30"]))
+    graph = clip_slam.look(images, walk.camera)
+
+    def loss(falloff: float) -> Tensor:
+        with torch.no_grad():
+            eyes.falloff.fill_(falloff)
+        poses = clip_slam(images, walk.camera, graph)
+        return ate(poses.T_cw, truth, poses.posed)
+
+    loss(1.0).backward()
+    assert eyes.falloff.grad is not None
+    with torch.no_grad():
+        wanted = float(loss(1.02) - loss(0.98)) / 0.04
+    assert float(eyes.falloff.grad) == pytest.approx(wanted, rel=0.01)

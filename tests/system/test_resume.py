@@ -1,0 +1,457 @@
+"""Runs that are ended, by a signal or a power cut, and gone on with."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from tests.walks import Walk, arc
+from torchslam import SLAM, Config, State, StepResult, load_config
+from torchslam.cli import arguments, main
+from torchslam.data import read_trajectory
+from torchslam.errors import ResultsError
+from torchslam.io.frames_file import read_frames
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.map.file import read_tensors, read_worlds, write_tensors, write_worlds
+from torchslam.map.tracking_state import Track
+from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
+from torchslam.system.run import Progressed, run_sequence
+
+SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
+# A system is settled once its world is no longer to be taken back. Without any noise, what a run says of its camera
+# would be looked for to the last bit, in hundreds of iterations.
+SETTINGS += ["initialization.min_frames=8", "simulated.noise_px=0.05"]
+SET = [part for setting in SETTINGS for part in ("--set", setting)]
+CONFIG = load_config(None, SETTINGS)
+FRAMES = 26
+PATH = arc(45)[:FRAMES]
+WALK = Walk(PATH)
+STOP = 17  # frame after which a run ends early
+
+
+class PowerCut(BaseException):
+    """Ends a run wherever it is, as nothing else does."""
+
+
+def half(config: Config = CONFIG) -> tuple[SLAM, Progressed]:
+    """A system in the middle of the walk."""
+    slam, so_far = SLAM(WALK.camera, config), Progressed()
+
+    def cut(result: StepResult) -> None:
+        if result.index >= STOP and slam.is_settled:
+            raise PowerCut
+
+    with pytest.raises(PowerCut):
+        run_sequence(slam, WALK, cut, so_far)
+    return slam, so_far
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
+    slam, so_far = half()
+    slam.foreign.stillness.evidence[3, 4] = 1  # too little to matter
+    slam.memory.recalls.append(Recall(15, 3, 0, 0))
+    write_checkpoint(path, slam, so_far, WALK)
+    return path
+
+
+# --- checkpoints ---------------------------------------------------------------------------------------------
+
+
+def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
+    slam, so_far = half()
+    resumed, loaded = read_checkpoint(checkpoint, WALK, CONFIG)
+    assert loaded.next == so_far.next == STOP + 1
+    assert loaded.skipped == so_far.skipped
+    for before, after in zip(so_far.results, loaded.results, strict=True):
+        for name in ("T_cw", "covariance"):
+            expected, found = getattr(before, name), getattr(after, name)
+            assert found is None if expected is None else torch.equal(found, expected)
+        times = {stage: pytest.approx(time, abs=1e3) for stage, time in before.stage_ms.items()}
+        plain = {"T_cw": None, "covariance": None}
+        assert replace(after, **plain) == replace(before, **plain, stage_ms=times)
+    assert resumed.last_frame == slam.last_frame
+    assert resumed.session.number == 0
+    assert resumed.is_settled
+    assert resumed.world is not None
+    assert slam.world is not None
+    assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
+    assert resumed.state is State.TRACKING
+    assert resumed.memory.recalls == [Recall(15, 3, 0, 0)]
+    for column in fields(Track):
+        before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
+        assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
+            column.name
+        )
+    assert torch.nonzero(resumed.foreign.stillness.evidence).tolist() == [[3, 4]]
+
+
+def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:
+    whole = SLAM(WALK.camera, CONFIG).run(WALK)
+    slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
+    resumed = run_sequence(slam, WALK, None, so_far)
+    for name, run in (("whole", whole), ("resumed", resumed)):
+        write_worlds(tmp_path / name, run.worlds, run.camera, run.sessions)
+    assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
+    assert [result.index for result in resumed.results] == list(range(FRAMES))
+    assert torch.equal(resumed.trajectory.T_wc, whole.trajectory.T_wc)
+    assert torch.equal(resumed.online.T_wc, whole.online.T_wc)
+
+
+@pytest.mark.parametrize("window", [3, 1000])  # few keyframes are enough to wait, or none are
+def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, window: int) -> None:
+    config = load_config(None, [*SETTINGS, "bundle.delay=3", f"bundle.window={window}"])
+    whole = SLAM(WALK.camera, config).run(WALK)
+    slam, so_far = SLAM(WALK.camera, config), Progressed()
+
+    def cut(result: StepResult) -> None:
+        if slam.is_settled and slam.mapper.adjusting:
+            raise PowerCut
+
+    with pytest.raises(PowerCut):
+        run_sequence(slam, WALK, cut, so_far)
+    write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
+    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, config)
+    assert resumed.mapper.adjusting
+    assert resumed.mapper.adjusting.due == slam.mapper.adjusting.due
+    assert resumed.mapper.adjusting.is_due_first is (window == 1000)
+    run = run_sequence(resumed, WALK, None, loaded)
+    assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
+    assert torch.equal(run.online.T_wc, whole.online.T_wc)
+
+
+def test_same_state_same_bytes(checkpoint: Path, tmp_path: Path) -> None:
+    slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
+    write_checkpoint(tmp_path / "again", slam, so_far, WALK)
+    assert (tmp_path / "again").read_bytes() == checkpoint.read_bytes()
+
+
+def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+    for other in (Walk(PATH[:-1]), Walk(PATH)):
+        if len(other) == FRAMES:
+            other.camera = other.camera.with_params(other.camera.params + 1)
+        with pytest.raises(ResultsError, match=r"checkpoint\.safetensors: .* with another sequence"):
+            read_checkpoint(checkpoint, other, CONFIG)
+    with pytest.raises(ResultsError, match="with another configuration"):
+        read_checkpoint(checkpoint, WALK, replace(CONFIG, seed=1))
+    write_worlds(tmp_path / "map", [], WALK.camera)
+    with pytest.raises(ResultsError, match="a map, but not a checkpoint"):
+        read_checkpoint(tmp_path / "map", WALK, CONFIG)
+    with pytest.raises(ResultsError, match="foreign tensors: run"):
+        read_worlds(checkpoint)
+
+
+DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
+    (lambda run, tensors: run.pop("next"), "'next'"),
+    (lambda run, tensors: run.update(world=5), "not enough values"),
+    (lambda run, tensors: run["track"].update(reference=1000), "names rows beyond"),
+    (lambda run, tensors: run.update(last_frame=[3]), "not enough values"),
+    (lambda run, tensors: run["reasons"].pop(), "out of range"),
+    (lambda run, tensors: tensors.pop("run.T_cw"), r"run\.T_cw"),
+    (lambda run, tensors: tensors.pop("run.track.seen_last"), "seen_last"),
+    (lambda run, tensors: tensors.update({"run.evidence": torch.zeros(3)}), "evidence|size"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGES)
+def test_damaged_checkpoints_are_refused(
+    checkpoint: Path, tmp_path: Path, damage: Callable[..., object], message: str
+) -> None:
+    tensors, about = read_tensors(checkpoint)
+    damage(about["run"], tensors)
+    write_tensors(tmp_path / "damaged", tensors, about)
+    with pytest.raises(ResultsError, match=f"damaged: not a whole checkpoint: .*({message})"):
+        read_checkpoint(tmp_path / "damaged", WALK, CONFIG)
+
+
+def test_only_a_settled_system_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="held back"):
+        write_checkpoint(tmp_path / "x", SLAM(WALK.camera, CONFIG), Progressed(), WALK)
+
+
+# --- the command ---------------------------------------------------------------------------------------------
+
+
+class Cut(Walk):
+    """Does something when frame `at` is read."""
+
+    at: int = STOP
+    do: Callable[[], object] = staticmethod(lambda: None)
+
+    def image(self, index: int) -> torch.Tensor:
+        if index == self.at:
+            type(self).do()
+        return super().image(index)
+
+
+@pytest.fixture
+def cut(monkeypatch: pytest.MonkeyPatch, without_pictures: None) -> Iterator[type[Cut]]:
+    """The sequence that every command gets, and what it does in the middle."""
+    monkeypatch.setattr(arguments, "sequence", lambda options: Cut(PATH))
+    yield Cut
+    Cut.do = staticmethod(lambda: None)
+    Cut.at = STOP
+
+
+def command(folder: Path, *more: str) -> int:
+    return main(["run", "walk", "--output", str(folder), *SET, *more])
+
+
+def power_cut() -> None:
+    raise PowerCut
+
+
+def send(number: int) -> Callable[[], None]:
+    return lambda: os.kill(os.getpid(), number)
+
+
+def test_a_power_cut_loses_nothing_before_the_last_checkpoint(
+    tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "cut"
+    cut.do = staticmethod(power_cut)
+    with pytest.raises(PowerCut):
+        command(folder, "--checkpoint", "2")
+    assert [path.name for path in folder.iterdir()] == ["checkpoint.safetensors"]
+    assert command(folder) == 2  # neither resumed nor given up
+    assert "--resume goes on with it" in capsys.readouterr().err
+    cut.do = staticmethod(lambda: None)
+    assert command(folder, "--resume", "--set", "seed=3") == 2
+    assert "another configuration" in capsys.readouterr().err
+    assert command(folder, "--resume") == 0
+    assert "going on at frame" in capsys.readouterr().err
+    assert not (folder / "checkpoint.safetensors").exists()
+    assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
+    assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
+    assert command(tmp_path / "whole", "--checkpoint", "0") == 0
+    for name in ("map.safetensors", "trajectory.txt", "online.txt", "keyframes.txt"):
+        assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+
+
+def test_checkpoints_can_be_left_out(
+    tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut.do = staticmethod(power_cut)
+    with pytest.raises(PowerCut):
+        command(tmp_path, "--checkpoint", "0")
+    assert list(tmp_path.iterdir()) == []
+    cut.do = staticmethod(lambda: None)
+    assert command(tmp_path, "--resume", "--checkpoint", "0") == 0
+    assert "no checkpoint to resume: beginning with the first frame" in capsys.readouterr().err
+    assert len(read_frames(tmp_path / "frames.csv")) == FRAMES
+
+
+def test_results_are_not_overwritten_unless_told(
+    tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "map.safetensors").write_bytes(b"the work of years")
+    assert command(tmp_path) == 2
+    assert "results of an earlier run, which would be replaced" in capsys.readouterr().err
+    assert command(tmp_path, "--resume") == 2
+    assert "no checkpoint to resume" in capsys.readouterr().err
+    assert (tmp_path / "map.safetensors").read_bytes() == b"the work of years"
+    assert command(tmp_path, "--overwrite") == 0
+    read_worlds(tmp_path / "map.safetensors")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_run_after_its_frame_and_it_can_be_resumed(
+    tmp_path: Path, cut: type[Cut], number: int, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    cut.do = staticmethod(send(number))
+    assert command(tmp_path) == status
+    assert signal.getsignal(signal.SIGTERM) is before
+    err = capsys.readouterr().err
+    assert "stopping after this frame" in err
+    assert "adjusting" in err
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["interrupted"]
+    assert figures["frames"] == STOP + 1
+    cut.do = staticmethod(lambda: None)
+    assert command(tmp_path, "--resume") == 0
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert not figures["interrupted"]
+    assert figures["frames"] == figures["posed"] == FRAMES
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_final_adjustment(
+    tmp_path: Path,
+    cut: type[Cut],
+    number: int,
+    status: int,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from torchslam.cli.progress import ProgressBar
+
+    original, calls = ProgressBar.adjusting, []
+
+    def adjusting(self: ProgressBar, iteration: int, iterations: int) -> None:
+        calls.append(iteration)
+        original(self, iteration, iterations)
+        if len(calls) == 1:
+            os.kill(os.getpid(), number)
+            original(self, iteration, iterations)
+            pytest.fail("the adjustment went on")
+
+    monkeypatch.setattr(ProgressBar, "adjusting", adjusting)
+    assert command(tmp_path) == status
+    assert "stopping the adjustment after this iteration" in capsys.readouterr().err
+    assert calls == [0]
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["interrupted"]
+    assert figures["frames"] == figures["posed"] == FRAMES
+    assert figures["ate_m"] < 0.01
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_second_signal_ends_at_once(
+    tmp_path: Path, cut: type[Cut], number: int, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(number)
+
+    def twice() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
+        time.sleep(1)  # where the signal is taken note of, at the latest
+
+    cut.do = staticmethod(twice)
+    with pytest.raises(SystemExit) as ended:
+        command(tmp_path, "--checkpoint", "2")
+    assert ended.value.code == status
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.safetensors"]
+    assert signal.getsignal(number) is before
+
+
+def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchslam.cli import result_folder as folder
+
+    taken: list[int] = []
+    slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, is_settled=True)
+    state.worlds = [SimpleNamespace(map=slam_map)]
+    monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
+    checkpoints = folder.Checkpoints(tmp_path, 10, state, Progressed(), WALK)  # type: ignore[arg-type]
+    for count in range(1, 1001):
+        slam_map.num_keyframes = count
+        state.is_settled = count not in (30, 31)
+        checkpoints.offer()
+    assert taken[:4] == [10, 20, 32, 42]
+    gaps = [after - before for before, after in itertools.pairwise(taken)]
+    assert all(
+        gap == max(10, math.ceil(0.05 * after)) for gap, after in zip(gaps[2:], taken[3:], strict=True)
+    )
+    state.mapping = False
+    checkpoints.offer(at_once=True)
+    assert taken[-1] < 1000
+
+
+def test_a_saved_map_is_gone_on_in_and_localised_in(
+    tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, third = (str(tmp_path / name) for name in ("first", "second", "third"))
+    assert main(["run", "walk", "-o", first, *SET, "--seed", "5"]) == 0
+    content = (tmp_path / "first" / "map.safetensors").read_bytes()
+    assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration beside the map
+    assert "session" in capsys.readouterr().out
+    grown = read_worlds(tmp_path / "second" / "map.safetensors")
+    (world,) = grown.worlds
+    assert grown.sessions == 2
+    assert len(world.trajectory(0)) == len(world.trajectory(1)) == FRAMES
+    assert len(read_trajectory(tmp_path / "second" / "trajectory.txt")) == FRAMES
+    assert json.loads((tmp_path / "second" / "metrics.json").read_text())["ate_m"] < 1e-3
+    file = str(tmp_path / "first" / "map.safetensors")
+    assert main(["run", "walk", "-o", third, *SET, "--seed", "5", "--map", file, "--localize"]) == 0
+    assert (tmp_path / "third" / "map.safetensors").read_bytes() == content
+    assert (tmp_path / "first" / "map.safetensors").read_bytes() == content
+    figures = json.loads((tmp_path / "third" / "metrics.json").read_text())
+    assert figures["posed"] == FRAMES
+    assert figures["keyframes"] == 0
+    assert figures["ate_m"] < 1e-3
+    assert len(read_trajectory(tmp_path / "third" / "trajectory.txt")) == FRAMES
+
+
+def test_maps_that_cannot_be_gone_on_in(
+    tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = WALK.camera.with_params(WALK.camera.params + 1)
+    write_worlds(tmp_path / "map", [], other)
+    assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 2
+    assert "made with the camera pinhole 401,401,160.5,120.5 of 320 x 240" in capsys.readouterr().err
+    assert command(tmp_path / "out", "--map", str(tmp_path / "nowhere")) == 2
+    assert "nowhere: no map file" in capsys.readouterr().err
+    assert command(tmp_path / "out", "--map", str(tmp_path / "map"), "--localize") == 2
+    assert "no world in it to localise in" in capsys.readouterr().err
+    assert command(tmp_path / "out", "--localize") == 2
+    assert "--localize needs a --map" in capsys.readouterr().err
+
+
+def test_the_camera_of_a_map_is_known_to_as_many_digits_as_a_calibration_file_has(
+    tmp_path: Path, cut: type[Cut]
+) -> None:
+    rounded = WALK.camera.with_params(WALK.camera.params * (1 + 4e-10))
+    write_worlds(tmp_path / "map", [], rounded)
+    assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 0
+
+
+# --- a real power cut ----------------------------------------------------------------------------------------
+
+CHILD = """
+import sys, time
+import torch
+torch.set_num_threads(1)
+from tests.test_resume import PATH
+from tests.walks import Walk
+from torchslam.cli.main import main
+from torchslam.cli import arguments
+
+class Slow(Walk):
+    def image(self, index):
+        time.sleep(float(sys.argv[1]))
+        return super().image(index)
+
+arguments.sequence = lambda options: Slow(PATH)
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_process_is_gone_on_with(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    line = ["run", "walk", "--output", str(folder), *SET, "--checkpoint", "2"]
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+    child = subprocess.Popen([sys.executable, "-c", CHILD, "0.2", *line], env=env, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 120
+    while not (folder / "checkpoint.safetensors").exists():
+        assert child.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    time.sleep(0.5)
+    child.send_signal(signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL
+    kept = load_file(str(folder / "checkpoint.safetensors"))  # whole
+    assert 0 < len(kept["run.counts"]) < FRAMES
+    again = [sys.executable, "-c", CHILD, "0", *line, "--resume"]
+    done = subprocess.run(again, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "going on at frame" in done.stderr
+    assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
+    assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
+    assert not (folder / "checkpoint.safetensors").exists()

@@ -1,0 +1,55 @@
+"""What a session is: its number, its worlds, and what it leaves in a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.map.simulated import CAMERA, simulated_world
+from torchslam.errors import ResultsError
+from torchslam.map.atlas import Worlds
+from torchslam.map.file import read_worlds
+from torchslam.system.session import Session
+
+
+def in_a_world() -> Session:
+    world = simulated_world()
+    world.map.points["last_seen"][:] = 7
+    return Session(CAMERA, Worlds.of([world], 1, CAMERA.params))
+
+
+def test_each_session_has_the_next_number(tmp_path: Path) -> None:
+    path = tmp_path / "map"
+    in_a_world().save(path)
+    for number in (1, 2):
+        session = Session.load(path)
+        assert (session.number, session.count, session.mapping) == (number, number + 1, True)
+        assert torch.equal(session.camera.params, CAMERA.params)
+        session.save(path)
+
+
+def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "map"
+    in_a_world().save(path)
+    session = Session.load(path, mapping=False)
+    assert (session.number, session.count) == (1, 1)
+    (world,) = session.worlds
+    assert (world.map.points["last_seen"] == 7).all()
+    session.save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == path.read_bytes()
+
+
+def test_where_the_map_may_change_frames_are_numbered_anew(tmp_path: Path) -> None:
+    in_a_world().save(tmp_path / "map")
+    (world,) = Session.load(tmp_path / "map").worlds
+    assert (world.map.points["last_seen"] == -1).all()
+
+
+def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
+    Session(CAMERA, Worlds(CAMERA.params)).save(tmp_path / "empty")
+    assert read_worlds(tmp_path / "empty").sessions == 1
+    assert len(Session.load(tmp_path / "empty").worlds) == 0
+    with pytest.raises(ResultsError, match="no world in it to localise in"):
+        Session.load(tmp_path / "empty", mapping=False)

@@ -1,0 +1,526 @@
+"""The whole system: simulated features for the geometry, a rendered room for the images."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc, still, there_and_elsewhere, turn
+from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
+from torchslam.errors import ConfigError, FrameError
+from torchslam.evaluation import ate, ate_apart
+from torchslam.features import SimulatedFeatures
+from torchslam.geometry import Noise, se3_inverse, se3_log, transform
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.mapping.async_bundle import Adjusting
+from torchslam.mapping.map_initialization import Founder
+from torchslam.system.front_end import Simulated
+from torchslam.system.lost import FOUND_AGAIN
+from torchslam.system.tracking_state import STARTED_ANEW
+from torchslam.tracking.localizer import Localizer
+from torchslam.types import Start, View
+
+SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+
+
+def run_walk(walk: Walk, *overrides: str, progress: Callable[[StepResult], None] | None = None) -> Run:
+    return SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides])).run(walk, progress)
+
+
+def test_exact_features_give_the_exact_trajectory() -> None:
+    walk = Walk(arc(60)[:30])
+    run = run_walk(walk)
+    assert len(run.trajectory) == 30  # frames before the start are posed once there is a map
+    result = evaluate(run.trajectory, walk.groundtruth)
+    assert result.ate_m < 1e-4 * result.path_length_m
+    assert all(r.state is State.TRACKING for r in run.results[-20:])
+
+
+@pytest.mark.parametrize("scales", ["false", "true"])
+def test_noise_and_outliers_are_withstood(scales: str) -> None:
+    walk = Walk(arc(60)[:30])
+    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    run = run_walk(walk, *noisy, f"simulated.scales={scales}")
+    assert len(run.trajectory) == 30
+    result = evaluate(run.trajectory, walk.groundtruth)
+    assert result.ate_m < 0.01 * result.path_length_m
+
+
+def test_the_scale_of_ground_truth() -> None:
+    walk = Walk(arc(40)[:16])
+    run = run_walk(walk, "scale=groundtruth")
+    assert evaluate(run.trajectory, walk.groundtruth).scale == pytest.approx(1.0, rel=1e-3)
+
+
+def test_unit_scale_puts_the_median_depth_of_the_start_at_one() -> None:
+    walk = Walk(arc(12))
+    run = run_walk(walk, "bundle.enabled=false", "mapping.cull=false")
+    born = run.map.points["born"] == 1
+    assert float(run.map.positions_w[born, 2].median()) == pytest.approx(1.0, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"), [(still(20), "stands still"), (turn(20), "turns|parallax|planar")]
+)
+def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, message: str) -> None:
+    run = run_walk(Walk(poses), "simulated.noise_px=0.3", "simulated.depth_near=2", "simulated.depth_far=6")
+    assert run.map.num_keyframes == 0
+    assert len(run.trajectory) == 0
+    assert "no map was initialised in 20 frames" in run.failure
+    assert re.search(message, run.failure)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
+    walk = Walk(arc(40)[:16])
+    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1")
+    one, two, other = run_walk(walk, *noisy), run_walk(walk, *noisy), run_walk(walk, *noisy, "seed=1")
+    assert torch.equal(one.trajectory.T_wc, two.trajectory.T_wc)
+    assert torch.equal(one.map.positions_w, two.map.positions_w)
+    assert not torch.equal(one.trajectory.T_wc, other.trajectory.T_wc)
+
+
+class Gap(Walk):
+    """Some frames show nothing that was seen before or after: their poses are far away."""
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = super().__getitem__(index)
+        if 35 <= index < 40:
+            away = torch.eye(4, dtype=torch.float64)
+            away[2, 3] = -1e6
+            return Frame(index, frame.timestamp, frame.image, frame.name, away)
+        return frame
+
+
+def test_lost_is_reported_and_tracking_comes_back() -> None:
+    walk = Gap(arc(60))
+    run = run_walk(walk)
+    states = [r.state for r in run.results]
+    assert states[35:40] == [State.LOST] * 5
+    assert all(r.T_cw is None for r in run.results[35:40])
+    confirmed = 40 + Config().relocalization.confirmations
+    assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
+    assert run.results[40].reason == FOUND_AGAIN
+    assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
+    assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
+    assert len(run.worlds) == 1
+    assert {r.world for r in run.results if r.T_cw is not None} == {0}
+    assert len(run.trajectory) == 55
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
+
+
+def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk = Gap(arc(60)[:42])
+    with monkeypatch.context() as patch:
+        patch.setattr(SLAM, "conclude", SLAM.settle)
+        without = run_walk(walk)
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    run = slam.run(walk)
+    assert [r.state for r in run.results[-2:]] == [State.UNCERTAIN] * 2
+    assert run.history.frames["frame_index"][-2:].tolist() == [40, 41]
+    assert len(run.trajectory) == 37
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
+    assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
+    assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
+    whole = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(Gap(arc(60)))
+    states = [slam.step(whole[index]).state for index in range(42, 46)]
+    assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
+    assert states[-1] is State.TRACKING
+    frames = slam.history.frames["frame_index"]
+    assert len(torch.unique(frames)) == len(frames) == 41
+
+
+class Glimpse(Walk):
+    """From frame 25 on the camera is where nothing was ever seen, but for one frame that shows frame 20 again."""
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = super().__getitem__(index)
+        away = torch.eye(4, dtype=torch.float64)
+        away[2, 3] = -1e6
+        if index == 28:
+            return replace(frame, T_cw_groundtruth=super().__getitem__(20).T_cw_groundtruth)
+        return frame if index < 25 else replace(frame, T_cw_groundtruth=away)
+
+
+def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
+    run = run_walk(Glimpse(arc(34)))
+    states = [r.state for r in run.results]
+    assert states[25:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
+    assert run.results[28].reason == FOUND_AGAIN
+    assert len(run.trajectory) == 25
+    assert int(run.map.keyframes["frame_index"].max()) < 25
+    assert int(run.history.frames["frame_index"].max()) < 25
+
+
+@pytest.mark.parametrize(("least", "believed"), [(0.4, True), (0.6, False)])
+def test_a_start_must_explain_the_frames_since_its_reference(
+    least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reference frame is explained, the one that starts the map is not."""
+    explains = Founder._explains
+    monkeypatch.setattr(
+        Founder, "_explains", lambda founder, world, view: explains(founder, world, view) and view.index == 0
+    )
+    walk = Walk(arc(40)[[0, 3]])
+    run = run_walk(
+        walk, "simulated.depth_near=7", "simulated.depth_far=25", f"initialization.min_explained={least}"
+    )
+    assert (len(run.worlds) == 1) is believed
+    assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
+
+
+@pytest.mark.parametrize("explained", [True, False])
+def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
+    explained: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No support is enough here: whatever start the first and the last frame make is a rival."""
+    few = ("initialization.min_matches=30", "initialization.min_points=20")
+    walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
+    monkeypatch.setattr("torchslam.tracking.provisional_map.LEAST_SUPPORT", 2.0)
+    found, founded = Founder.found, []
+
+    def counted(founder: Founder, world: World, start: Start, views: list[View]) -> str:
+        founded.append(views)
+        return found(founder, world, start, views) if explained or len(founded) == 1 else "it does not"
+
+    monkeypatch.setattr(Founder, "found", counted)
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
+    run = slam.run(walk)
+    anew = [r for r in run.results if r.reason == STARTED_ANEW]
+    assert len(founded) > 1
+    assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
+    assert len(run.trajectory) == 30
+    assert len(run.worlds) == 1
+    assert run.worlds[0].number == len(anew)
+    if explained:
+        assert len(anew) == len(founded) - 1
+        assert all(r.is_keyframe and r.state is State.TRACKING for r in anew)
+        assert len(slam.memory.places) == run.map.num_keyframes
+        assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-4
+    else:
+        assert not anew
+        assert torch.equal(run.trajectory.T_wc, plain.trajectory.T_wc)
+
+
+def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:
+    """A camera that stands at first: there is nothing to begin with before it moves."""
+    walk = Walk(torch.cat([still(6), arc(60)[1:20]]))
+    run = run_walk(walk, "simulated.depth_near=0.6", "simulated.depth_far=2", "simulated.noise_px=0.2")
+    begun = next(r.index for r in run.results if r.state is State.TRACKING)
+    assert begun >= 6
+    assert all(r.T_cw is None for r in run.results[:begun])
+    assert len(run.trajectory) == len(walk)
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
+
+
+JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.noise_px=0.5", "simulated.scales=true",
+          "relocalization.patience=3", "initialization.min_frames=8")  # fmt: skip
+
+
+def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
+    walk = Walk(there_and_elsewhere())
+    run = run_walk(walk, *JOINED)
+    worlds = [r.world for r in run.results if r.T_cw is not None]
+    assert set(worlds) == {0, 1}
+    assert worlds[0] == worlds[-1] == 0
+    assert len(run.worlds) == 1
+    assert sum(len(part) for part in run.online_parts) == len(worlds) > len(run.online)
+    assert ate_apart(run.online_parts, walk.groundtruth) < 0.015  # keyframes are adjusted two frames later
+    assert len(run.trajectory) == len(walk)
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
+
+
+def test_worlds_that_do_not_meet_are_kept_beside_each_other() -> None:
+    walk = Walk(there_and_elsewhere()[4:33])
+    run = run_walk(walk, *JOINED)
+    assert [len(world.history) for world in run.worlds] == [12, 17]
+    assert [world.number for world in run.worlds] == [0, 1]
+    assert len(run.trajectory) == 17  # of the world with most frames
+
+
+class Damaged(Walk):
+    def image(self, index: int) -> torch.Tensor:
+        if index in (3, 17):
+            raise FrameError(f"rgb.txt:{index}: is not an image")
+        return super().image(index)
+
+
+def test_damaged_frames_are_skipped_with_a_warning_and_counted() -> None:
+    walk = Damaged(arc(60)[:22])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run = run_walk(walk)
+    assert [str(w.message) for w in caught if "skipped a frame" in str(w.message)] != []
+    assert run.skipped == ["rgb.txt:3: is not an image", "rgb.txt:17: is not an image"]
+    assert len(run.trajectory) == 20
+
+
+def test_an_interrupt_keeps_what_there_is() -> None:
+    def interrupt(result: StepResult) -> None:
+        if result.index == 20:
+            raise KeyboardInterrupt
+
+    run = run_walk(Walk(arc(60)[:24]), progress=interrupt)
+    assert run.interrupted
+    assert len(run.results) == 21
+    assert len(run.trajectory) == 21
+
+
+def test_simulated_features_need_true_poses() -> None:
+    walk = Walk(arc(5))
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    with pytest.raises(ConfigError, match="true poses"):
+        slam.step(walk[0])
+
+
+def test_poses_are_rigid_and_results_tell_their_stages() -> None:
+    run = run_walk(Walk(arc(40)[:16]), "simulated.noise_px=0.5")
+    R = run.trajectory.T_wc[:, :3, :3]
+    assert torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), atol=1e-9)
+    assert torch.allclose(torch.linalg.det(R), torch.ones(len(R), dtype=R.dtype))
+    keyframe = next(r for r in run.results if r.is_keyframe and "bundle" in r.stage_ms)
+    assert {"features", "tracking", "mapping", "bundle", "rest", "total"} <= keyframe.stage_ms.keys()
+    assert keyframe.reason
+
+
+def test_every_frame_looks_at_a_bounded_part_of_the_map() -> None:
+    walk = Walk(arc(50, length=25.0))
+    slam = SLAM(
+        walk.camera, load_config(None, [*SIMULATED, "simulated.depth_near=0.032", "simulated.depth_far=0.16"])
+    )
+    slam.run(walk)
+    assert slam.map.num_keyframes > 10
+    assert slam.world is not None
+    track = slam.world.track
+    assert len(track.local_keyframes) <= Config().tracking.local_keyframes + 1
+    assert len(track.local_points) < 0.5 * slam.map.num_points
+
+
+def test_a_rendered_room_is_tracked() -> None:
+    sequence = open_sequence("synthetic:room").part(0, 30)
+    run = SLAM(sequence.camera).run(sequence)
+    assert len(run.trajectory) >= 29
+    result = evaluate(run.trajectory, sequence.groundtruth)
+    assert result.ate_m < 0.02 * result.path_length_m
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "frames", "ate_m"), [("shelf_bin", 50, 0.02), ("machine_hall", 60, 0.02)])
+def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m: float) -> None:
+    sequence = open_sequence(f"{data_dir}/{name}").part(0, frames)
+    run = SLAM(sequence.camera).run(sequence)
+    assert len(run.trajectory) >= 0.9 * frames
+    assert evaluate(run.trajectory, sequence.groundtruth).ate_m < ate_m
+
+
+@pytest.mark.data
+def test_a_real_standstill_starts_no_map(data_dir: object) -> None:
+    sequence = open_sequence(f"{data_dir}/standstill")
+    run = SLAM(sequence.camera).run(sequence)
+    assert run.map.num_keyframes == 0
+    assert "stands still" in run.failure
+
+
+def test_the_trajectory_of_a_run_is_the_minimiser_of_its_graph() -> None:
+    walk = Walk(arc(40)[:20])
+    run = run_walk(walk, "simulated.noise_px=0.5")
+    graph = run.graph
+    assert int(graph.is_keyframe.sum()) == run.map.num_keyframes
+    assert len(graph.timestamps) == 20
+    solution = solve(graph, backward="detached")
+    assert torch.allclose(solution.trajectory.timestamps, run.trajectory.timestamps)
+    assert torch.allclose(solution.trajectory.T_wc, run.trajectory.T_wc, atol=1e-5)
+
+
+def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
+    walk = Walk(arc(40)[:14])
+    graph = run_walk(walk, "simulated.noise_px=0.5").graph
+
+    def error(fx: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        params = torch.cat([fx[None], graph.camera.params[1:]])
+        moved = replace(graph, camera=graph.camera.with_params(params), pixels=pixels)
+        solution = solve(moved, tolerance=1e-14, iterations=60)
+        return ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids])
+
+    fx = graph.camera.params[0].clone().requires_grad_()
+    pixels = graph.pixels.clone().requires_grad_()
+    error(fx, pixels).backward()
+    assert fx.grad is not None
+    assert pixels.grad is not None
+    with torch.no_grad():
+        h = 1e-3
+        numeric = (error(fx + h, pixels) - error(fx - h, pixels)) / (2 * h)
+        assert float(fx.grad) == pytest.approx(float(numeric), rel=1e-3)
+        direction = pixels.grad / pixels.grad.norm()
+        h = 1e-2
+        numeric = (error(fx, pixels + h * direction) - error(fx, pixels - h * direction)) / (2 * h)
+        assert float(pixels.grad.norm()) == pytest.approx(float(numeric), rel=1e-3)
+
+
+def test_covariances_tell_the_errors_of_the_map() -> None:
+    """Errors of keyframes and points, squared and normalised, average to their degrees of freedom.
+
+    The map's scale is free; of all scales, the covariances belong to the one that least moves the keyframes.
+    """
+    walk = Walk(arc(60)[:40])
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, "simulated.noise_px=0.5", "seed=1"]))
+    slam_map = slam.run(walk).map
+    truth = true_T_cw(walk)[slam_map.keyframes["frame_index"]]
+    points_w, known = true_points(slam, walk)
+    points_w, truth = transform(truth[0], points_w), truth @ se3_inverse(truth[0])
+    T_cw = slam_map.T_cw
+    scale = (T_cw[:, :3, 3] ** 2).sum() / (T_cw[:, :3, 3] * truth[:, :3, 3]).sum()
+    truth[:, :3, 3] *= scale
+
+    errors = se3_log(truth @ se3_inverse(T_cw))[1:]
+    keyframes = normalised(errors, slam_map.keyframes["covariances"][1:])
+    assert 0.4 < float(keyframes.mean()) / 6 < 2.0
+    points = normalised(
+        slam_map.positions_w[known] - scale * points_w, slam_map.points["covariances_w"][known]
+    )
+    assert len(points) > 200
+    assert 0.5 < float(points.mean()) / 3 < 1.7
+
+
+def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions (n, 3) in the world of the walk, and ids (n,) of the map's points, by their descriptors."""
+    settings = slam.config.simulated
+    scene = SimulatedFeatures(
+        true_T_cw(walk),
+        walk.camera,
+        points_per_view=settings.points_per_view,
+        depth_near=settings.depth_near,
+        depth_far=settings.depth_far,
+        seed=slam.config.seed,
+    )
+    ids = slam.map.living_points()
+    same = (slam.map.points["descriptors"][ids][:, None] == scene.descriptors).all(-1)
+    assert same.any(1).all()
+    return scene.points_w[same.int().argmax(1)], ids
+
+
+def normalised(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
+    return (errors * torch.linalg.solve(covariances, errors)).sum(-1)
+
+
+def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
+    """An error that is too large for the pixel alone is accepted where the point is uncertain by as much."""
+    walk = Walk(arc(40)[:16])
+    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "measurement.gate=mahalanobis")
+    assert len(run.trajectory) == 16
+    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
+    localizer = Localizer(run.camera, run.config)
+    ids = run.map.points_seen_by(torch.tensor([1]))
+    T_cw, noise = run.map.T_cw[1], Noise.of(torch.ones(len(ids), dtype=torch.float64), None)
+    pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
+    assert localizer.agrees(run.map, T_cw, ids, pixels, noise).all()
+    run.map.points["covariances_w"][ids] = 0
+    assert not localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).any()
+    depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
+    spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
+    run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
+    assert localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).all()
+
+
+# --- adjustments that wait -----------------------------------------------------------------------------------
+
+
+def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
+    """When adjustments were asked for and taken over, of worlds that are no longer young."""
+    events: list[tuple[str, int]] = []
+    slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides]))
+    ask, take_over = slam.mapper.adjusting.ask, slam.mapper.adjusting.take_over
+
+    def asking(slam_map: Map, keyframe: int, due: int | None) -> None:
+        events.append(("asked", int(slam_map.keyframes["frame_index"][keyframe])))
+        ask(slam_map, keyframe, due)
+
+    def taking_over(slam_map: Map) -> None:
+        assert slam.last_frame is not None
+        events.append(("taken", slam.last_frame[0]))
+        take_over(slam_map)
+
+    monkeypatch.setattr(slam.mapper.adjusting, "ask", asking)
+    monkeypatch.setattr(slam.mapper.adjusting, "take_over", taking_over)
+    old: list[int] = []  # frames in which the world is no longer young
+
+    def after(result: StepResult) -> None:
+        assert not (slam.world is None and slam.mapper.adjusting)  # nothing is left behind
+        if slam.world is not None and slam.youth is None:
+            old.append(result.index)
+
+    slam.run(walk, after)
+    assert not slam.mapper.adjusting
+    return [event for event in events if event[1] in old[1:]]
+
+
+def test_an_adjustment_is_taken_over_after_some_frames_or_before_the_next_keyframe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk = Walk(arc(80, 6.0)[:40])
+    at_once = asked_and_taken(monkeypatch, walk, "bundle.delay=0")
+    assert len(at_once) >= 6
+    assert {(what, frame) for what, frame in at_once if what == "asked"} == {
+        ("asked", frame) for what, frame in at_once if what == "taken"
+    }
+    for delay in (1, 3):
+        events = asked_and_taken(monkeypatch, walk, f"bundle.delay={delay}")
+        kinds = [what for what, _ in events]
+        assert kinds[: len(kinds) // 2 * 2] == ["asked", "taken"] * (len(kinds) // 2)  # one after the other
+        waits = [taken - asked for (_, asked), (_, taken) in zip(events[::2], events[1::2], strict=False)]
+        assert len(waits) >= 3
+        assert set(waits) <= set(range(1, delay + 1))
+    rare = asked_and_taken(monkeypatch, walk, "bundle.delay=2", "keyframes.max_translation=0.6")
+    waits = [taken - asked for (_, asked), (_, taken) in zip(rare[::2], rare[1::2], strict=False)]
+    assert 2 in waits
+
+
+def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
+    begin = Adjusting.begin
+
+    def beginning(self: Adjusting) -> None:
+        if self and self._begun is None:
+            begun.append(self.due)
+        begin(self)
+
+    monkeypatch.setattr(Adjusting, "begin", beginning)
+    for delay in (0, 2):
+        begun.clear()
+        runs.append(run_walk(walk, "bundle.window=1000", f"bundle.delay={delay}"))
+        assert len(begun) > 6
+        assert set(begun) == {None}  # no frame is tracked before
+    at_once, between = runs
+    assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
+    assert torch.equal(at_once.map.positions_w, between.map.positions_w)
+    events = asked_and_taken(monkeypatch, walk, "bundle.window=1000", "bundle.delay=2")
+    assert [what for what, _ in events[:6]] == ["asked", "taken"] * 3
+    assert all(taken == asked + 1 for (_, asked), (_, taken) in zip(events[:6:2], events[1:6:2], strict=True))
+
+
+def test_a_camera_that_is_lost_leaves_no_adjustment_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    walk = Walk(there_and_elsewhere())
+    events = asked_and_taken(monkeypatch, walk, "bundle.delay=1000", "keyframes.min_overlap=0")
+    assert [what for what, _ in events if what == "taken"]
+
+
+def test_a_delay_costs_no_accuracy() -> None:
+    walk = Walk(arc(80, 6.0)[:35])
+    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    errors = []
+    for delay in (0, 2):
+        run = run_walk(walk, *noisy, f"bundle.delay={delay}")
+        assert len(run.trajectory) == 35
+        result = evaluate(run.trajectory, walk.groundtruth)
+        errors.append(result.ate_m / result.path_length_m)
+    assert max(errors) < 0.005

@@ -1,0 +1,224 @@
+"""Frames that are held back are mapped on trial: kept when they are confirmed, taken back when the camera is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.walks import T_cw as true_T_cw
+from tests.walks import Walk, arc
+from torchslam import SLAM, Frame, State, evaluate, load_config
+from torchslam.system import tracking_state as following
+from torchslam.system.front_end import Simulated
+from torchslam.system.tentative_mapping import OnTrial
+from torchslam.tracking import backward_tracking as backwards
+from torchslam.tracking import pose_confirmation as probation
+from torchslam.tracking.dynamic.independent_motion import NOTHING
+
+SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+DOUBTED = range(22, 34)
+LATE = 15  # the first frame that may begin a world, where one starts late
+SEEN = 46  # frames, until as many were certain as were doubtful
+
+
+class Leaving(Walk):
+    """From a frame on the camera is where nothing was ever seen."""
+
+    def __init__(self, T_wc: Tensor, leaves: int) -> None:
+        super().__init__(T_wc)
+        self.leaves = leaves
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = super().__getitem__(index)
+        away = torch.eye(4, dtype=torch.float64)
+        away[2, 3] = -1e6
+        return frame if index < self.leaves else replace(frame, T_cw_groundtruth=away)
+
+
+def doubting(monkeypatch: pytest.MonkeyPatch, frames: Iterable[int], judge: str = "why_strange") -> SLAM:
+    """A system to which some frames seem strange."""
+    slam = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED))
+
+    def why(*_: object) -> str:
+        assert slam.last_frame is not None
+        return "odd" if slam.last_frame[0] in frames else ""
+
+    monkeypatch.setattr(following, judge, why)
+    return slam
+
+
+def shown(slam: SLAM, walk: Walk, each: Callable[[int], None] = lambda _: None) -> list[State]:
+    """The states of the system at the frames of a walk."""
+    frames, states = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk), []
+    for index in range(len(walk)):
+        states.append(slam.step(frames[index]).state)
+        each(index)
+    return states
+
+
+def tables(slam: SLAM) -> dict[str, Tensor]:
+    """The columns of a map, but for when points were looked for."""
+    points, keyframes = slam.map.points.columns(), slam.map.keyframes.columns()
+    return {name: column for name, column in (points | keyframes).items() if name != "last_seen"}
+
+
+def test_the_map_grows_on_trial_and_is_kept_when_it_is_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, walk = doubting(monkeypatch, DOUBTED), Walk(arc(60)[: SEEN + 4])
+    keyframes: list[int] = []
+    states = shown(slam, walk, lambda _: keyframes.append(slam.map.num_keyframes))
+    first, last = DOUBTED[0], DOUBTED[-1]
+    assert keyframes[last] > keyframes[first - 1] + 1
+    assert states[first : SEEN - 1] == [State.UNCERTAIN] * (SEEN - 1 - first)
+    assert states[SEEN - 1 :] == [State.TRACKING] * 5  # as many certain frames as doubtful ones
+    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert len(slam.trajectory()) == len(walk)
+    assert walk.groundtruth is not None
+    assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
+
+
+def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two systems that see the same, but that one of them does not map what is doubtful."""
+    walk = Leaving(arc(60)[:30], 27)
+    slam = doubting(monkeypatch, DOUBTED)
+    grown: list[int] = []
+    states = shown(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
+    assert states[-1] is State.LOST
+    assert max(grown) > grown[DOUBTED[0] - 1]
+    assert len(slam.memory.places) == slam.map.num_keyframes == grown[DOUBTED[0] - 1]
+
+    cautious = doubting(monkeypatch, DOUBTED)
+    monkeypatch.setattr(OnTrial, "take", lambda *_: None)
+    assert shown(cautious, walk) == states
+    assert tables(slam).keys() == tables(cautious).keys()
+    for name, column in tables(slam).items():
+        assert torch.equal(column, tables(cautious)[name]), name
+    assert torch.equal(slam.trajectory().T_wc, cautious.trajectory().T_wc)
+
+
+@pytest.mark.parametrize("judge", ["why_unsound", "moves"])
+def test_a_pose_that_is_not_what_its_matches_say_is_not_mapped(
+    judge: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam = doubting(monkeypatch, DOUBTED, "why_strange" if judge == "moves" else judge)
+    if judge == "moves":
+        monkeypatch.setattr(following, "why_strange", lambda *_: "")
+        moving = replace(NOTHING, words="it moves", is_doubt=True)
+        monkeypatch.setattr(
+            slam.foreign,
+            "moves",
+            lambda _: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NOTHING,
+        )
+    grown: list[int] = []
+    states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
+    assert State.UNCERTAIN in states
+    assert len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) == 1
+
+
+def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    walk = Walk(arc(60)[:36])
+    slam = doubting(monkeypatch, range(22, 60))
+    states = shown(slam, walk)
+    before = slam.map.num_keyframes
+    slam.conclude()
+    assert states[-1] is State.UNCERTAIN
+    assert len(slam.trajectory()) == len(walk)
+    assert slam.map.num_keyframes == before
+    assert walk.groundtruth is not None
+    assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
+
+
+def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
+    """No world may begin before frame `LATE`: what comes before waits for the way back."""
+    beginning = slam._following.beginning
+    step = beginning.step
+    monkeypatch.setattr(beginning, "step", lambda view: "wait" if view.index < LATE else step(view))
+
+
+def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
+    starting_late(monkeypatch, slam)
+    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    shown(slam, walk)
+    assert len(slam.trajectory()) == len(walk)
+    assert int(slam.map.keyframes["frame_index"].min()) < LATE
+    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert walk.groundtruth is not None
+    assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
+
+
+def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
+    starting_late(monkeypatch, slam)
+    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    grown: list[int] = []
+
+    def why_unsound(*_: object) -> str:
+        grown.append(slam.map.num_keyframes)
+        return "off" if len(grown) > LATE // 2 else ""
+
+    monkeypatch.setattr(backwards, "why_unsound", why_unsound)
+    shown(slam, walk)
+    assert grown[-1] > grown[0]
+    first = int(slam.map.keyframes["frame_index"][0])
+    assert first >= LATE
+    assert int(slam.map.keyframes["frame_index"].min()) == first
+    assert int(slam.history.frames["frame_index"].min()) == first
+    assert len(slam.memory.places) == slam.map.num_keyframes
+
+
+@pytest.mark.parametrize(("end", "posed"), [(SLAM.conclude, 36), (SLAM.settle, 22)])
+def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
+    end: Callable[[SLAM], None], posed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was mapped on trial is kept before the way back adds to the map."""
+    walk = Walk(arc(60)[:36])
+    slam = doubting(monkeypatch, range(22, 60))
+    starting_late(monkeypatch, slam)
+    shown(slam, walk)
+    assert slam.youth is not None
+    assert slam.map.num_keyframes > len(slam.memory.places)
+    end(slam)
+    assert len(slam.trajectory()) == posed
+    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert int(slam.map.keyframes["frame_index"].min()) < LATE
+
+
+def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
+    monkeypatch.setattr(probation, "MOST", 5)
+    walk = Leaving(arc(60)[:40], 34)
+    slam = doubting(monkeypatch, range(22, 60))
+    states = shown(slam, walk)
+    assert states[22:34] == [State.UNCERTAIN] * 12
+    assert states[34:] == [State.LOST] * 6
+    assert slam.history.frames["frame_index"].tolist() == list(range(32))
+    assert int(slam.map.keyframes["frame_index"].max()) < 32
+    assert len(slam.memory.places) == slam.map.num_keyframes
+
+
+def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A keyframe whose adjustment is taken over without a look back, as before the first keyframe on trial."""
+    slam, walk = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED)), Walk(arc(60)[:40])
+    frames = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk)
+    for index in range(len(walk)):
+        slam.step(frames[index])
+        newest = slam.map.num_keyframes - 1
+        if slam.mapper.adjusting and slam.memory.looks_known == (slam.map.key(newest), False):
+            break
+    else:
+        pytest.fail("no keyframe was asked about")
+    asked: list[int] = []
+    recognizer, world = slam.memory.recognizer, slam.world
+    assert world is not None
+    monkeypatch.setattr(recognizer, "recognize", lambda _, keyframe: asked.append(keyframe))
+    slam._following.loop_closing.look_back(world)
+    assert not asked  # it is known already
+    slam.memory.looks_known = -1, False
+    slam._following.loop_closing.look_back(world)
+    assert asked == [newest]

@@ -1,0 +1,218 @@
+"""What moves by itself is found, followed and left out; the scene is not, and the two are not taken for each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, pose
+from torchslam.config import IndependentMotionConfig, MatchingConfig
+from torchslam.geometry import se3_inverse
+from torchslam.tracking.dynamic.independent_motion import IndependentMotion, Movement
+from torchslam.types import Tracked, View
+
+SCENE = Scene.of(200)
+NEAR = Scene.of(60, seed=1, depth=2.0, width=0.8)  # a thing: a sixth of the image's width
+EVERY = IndependentMotionConfig().frames
+DEPTH = 4.0
+
+
+def camera_at(index: int) -> Tensor:
+    """(4, 4) T_cw of a camera that goes to the right and turns a little."""
+    return pose(-0.04 * index, 0, 0, 0, 0.004 * index)
+
+
+def thing_at(index: int, speed: float) -> Tensor:
+    """(4, 4) from where the thing was first to where it is now: it falls."""
+    return pose(-0.4, -0.3 + speed * index, 0)
+
+
+def joined(one: View, other: View) -> View:
+    """The keypoints of both."""
+    columns = ("keypoints", "scales", "angles", "descriptors", "mask")
+    return replace(one, **{name: torch.cat([getattr(one, name), getattr(other, name)]) for name in columns})
+
+
+def frame(index: int, speed: float = 0.03, thing: Scene = NEAR, scene: Scene = SCENE) -> View:
+    """The scene first, then the thing before it, which moves by `speed` a frame."""
+    T_cw = camera_at(index)
+    behind, before = scene.view(index, T_cw), thing.view(index, T_cw @ thing_at(index, speed))
+    box = before.keypoints[before.mask]
+    hidden = ((behind.keypoints > box.amin(0)) & (behind.keypoints < box.amax(0))).all(-1)
+    return joined(replace(behind, mask=behind.mask & ~hidden), before)
+
+
+def is_thing(view: View, scene: Scene = SCENE) -> Tensor:
+    return torch.arange(len(view.mask)) >= len(scene)
+
+
+def tracked(view: View, T_cw: Tensor, keypoints: Tensor) -> Tracked:
+    return Tracked(T_cw, keypoints, keypoints, len(keypoints), torch.eye(6).double(), DEPTH)
+
+
+def watcher(**settings: float) -> IndependentMotion:
+    return IndependentMotion(CAMERA, replace(IndependentMotionConfig(), **settings), MatchingConfig())
+
+
+def watched(
+    by: IndependentMotion, views: list[View], T_cw: Tensor | None = None
+) -> Iterator[tuple[View, View, Movement]]:
+    """Each view, what is left of it, and what is said; the scene is what agrees with the pose."""
+    for view in views:
+        cleared = by.clear_of(view)
+        agrees = torch.nonzero(cleared.mask & ~is_thing(view))[:, 0]
+        pose_now = camera_at(view.index) if T_cw is None else T_cw
+        yield view, cleared, by.observe(view, tracked(view, pose_now, agrees))
+
+
+def test_what_moves_is_found_when_two_looks_differ_and_then_left_out() -> None:
+    by = watcher()
+    for view, cleared, said in watched(by, [frame(index) for index in range(3 * EVERY)]):
+        left_out = view.mask & ~cleared.mask
+        assert not (left_out & ~is_thing(view)).float().mean() > 0.02  # some of the scene is close beside it
+        if view.index == EVERY:
+            assert said.words == f"{int(said.words.split()[0])} keypoints move by themselves and are left out"
+            assert 40 <= int(said.words.split()[0]) <= 75
+        if view.index <= EVERY:
+            assert not left_out.any()
+        else:
+            assert (left_out & is_thing(view)).sum() > 0.75 * (view.mask & is_thing(view)).sum()
+        assert not said.is_doubt
+
+
+def test_a_thing_that_stands_still_is_scene() -> None:
+    by = watcher()
+    for view, cleared, said in watched(by, [frame(index, speed=0.0) for index in range(3 * EVERY)]):
+        assert said == Movement()
+        assert torch.equal(cleared.mask, view.mask)
+
+
+@pytest.mark.parametrize("depth", [0.6, 1.0, 20.0])
+def test_near_and_far_is_not_moving(depth: float) -> None:
+    """Whatever its depth, a point of the scene lies where a point of the scene can be."""
+    other = Scene.of(60, seed=2, depth=depth, width=0.4 * depth)
+    by = watcher()
+    for index in range(2 * EVERY):
+        view = joined(SCENE.view(index, camera_at(index)), other.view(index, camera_at(index)))
+        by.clear_of(view)
+        assert by.observe(view, tracked(view, camera_at(index), torch.arange(50))) == Movement()
+
+
+def test_the_least_error_decides() -> None:
+    """A thing that falls by 3 px from look to look is none for a threshold of 4 of its scales, and one of 1."""
+    speed = 3.0 / EVERY / 100.0  # 100 px a unit at its depth
+    for least, found in ((4.0, False), (0.5, True)):
+        by = watcher(min_error_px=least)
+        views = [frame(index, speed) for index in range(EVERY + 1)]
+        *_, (_, _, said) = watched(by, views)
+        assert bool(said.words) is found
+
+
+def test_fewer_than_the_least_number_of_matches_are_chance() -> None:
+    few = Scene.of(19, seed=1, depth=2.0, width=0.8)
+    for least, found in ((20, False), (15, True)):
+        by = watcher(min_matches=least)
+        *_, (_, _, said) = watched(by, [frame(index, thing=few) for index in range(EVERY + 1)])
+        assert bool(said.words) is found
+
+
+def test_strays_that_go_each_their_way_are_no_group() -> None:
+    """Keypoints that jump about are wrong matches; of what misses the scene, half must move as one."""
+    by = watcher()
+    for index in range(2 * EVERY):
+        view = frame(index)
+        jumps = 40 * torch.randn(len(view.mask), 2, generator=torch.Generator().manual_seed(index)).double()
+        view = replace(
+            view,
+            keypoints=torch.where(is_thing(view)[:, None], view.keypoints + jumps, view.keypoints),
+        )
+        by.clear_of(view)
+        assert not by.observe(view, tracked(view, camera_at(index), torch.arange(50))).words
+
+
+def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
+    by = watcher()
+    *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
+    for index in range(2 * EVERY, 6 * EVERY):
+        view = frame(index)
+        left_out = view.mask & ~by.clear_of(view).mask
+        assert (left_out & is_thing(view)).sum() > 0.8 * (view.mask & is_thing(view)).sum()
+        assert (left_out & ~is_thing(view)).sum() < 0.2 * view.mask.sum()
+
+
+def test_it_is_given_up_when_it_was_not_seen_to_move_for_long() -> None:
+    for limit, kept in ((2, False), (100, True)):
+        by = watcher(max_unseen=limit)
+        *_, _ = watched(by, [frame(index) for index in range(EVERY + 1)])
+        for index in range(EVERY + 1, EVERY + 4):
+            cleared = by.clear_of(frame(index))
+        assert bool((~cleared.mask & frame(index).mask).any()) is kept
+
+
+def test_it_is_given_up_when_it_has_gone() -> None:
+    by = watcher()
+    *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
+    alone = SCENE.view(2 * EVERY, camera_at(2 * EVERY))
+    assert torch.equal(by.clear_of(alone).mask, alone.mask)
+
+
+def test_what_has_more_of_the_image_than_the_map_is_not_left_out_but_doubted() -> None:
+    """The map followed the thing: the rest moves against it, in most of the image."""
+    by = watcher()
+    for index in range(EVERY + 1):
+        view = frame(index, speed=0.1)
+        cleared = by.clear_of(view)
+        T_cw = camera_at(index) @ thing_at(index, 0.1)
+        said = by.observe(view, tracked(view, T_cw, torch.nonzero(is_thing(view))[:, 0]))
+    assert said.is_doubt
+    assert "move against the map" in said.words
+    assert torch.equal(cleared.mask, view.mask)
+    assert torch.equal(by.clear_of(view).mask, view.mask)
+
+
+def test_a_map_that_goes_over_to_what_was_known_to_move_is_doubted() -> None:
+    by = watcher()
+    *_, _ = watched(by, [frame(index) for index in range(2 * EVERY + 1)])
+    doubts = []
+    for index in range(2 * EVERY + 1, 4 * EVERY + 1):
+        view = frame(index)
+        by.clear_of(view)
+        # The pose is relative to the thing from here on, without a jump.
+        T_cw = camera_at(index) @ thing_at(index, 0.03) @ se3_inverse(thing_at(2 * EVERY, 0.03))
+        doubts.append(by.observe(view, tracked(view, T_cw, torch.arange(len(SCENE)))).is_doubt)
+    assert any(doubts)
+
+
+def test_where_most_of_the_image_moves_the_pose_is_doubted() -> None:
+    by = watcher()
+    *_, (view, _, said) = watched(by, [frame(index) for index in range(EVERY + 1)])
+    assert not said.is_doubt
+    cell = torch.nonzero(view.mask & ~is_thing(view))[:1, 0]  # one keypoint agrees with the map
+    assert by.observe(view, tracked(view, camera_at(view.index), cell)).is_doubt
+    assert not watcher(max_share=100.0).observe(view, tracked(view, camera_at(0), cell)).is_doubt
+
+
+def test_poses_of_two_worlds_are_not_compared() -> None:
+    by = watcher()
+    for index in range(2 * EVERY):
+        view = frame(index)
+        by.clear_of(view)
+        if index == EVERY - 1:
+            by.forget_last()
+        said = by.observe(
+            view, tracked(view, camera_at(index) @ pose(3.0 * (index >= EVERY), 0, 0), torch.arange(50))
+        )
+        assert said == Movement()
+
+
+def test_frames_of_another_session_are_not_compared() -> None:
+    by = watcher()
+    for index in range(EVERY + 1):
+        view = replace(frame(index), session=int(index == EVERY))
+        by.clear_of(view)
+        said = by.observe(view, tracked(view, camera_at(index), torch.arange(50)))
+    assert said == Movement()

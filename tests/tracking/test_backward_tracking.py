@@ -1,0 +1,143 @@
+"""The way back: who is posed, and where it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import replace
+from itertools import count
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, pose, sideways, world_in
+from torchslam.config import Config, JudgeConfig
+from torchslam.map.submap import World
+from torchslam.tracking import backward_tracking as backwards
+from torchslam.tracking.backward_tracking import MISSES, track_back
+from torchslam.tracking.pose_confirmation import Held
+from torchslam.tracking.tracker import Tracker
+from torchslam.types import Tracked, View
+
+SCENE = Scene.of(300)
+AWAY = pose(0, 0, 0, 0, 3.0)  # looks back: sees nothing
+
+
+class Ledger:
+    """What was taken or kept, what was mapped on trial, and how often that was dropped."""
+
+    def __init__(self) -> None:
+        self.taken: dict[int, Tensor] = {}
+        self.tried: list[int] = []
+        self.dropped = 0
+
+    def take(self, world: World, view: View, tracked: Tracked) -> None:
+        self.taken[view.index] = tracked.T_cw
+
+    def try_out(self, world: World, view: View, tracked: Tracked) -> bool:
+        self.tried.append(view.index)
+        return False
+
+    def keep(self, world: World, held: list[Held]) -> None:
+        for view, tracked, T_cr, reference in held:
+            self.taken[view.index] = tracked.T_cw
+            torch.testing.assert_close(T_cr @ world.map.T_cw[reference], tracked.T_cw)
+
+    def drop(self, world: World) -> None:
+        self.dropped += 1
+
+
+def walked(T_cw: Tensor, judge: JudgeConfig | None = None, noise: float = 0.0) -> Ledger:
+    """What became of cameras at T_cw (F, 4, 4), the first the one before the world's first keyframe, frame 100."""
+    world = world_in(SCENE, sideways(4), first=100)
+    config = replace(Config(), judge=judge or JudgeConfig())
+    tracker, ledger = Tracker(CAMERA, config), Ledger()
+    tracker.follow(world, 0)
+    views = [SCENE.view(99 - offset, T, noise=noise) for offset, T in enumerate(T_cw)]
+    posed = track_back(tracker, world, views, config, ledger)
+    assert [view.index for view in posed] == list(ledger.taken)
+    return ledger
+
+
+def back(
+    T_cw: Tensor, judge: JudgeConfig | None = None, noise: float = 0.0
+) -> tuple[list[int], dict[int, Tensor]]:
+    """Frames posed, and where; see `walked`."""
+    taken = walked(T_cw, judge, noise).taken
+    return list(taken), taken
+
+
+def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
+    """The frames that come as these to be judged, from the first on, seem strange."""
+    asked = count()
+    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd" if next(asked) in doubtful else "")
+
+
+def test_frames_before_the_map_get_their_true_poses() -> None:
+    T_cw = sideways(6, -0.05, start=-0.05)
+    posed, poses = back(T_cw)
+    assert posed == [99, 98, 97, 96, 95, 94]
+    for index, found in poses.items():
+        torch.testing.assert_close(found, T_cw[99 - index], atol=1e-7, rtol=0)
+
+
+def test_a_few_frames_that_see_nothing_are_passed_over() -> None:
+    T_cw = sideways(12, -0.02, start=-0.02)
+    T_cw[2 : 2 + MISSES - 1] = AWAY
+    T_cw[8 : 8 + MISSES - 1] = AWAY
+    assert back(T_cw)[0] == [99, 98, 93, 92]
+
+
+def test_many_frames_that_see_nothing_end_the_way() -> None:
+    T_cw = sideways(10, -0.02, start=-0.02)
+    T_cw[1 : 1 + MISSES] = AWAY
+    assert back(T_cw)[0] == [99]
+
+
+def test_frames_whose_poses_are_not_sound_are_not_taken() -> None:
+    T_cw = sideways(3, -0.05, start=-0.05)
+    assert back(T_cw, noise=0.5)[0] == [99, 98, 97]
+    assert back(T_cw, JudgeConfig(max_rotation_std_deg=1e-6), noise=0.5)[0] == []
+
+
+def test_a_jump_from_where_the_motion_leads_is_doubted() -> None:
+    T_cw = sideways(4, -0.05, start=-0.05)
+    # the first frame has no motion to be compared with; the motion from the first to the third is too large
+    judge = JudgeConfig(max_jump=0.03)
+    T_cw[2:] = sideways(2, -0.05, start=-0.5)
+    assert back(T_cw, judge)[0] == [99, 98]
+
+
+def test_strange_frames_are_kept_where_the_way_leads_to_the_earliest_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    doubting(monkeypatch, range(2, 100))
+    T_cw = sideways(10, -0.02, start=-0.02)
+    ledger = walked(T_cw)
+    assert list(ledger.taken) == list(range(99, 89, -1))
+    assert ledger.tried == list(range(97, 89, -1))
+    assert not ledger.dropped
+    torch.testing.assert_close(ledger.taken[90], T_cw[9], atol=1e-7, rtol=0)
+
+
+def test_strange_frames_are_not_kept_where_the_way_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    doubting(monkeypatch, range(2, 100))
+    T_cw = sideways(12, -0.02, start=-0.02)
+    T_cw[6 : 6 + MISSES] = AWAY
+    ledger = walked(T_cw)
+    assert list(ledger.taken) == [99, 98]
+    assert ledger.dropped == 1
+
+
+def test_strange_frames_are_kept_once_as_many_certain_ones_as_are_asked_for_follow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = JudgeConfig().confirmations
+    T_cw = sideways(15, -0.02, start=-0.02)
+    for certain, posed in ((asked - 1, [99]), (asked, list(range(99, 96 - asked, -1)))):
+        doubting(monkeypatch, {1, 2})
+        away = T_cw.clone()
+        away[3 + certain : 3 + certain + MISSES] = AWAY
+        ledger = walked(away)
+        assert list(ledger.taken) == posed
+        assert ledger.tried == list(range(98, 96 - certain, -1))

@@ -1,0 +1,128 @@
+"""Who is held back, for how long, and what is given free again."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.map.simulated import tracked_at
+from tests.scene import Scene, pose
+from torchslam.config import Config, load_config
+from torchslam.map.tracking_state import Track
+from torchslam.tracking.pose_confirmation import Probation
+from torchslam.types import Tracked, View
+
+SCENE = Scene.of(10)
+
+
+def frame(index: int) -> tuple[View, Tracked, Track]:
+    track = Track.nowhere(torch.zeros(1, dtype=torch.float64))
+    track.T_cr, track.reference = pose(0.1 * index), 100 + index
+    return SCENE.view(index, pose()), tracked_at(pose(index), torch.arange(5), torch.arange(5)), track
+
+
+def test_nothing_is_held_at_first() -> None:
+    probation = Probation(Config())
+    assert not probation
+    assert not probation.came_back
+    assert probation.views() == []
+
+
+def test_two_certain_frames_confirm_a_doubtful_one() -> None:
+    probation = Probation(Config())
+    probation.hold(*frame(0), "odd")
+    assert probation
+    assert probation.reason == "to be confirmed by 2 more frames"
+    probation.hold(*frame(1), "")
+    assert probation
+    assert probation.reason == "to be confirmed by 1 more frames"
+    probation.hold(*frame(2), "")
+    assert not probation
+    assert not probation.came_back
+    assert [view.index for view in probation.views()] == [0, 1, 2]
+
+
+def test_another_doubt_begins_the_count_again() -> None:
+    probation = Probation(Config())
+    for index, doubt in enumerate(["odd", "", "odd", ""]):
+        probation.hold(*frame(index), doubt)
+        assert probation
+    probation.hold(*frame(4), "")
+    assert not probation
+
+
+def test_what_came_back_needs_more_confirmations() -> None:
+    probation = Probation(load_config(None, ["relocalization.confirmations=3"]))
+    probation.come_back(*frame(0))
+    assert probation
+    assert probation.came_back
+    assert probation.reason == "to be confirmed by 3 more frames"
+    probation.hold(*frame(1), "")
+    probation.hold(*frame(2), "odd")
+    assert probation.reason == "to be confirmed by 3 more frames"
+    for index in (3, 4):
+        probation.hold(*frame(index), "")
+        assert probation
+    probation.hold(*frame(5), "")
+    assert not probation
+    assert [view.index for view in probation.views()] == [0, 1, 2, 3, 4, 5]
+
+
+def test_coming_back_forgets_what_was_held_before() -> None:
+    probation = Probation(Config())
+    probation.hold(*frame(7), "odd")
+    probation.come_back(*frame(8))
+    assert [view.index for view in probation.views()] == [8]
+
+
+def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
+    probation = Probation(Config())
+    frames = [frame(index) for index in range(3)]
+    probation.come_back(*frames[0])
+    for held in frames[1:]:
+        probation.hold(*held, "odd")
+    released = probation.release()
+    assert not probation
+    assert probation.views() == []
+    assert [one[0] for one in released] == [view for view, _, _ in frames]
+    assert [one[1] for one in released] == [tracked for _, tracked, _ in frames]
+    assert all(torch.equal(one[2], track.T_cr) for one, (_, _, track) in zip(released, frames, strict=True))
+    assert [one[3] for one in released] == [100, 101, 102]
+
+
+def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
+    probation = Probation(Config())
+    probation.hold(*frame(0), "odd")
+    probation.hold(*frame(1), "")
+    assert [held[0].index for held in probation.hand_over()] == [0, 1]
+    assert probation.views() == []
+    assert probation.reason == "to be confirmed by 1 more frames"
+    probation.hold(*frame(2), "")
+    assert not probation
+    assert [held[0].index for held in probation.release()] == [2]
+
+
+def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_ones() -> None:
+    probation = Probation(Config())
+    for index in range(5):
+        probation.hold(*frame(index), "odd", is_mapped=index > 2)
+    assert probation.reason == "to be confirmed by 5 more frames"
+    for index in range(5, 9):
+        probation.hold(*frame(index), "", is_mapped=True)
+        assert probation
+    probation.hold(*frame(9), "", is_mapped=True)
+    assert not probation
+    probation.release()
+    probation.hold(*frame(10), "odd", is_mapped=True)  # who was believed begins anew
+    assert probation.reason == "to be confirmed by 2 more frames"
+
+
+def test_no_more_than_so_many_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.tracking.pose_confirmation.MOST", 3)
+    probation = Probation(Config())
+    for index in range(3):
+        assert not probation.is_full
+        probation.hold(*frame(index), "odd")
+    assert probation.is_full
+    probation.hand_over()
+    assert not probation.is_full

@@ -1,0 +1,117 @@
+"""Every threshold from both sides: a pose just inside is believed, one just outside is not, and says why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.map.simulated import tracked_at
+from tests.scene import pose
+from torchslam.config import JudgeConfig
+from torchslam.geometry import se3_exp
+from torchslam.map.tracking_state import Track
+from torchslam.tracking.pose_validation import deviations, jump, why_doubt
+from torchslam.types import Tracked
+
+SETTINGS = JudgeConfig()
+HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
+
+
+def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> Tracked:
+    return tracked_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
+
+
+def doubt(
+    tracked: Tracked, expected: Tensor | None = None, error: float = 0.9, explained: float = 1.0
+) -> str:
+    track = replace(Track.nowhere(HERE), error=error, explained=explained)
+    return why_doubt(tracked, expected, track, SETTINGS)
+
+
+def test_a_certain_pose_is_believed() -> None:
+    assert doubt(seen()) == ""
+    assert doubt(seen(), HERE) == ""
+
+
+def test_half_of_the_matches_must_agree() -> None:
+    assert doubt(seen(30, 60)) == ""
+    assert doubt(seen(29, 60)) == "only 48% of 60 matches agree with the pose"
+    assert doubt(seen(1, 1)) == ""
+    assert doubt(seen(0, 0)).startswith("only 0% of 0")
+
+
+def test_errors_over_many_frames_must_be_noise() -> None:
+    assert doubt(seen(), error=SETTINGS.max_error - 0.01) == ""
+    assert doubt(seen(), error=SETTINGS.max_error) == ""
+    assert doubt(seen(), error=9.0).startswith("the matches of the last frames are off by 3.0 times")
+
+
+def test_enough_of_the_image_must_show_what_is_expected() -> None:
+    assert doubt(seen(coverage=SETTINGS.min_coverage)) == ""
+    assert doubt(seen(coverage=SETTINGS.min_coverage - 0.01)).startswith("only 19% of the image")
+
+
+def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
+    least = SETTINGS.min_explained
+    assert doubt(seen(), explained=least) == ""
+    assert doubt(seen(explained=0.0)) == ""  # one frame alone proves nothing
+    assert doubt(seen(), explained=least - 0.01).startswith(
+        f"the map explains only {least - 0.01:.0%} of the image"
+    )
+
+
+def covariance(position: float = 0.0, rotation: float = 0.0) -> Tensor:
+    """Of so much standard deviation along one axis each."""
+    return torch.diag(torch.tensor([0, position, 0, 0, 0, rotation], dtype=torch.float64) ** 2)
+
+
+def test_deviations_are_in_units_of_the_depth_and_degrees() -> None:
+    every = torch.diag(torch.tensor([0.01, 0.02, 0.02, 0.003, 0.006, 0.006], dtype=torch.float64) ** 2)
+    position, rotation = deviations(seen(covariance=every, depth=2.0))
+    assert position == pytest.approx(0.015)
+    assert rotation == pytest.approx(math.degrees(0.009))
+
+
+def test_the_position_must_be_known_in_units_of_the_depth() -> None:
+    limit = SETTINGS.max_position_std
+    assert doubt(seen(covariance=covariance(2.99 * limit), depth=3.0)) == ""
+    assert doubt(seen(covariance=covariance(3.01 * limit), depth=3.0)).startswith(
+        "the position is known to 0.017"
+    )
+
+
+def test_the_rotation_must_be_known() -> None:
+    limit = math.radians(SETTINGS.max_rotation_std_deg)
+    assert doubt(seen(covariance=covariance(rotation=0.99 * limit))) == ""
+    assert "the rotation is known to 0.91 degrees" in doubt(
+        seen(covariance=covariance(rotation=1.01 * limit))
+    )
+
+
+def test_the_motion_must_be_possible() -> None:
+    side = pose(2.0)  # half the depth
+    assert doubt(seen(), pose(1.99) @ HERE) == ""
+    assert doubt(seen(), pose(2.01) @ HERE) == "jumped by 0.50 of the scene's depth and 0 degrees"
+    assert doubt(seen(depth=3.9), side @ HERE).startswith("jumped by 0.51")
+    turn = math.radians(SETTINGS.max_turn_deg)
+    assert doubt(seen(), pose(0, 0, 0, 0.99 * turn) @ HERE) == ""
+    assert (
+        doubt(seen(), pose(0, 0, 0, 1.01 * turn) @ HERE)
+        == "jumped by 0.00 of the scene's depth and 20 degrees"
+    )
+
+
+def test_a_jump_is_measured_in_the_camera_that_made_it() -> None:
+    tangent = torch.tensor([0.3, -0.1, 0.5, 0.0, 0.0, 0.4], dtype=torch.float64)
+    expected = se3_exp(-tangent) @ HERE
+    moved, turned = jump(seen(depth=0.5), expected)
+    assert moved == pytest.approx(float(se3_exp(tangent)[:3, 3].norm()) / 0.5, rel=1e-9)
+    assert turned == pytest.approx(math.degrees(0.4))
+
+
+def test_a_scene_without_depth_is_never_certain() -> None:
+    assert doubt(replace(seen(), depth=0.0)).startswith("the position")

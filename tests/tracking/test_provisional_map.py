@@ -1,0 +1,106 @@
+"""When two frames alone contradict a young world, and when they do not."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.scene import CAMERA, Scene, pose, world_in
+from torchslam.config import Config
+from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
+from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.provisional_map import INTERVAL, LEAST_SUPPORT, Youth, support
+from torchslam.types import Start, View
+
+SCENE = Scene.of(400)
+SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
+THRESHOLD = Config().initialization.threshold_px
+
+
+def swung(degrees: float) -> Tensor:
+    """(4, 4) SIDE as it would be had the camera moved in a direction that much higher."""
+    T_cw = SIDE.clone()
+    turn = so3_exp(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
+    T_cw[:3, 3] = T_cw[:3, :3] @ turn @ se3_inverse(SIDE)[:3, 3] * -1
+    return T_cw
+
+
+def young(T_cw: Tensor, age: int = INTERVAL) -> Youth:
+    """A world with a frame at the origin and one at SIDE that the map has at T_cw, in a frame of its own."""
+    world = world_in(SCENE, torch.stack([pose(), SIDE]))
+    own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
+    world.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
+    youth = Youth(world, [SCENE.view(0, pose())])
+    youth.grow(SCENE.view(1, SIDE))
+    youth.age = age
+    return youth
+
+
+def two_views() -> Start:
+    initializer = Initializer(CAMERA, Config())
+    initializer.step(SCENE.view(0, pose()))
+    start, reason = initializer.step(SCENE.view(1, SIDE))
+    assert start is not None, reason
+    return start
+
+
+def supported(start: Start, T_21: Tensor) -> float:
+    pixels_1 = start.reference.keypoints[start.keypoints_1]
+    return support(pixels_1, start.view.keypoints[start.keypoints_2], T_21, CAMERA, THRESHOLD)
+
+
+def test_a_world_that_has_the_camera_where_it_was_has_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert young(SIDE).rival(CAMERA, Config()) is None
+    looked: list[View] = []
+    monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view) or (None, ""))
+    assert young(SIDE).rival(CAMERA, Config()) is None
+    assert not looked  # it explains more than half of the matches: no motion can have twice as much support
+    assert young(swung(60)).rival(CAMERA, Config()) is None
+    assert len(looked) == 2
+
+
+def test_the_rival_of_a_wrong_world_has_the_right_motion() -> None:
+    start = young(swung(60)).rival(CAMERA, Config())
+    assert start is not None
+    wanted = SIDE.clone()
+    wanted[:3, 3] /= SIDE[:3, 3].norm()
+    torch.testing.assert_close(start.T_cw, wanted, atol=1e-6, rtol=0)
+    assert (start.reference.index, start.view.index) == (0, 1)
+
+
+@pytest.mark.parametrize("age", range(1, 2 * INTERVAL + 1))
+def test_every_few_frames_are_looked_at(age: int) -> None:
+    assert (young(swung(60), age).rival(CAMERA, Config()) is not None) is (age % INTERVAL == 0)
+
+
+def test_frames_that_make_no_start_contradict_nothing() -> None:
+    youth = young(swung(60))
+    youth.views[1] = SCENE.view(1, pose())
+    assert youth.rival(CAMERA, Config()) is None
+
+
+def test_a_world_is_contradicted_when_it_has_less_than_half_of_the_support() -> None:
+    start, decided = two_views(), set()
+    for degrees in torch.linspace(2.5, 4.5, 21).tolist():
+        T_21 = swung(degrees)
+        share = supported(start, T_21) / supported(start, start.T_cw)
+        contradicted = young(T_21).rival(CAMERA, Config()) is not None
+        assert contradicted is (share < LEAST_SUPPORT)
+        if abs(share - 0.5) < 0.1:
+            decided.add(contradicted)
+    assert decided == {True, False}
+
+
+def test_support_falls_with_the_square_of_the_error_and_ends_at_the_threshold() -> None:
+    start = two_views()
+    T_21 = swung(5)
+    assert supported(start, start.T_cw) == pytest.approx(len(start.points_w), abs=1e-4)
+    pixels_1 = start.reference.keypoints[start.keypoints_1]
+    pixels_2 = start.view.keypoints[start.keypoints_2]
+    errors = epipolar_offsets(T_21, pixels_1, pixels_2, CAMERA, CAMERA)[0].abs()
+    wanted = sum(1 - (e / THRESHOLD) ** 2 for e in errors.tolist() if e < THRESHOLD)
+    assert 0 < wanted < len(start.points_w)
+    assert supported(start, T_21) == pytest.approx(wanted)

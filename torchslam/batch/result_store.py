@@ -1,0 +1,115 @@
+"""Results that are there whole or not at all, with the record of what they are the results of.
+
+In the folder of a batch: `runs/NAME/` has what a run wrote, with its record; `errors/NAME.json` says why there is none.
+"""
+
+from __future__ import annotations
+
+import json
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from torchslam.errors import ResultsError, TorchslamError
+from torchslam.utils.atomic_write import whole_folder, write_whole
+from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
+
+RUNS = "runs"
+ERRORS = "errors"
+RECORD = "row.json"
+DONE = "done"
+NO_MAP = "no map"
+ERROR = "error"
+OPEN = "open"
+"""The status of a row: with a map, without one and why, not run because of an error, not yet run."""
+Columns = dict[str, Any]
+
+
+def keep(
+    output: Path,
+    name: str,
+    marks: Callable[[], Columns],
+    work: Callable[[Path], Columns],
+    overwrite: bool = False,
+) -> Columns:
+    """Do the work unless its results are there; returns its columns, with `is_new` whether it was done now.
+
+    marks:     hashes of what the results depend on, `configuration` and `input`
+    work:      writes into a folder, which is given its place when all is written, and returns columns as JSON has them
+    overwrite: replace results that have other marks; otherwise they are an error
+
+    No Exception leaves it: it becomes the columns `status` and `error`, and is kept in `errors/`, with its traceback
+    where nobody raised it on purpose. What failed is tried again by the next call. KeyboardInterrupt and SystemExit
+    pass, and leave nothing.
+    """
+    known: Columns = {"name": name, "configuration": ""}
+    place = output / RUNS / name
+    try:
+        known |= marks()
+        record = read_record(place / RECORD)
+        if record is not None and all(record.get(key) == value for key, value in known.items()):
+            return record | {"is_new": False}
+        if record is None and place.exists():
+            raise ResultsError(f"{place}: something else than results of a batch: move it away")
+        if record is not None and not overwrite:
+            raise ResultsError(
+                f"{place}: results of another configuration, input or version of the program: "
+                "--overwrite gives them up"
+            )
+        with whole_folder(place) as folder:
+            columns = known | work(folder)
+            _write(folder / RECORD, columns)
+        (output / ERRORS / f"{name}.json").unlink(missing_ok=True)
+        return columns | {"is_new": True}
+    except Exception as error:
+        is_meant = isinstance(error, TorchslamError | OSError)
+        return failed(output, known, _in_words(error), "" if is_meant else traceback.format_exc())
+
+
+def failed(output: Path, known: Columns, words: str, trace: str = "") -> Columns:
+    """The columns of what ended with an error, which are kept where that can be done."""
+    columns = known | {"status": ERROR, "error": words}
+    try:
+        (output / ERRORS).mkdir(parents=True, exist_ok=True)
+        _write(output / ERRORS / f"{known['name']}.json", columns | {"traceback": trace})
+    except OSError as error:
+        columns["error"] += f"; and this could not be written: {error}"
+    return columns | {"is_new": True}
+
+
+def read_kept(output: Path, name: str, configuration: str) -> Columns:
+    """What is known of a name: the record of its results, or why there are none, of this configuration; else `open`."""
+    for path in (output / RUNS / name / RECORD, output / ERRORS / f"{name}.json"):
+        record = read_record(path)
+        if record is not None and record.get("configuration") == configuration:
+            return record
+    return {"name": name, "status": OPEN}
+
+
+def read_record(path: Path) -> Columns | None:
+    """The columns in a file; None where there is none. Raises ResultsError for something else."""
+    try:
+        record = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ResultsError(f"{path}: not valid JSON: {error}") from None
+    if not isinstance(record, dict) or not isinstance(record.get("status"), str):
+        raise ResultsError(f"{path}: not the record of a row")
+    return record
+
+
+def _write(path: Path, columns: Columns) -> None:
+    write_whole(path, (json.dumps(columns, indent=2) + "\n").encode())
+
+
+def _in_words(error: Exception) -> str:
+    """One line; of an error that nobody made on purpose, its kind and where it came from."""
+    if isinstance(error, TorchslamError | OSError):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text[:1000]} ({Path(place.filename).name}:{place.lineno})"

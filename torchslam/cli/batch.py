@@ -1,0 +1,145 @@
+"""Run many sequences, each once, with one table: alone, as shards of an array of jobs, or on Ray.
+
+LIST is a text with a path on each line (`#` for comments), or a CSV file with a header: `sequence`, and of `name`,
+`camera`, `config`, `overrides` (section.key=value; ...), `groundtruth` (TUM format), `start`, `stop`, `stride`, `fps`,
+`limit`, `resize` and `mask` those that differ from row to row; the options below say the rest. Names of files in it are
+relative to its folder.
+
+In DIR: runs/NAME/ with the results of each sequence, as `torchslam run` writes them but for times, which are in
+times.json; errors/NAME.json for those that failed; table.csv, table.parquet where pyarrow is installed, times.csv and
+table.png. One process or many, in one go or after having been killed: apart from times the same bytes. A sequence is
+run on one thread; what is there already, by settings, program, and names, sizes and times of change of the files below
+its path, is not run again. What failed is tried again by the next call.
+
+Several jobs may share DIR, each with its `--shard`; the table has the rows of all. In an array of jobs:
+  Slurm       sbatch --array=0-7 --wrap 'torchslam batch LIST -o DIR --shard auto'
+  Kubernetes  completionMode: Indexed, args: [batch, LIST, -o, DIR, --shard, $(JOB_COMPLETION_INDEX)/8]
+`--shard auto` reads SLURM_ARRAY_TASK_ID, _MIN, _MAX and _COUNT, or JOB_COMPLETION_INDEX and, set by yourself,
+JOB_COMPLETIONS. Without --shard no such variable is looked at.
+
+Exit status: 0 all sequences of this call are done ("no map" is a result), 4 some ended with an error, which the table
+says, 2 the batch could not be run; 130 and 143 ended by Ctrl-C and by SIGTERM: the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from torchslam.batch import DONE, ENGINES, ERROR, Columns, Engine, Task, parse_shard, read_list, run_batch
+from torchslam.batch.table import CSV, counts
+from torchslam.cli import arguments
+from torchslam.cli.signals import SIGNALS, STATUS
+
+ERRORS = 4
+READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("list", type=Path, metavar="LIST", help="which sequences: a text, or a CSV file")
+    parser.add_argument(
+        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for all results"
+    )
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace results of other settings, files or versions; else these are errors",
+    )
+    parser.add_argument(
+        "--no-pictures", action="store_true", help="no plots and no view.html for each sequence"
+    )
+    spread = parser.add_argument_group("who runs them")
+    spread.add_argument("--shard", metavar="I/N|auto", help="every N-th row from row I on; I counts from 0")
+    spread.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help="ray: Ray Data, extra `ray` (default: %(default)s)",
+    )
+    spread.add_argument(
+        "--address",
+        metavar="ADDRESS",
+        help="of a Ray cluster (auto, ray://HOST:10001) whose nodes have torchslam, and LIST's files and DIR at the "
+        "same places; without it a local one for this call",
+    )
+    spread.add_argument(
+        "--workers",
+        type=arguments.positive,
+        metavar="N",
+        help="of Ray, at a time (default: one per processor)",
+    )
+    arguments.add_reading(parser)
+    arguments.add_device(parser)
+    arguments.add_config(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    rows = [row.completed(_defaults(options)) for row in read_list(options.list)]
+    arguments.config(options)  # what is wrong with it is said once
+    output, device = str(options.output.absolute()), options.device
+    tasks = [Task(row, output, str(device), options.overwrite, not options.no_pictures) for row in rows]
+    engine = Engine(options.engine, options.workers, options.address, int(device.type == "cuda"))
+    shard = None if options.shard is None else parse_shard(options.shard)
+    with _stopping():
+        progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
+        found = run_batch(tasks, engine, shard, progress.tell)
+    new = sum(columns["is_new"] for columns in found)
+    print(f"{len(found)} sequences: {counts(found)}; {len(found) - new} of them were there before")
+    print(f"table: {options.output / CSV}")
+    return ERRORS if any(columns["status"] == ERROR for columns in found) else 0
+
+
+def _defaults(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say for all rows; names of files are relative to where the command was called."""
+    said = {name: getattr(options, name) for name in READING}
+    said["start"] = None if options.start == 0 else options.start
+    said["stride"] = None if options.stride == 1 else options.stride
+    said |= {"config": options.config, "overrides": tuple(arguments.overrides(options))}
+    for name in ("camera", "mask", "config"):
+        if said[name] is not None and Path(said[name]).exists():
+            said[name] = str(Path(said[name]).absolute())
+    return said
+
+
+class _Progress:
+    """A line on stderr for each sequence."""
+
+    def __init__(self, count: int) -> None:
+        self._count, self._done = count, 0
+
+    def tell(self, columns: Columns) -> None:
+        self._done += 1
+        words = columns["status"]
+        if columns["status"] == DONE:
+            words = f"{columns['posed']} of {columns['frames']} frames posed"
+            words += f", ATE {columns['ate_m']:.4f} m" if "ate_m" in columns else ""
+        elif columns["error"]:
+            words += f": {columns['error']}"
+        before = "" if columns["is_new"] else " (there before)"
+        print(
+            f"torchslam: {self._done}/{self._count} {columns['name']}: {words}{before}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+@contextmanager
+def _stopping() -> Iterator[None]:
+    """Inside, Ctrl-C and SIGTERM end at once: what is half-written goes, what is done stays."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        print("torchslam: stopped; the same command goes on", file=sys.stderr)
+        raise SystemExit(STATUS[signal.Signals(number)])
+
+    before = {number: signal.signal(number, end) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,248 @@
+"""Give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo.
+
+  colmap      sparse/0/ with the model, binary and text, and images/; keyframes, points, tracks
+  nerfstudio  transforms.json (OpenGL axes, z up), sparse_pc.ply and images/; keyframes, of which a slow camera has
+              few: --frames all gives a trainer more images
+  ply         the points in the colours of the images, the keyframes in red, z up
+  rerun       a recording (.rrd): points, path, every camera; images and keypoints of the keyframes, undistorted, z up
+  tum, kitti  every pose, camera to world: a file with times; a folder with poses.txt and times.txt
+
+Lengths are in map units. Up is the mean up direction of the keyframes' cameras: gravity is not known. Images are read
+again from the sequence that the run read.
+
+Then, for example, `ns-train splatfacto --data DIR/export/nerfstudio`, `train.py -s DIR/export/colmap` (3D Gaussian
+Splatting knows pinhole cameras alone: --undistort), `rerun DIR/export/recording.rrd`, `evo_traj tum
+DIR/export/trajectory.txt`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchslam.cli import arguments
+from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
+from torchslam.errors import ConfigError, ResultsError
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.conventions import upright_rotation
+from torchslam.io.export.colmap import colmap_camera, write_colmap
+from torchslam.io.export.images import WITHOUT, Images, open_images, write_images
+from torchslam.io.export.kitti import write_kitti
+from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
+from torchslam.io.export.ply import write_map_cloud
+from torchslam.io.export.recording import import_rerun, write_recording
+from torchslam.io.export.scene import Scene, scene_of
+from torchslam.io.export.undistortion import undistorted
+from torchslam.io.report import table
+from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
+from torchslam.map.file import read_worlds
+from torchslam.map.submap import World
+from torchslam.system.run import keyframe_rows, keyframe_trajectory
+from torchslam.types import Trajectory
+
+FOLDER = "export"  # in the folder of results
+MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats look for it
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be exported, and where to.
+
+    directory: of the results; figures: of the run, from there
+    world, camera: from its map
+    source:    what the images are read from, and
+    fps:       at what rate, where the run was told; None where they are not wanted, or nothing says where they are
+    undistort: whether images and keypoints are to be as of a pinhole camera
+    """
+
+    directory: Path
+    figures: dict[str, Any]
+    world: World
+    camera: Camera
+    output: Path
+    keyframes_alone: bool
+    undistort: bool
+    source: str | None
+    fps: float | None
+
+    @property
+    def session(self) -> int:
+        """Which run over the map it was."""
+        return int(self.figures["session"])
+
+    @property
+    def R_up(self) -> torch.Tensor:
+        """(3, 3) from the map's world to the upright one: the same for every format."""
+        return upright_rotation(se3_inverse(self.world.map.T_cw).double())
+
+    def scene(self) -> tuple[Scene, Images | None]:
+        """What is seen, and the images if they are wanted. Raises ResultsError where they are gone."""
+        scene = scene_of(self.world, self.camera, self.session, self.keyframes_alone)
+        images = None
+        if self.source is not None:
+            images = open_images(self.source, scene, self.undistort, self.fps)
+        return (undistorted(scene) if self.undistort else scene), images
+
+    def trajectory(self) -> Trajectory:
+        """The poses of the run in the world. Of all frames they are read: one that only localised is not in the map."""
+        if self.keyframes_alone:
+            return keyframe_trajectory(self.world.map, self.session)
+        is_main = self.world.number == self.figures["world"]
+        name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(self.world.number)
+        return read_trajectory(self.directory / name)
+
+
+@dataclass(frozen=True)
+class Target:
+    """write:     write it; returns what was written, label by label
+    name:         of its file or folder
+    is_of_images: whether images belong to it
+    keyframes:    whether it is of keyframes alone where nothing else is asked for
+    """
+
+    write: Callable[[Job], dict[str, str]]
+    name: str
+    is_of_images: bool
+    keyframes: bool
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+    parser.add_argument("--to", choices=TARGETS, required=True, help="for which program")
+    parser.add_argument(
+        "--output", "-o", type=Path, metavar="PATH", help=f"file or folder to write; default: in DIR/{FOLDER}"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    parser.add_argument(
+        "--frames", choices=("all", "keyframes"), help="which of the posed frames; default: see above"
+    )
+    parser.add_argument(
+        "--world", type=arguments.not_negative, metavar="N", help="another world than the main one"
+    )
+    parser.add_argument(
+        "--undistort", action="store_true", help="images and keypoints as of a pinhole camera (rerun: always)"
+    )
+    parser.add_argument(
+        "--sequence", metavar="PATH", help="where the sequence of the run is now, if it was moved"
+    )
+    parser.add_argument("--no-images", action="store_true", help="do without images")
+
+
+def execute(options: argparse.Namespace) -> int:
+    target = TARGETS[options.to]
+    if options.undistort and not target.is_of_images:
+        raise ConfigError(f"--undistort: there are no images in an export to {options.to}")
+    if options.to == "rerun":
+        import_rerun()
+    job = _job(options, target)
+    _make_way(job.output, options.overwrite)
+    written = target.write(job)
+    print(table(written | {"written": str(job.output)}))
+    return 0
+
+
+def _job(options: argparse.Namespace, target: Target) -> Job:
+    """What the arguments ask for. Raises ResultsError for results that do not have it."""
+    directory = options.directory
+    if not directory.is_dir():
+        raise ResultsError(f"{directory}: no such folder of results")
+    figures, saved = read_metrics(directory), read_worlds(directory / MAP)
+    number = figures["world"] if options.world is None else options.world
+    worlds = {world.number: world for world in saved.worlds}
+    if not worlds:
+        raise ResultsError(f"{directory}: there is no map: {figures.get('failure', '')}")
+    if number not in worlds:
+        raise ResultsError(f"{directory}: no world {number}: there are {', '.join(map(str, worlds))}")
+    keyframes_alone = options.frames == "keyframes" or (options.frames is None and target.keyframes)
+    source = None
+    if target.is_of_images and not options.no_images:
+        source = options.sequence or figures.get("source")
+        if source is None:
+            raise ResultsError(f"{directory}: does not say where the images of the run are: {WITHOUT}")
+    return Job(
+        directory=directory,
+        figures=figures,
+        world=worlds[number],
+        camera=saved.camera,
+        output=options.output or directory / FOLDER / target.name,
+        keyframes_alone=keyframes_alone,
+        undistort=options.undistort or options.to == "rerun",
+        source=source,
+        fps=figures.get("source_fps"),
+    )
+
+
+def _make_way(output: Path, overwrite: bool) -> None:
+    """Make the folder that an export goes to. Raises ResultsError where it would replace something."""
+    is_taken = any(output.iterdir()) if output.is_dir() else output.exists()
+    if is_taken and not overwrite:
+        raise ResultsError(f"{output}: is there already: --overwrite replaces it")
+    output.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _colmap(job: Job) -> dict[str, str]:
+    scene, images = job.scene()
+    if images is not None:
+        write_images(job.output / IMAGES, scene, images)
+    write_colmap(job.output / MODEL, scene)
+    return {"camera": colmap_camera(scene.camera)[0]} | _figures(job, scene)
+
+
+def _nerfstudio(job: Job) -> dict[str, str]:
+    scene, images = job.scene()
+    if images is not None:
+        write_images(job.output / IMAGES, scene, images)
+    write_nerfstudio(job.output, scene, job.R_up)
+    return _figures(job, scene)
+
+
+def _rerun(job: Job) -> dict[str, str]:
+    scene, images = job.scene()
+    write_recording(job.output, scene, job.R_up, images)
+    return _figures(job, scene)
+
+
+def _figures(job: Job, scene: Scene) -> dict[str, str]:
+    error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
+    frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
+    if job.keyframes_alone:
+        posed = job.world.history.count(job.session)
+        frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all takes all of them"
+    return {
+        "frames": frames,
+        "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
+        "error": f"{error:.4f} px, mean over the points",
+    }
+
+
+def _ply(job: Job) -> dict[str, str]:
+    write_map_cloud(job.output, job.world.map, job.session)
+    keyframes = len(keyframe_rows(job.world.map, job.session))
+    return {"points": f"{job.world.map.num_points}, and {keyframes} keyframes"}
+
+
+def _tum(job: Job) -> dict[str, str]:
+    trajectory = job.trajectory()
+    write_trajectory(job.output, trajectory)
+    return {"poses": str(len(trajectory))}
+
+
+def _kitti(job: Job) -> dict[str, str]:
+    trajectory = job.trajectory()
+    write_kitti(job.output, trajectory)
+    return {"poses": str(len(trajectory))}
+
+
+TARGETS = {
+    "colmap": Target(_colmap, "colmap", is_of_images=True, keyframes=True),
+    "nerfstudio": Target(_nerfstudio, "nerfstudio", is_of_images=True, keyframes=True),
+    "ply": Target(_ply, "map.ply", is_of_images=False, keyframes=True),
+    "rerun": Target(_rerun, "recording.rrd", is_of_images=True, keyframes=False),
+    "tum": Target(_tum, "trajectory.txt", is_of_images=False, keyframes=False),
+    "kitti": Target(_kitti, "kitti", is_of_images=False, keyframes=False),
+}

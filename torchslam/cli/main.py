@@ -1,0 +1,124 @@
+"""The command line: `torchslam run | batch | refine | demo | eval | plot | export | info | config | download`.
+
+Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
+4 some sequences of a batch with an error, 130 and 143 ended by Ctrl-C and by SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+import torchslam
+from torchslam.errors import TorchslamError
+from torchslam.utils.optional_deps import explained
+
+ERROR = 2
+INTERRUPTED = 130
+
+# Module, and the first line of its docstring: only that of the command at hand is imported.
+COMMANDS = {
+    "run": ("run", "run SLAM on a sequence and write trajectory, map, figures and pictures"),
+    "batch": (
+        "batch",
+        "run many sequences, each once, with one table: alone, as shards of an array of jobs, or on Ray",
+    ),
+    "refine": (
+        "refine",
+        "make poses of another program better by the images, and write them in the form that they had",
+    ),
+    "demo": (
+        "demo",
+        "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",
+    ),
+    "eval": ("evaluate", "compare two trajectories in TUM format: absolute and relative errors"),
+    "plot": (
+        "plot",
+        "draw the pictures of a run and make its view.html again, from the files in its folder of results",
+    ),
+    "export": (
+        "export",
+        "give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
+    ),
+    "info": ("info", "say what would be read from a sequence: frames, size, rate, calibration, ground truth"),
+    "config": (
+        "config",
+        "print every setting with what it is, its range and its default, as TOML that --config reads",
+    ),
+    "download": (
+        "download",
+        "fetch a public sequence: with a progress bar, taking up a transfer that broke off",
+    ),
+}
+
+WITHOUT_THREADS = (
+    "config",
+    "info",
+)  # compute nothing: torch is imported where a sequence is opened, if at all
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
+    # Before NumPy is imported: its threads would stand idle, and keep a second process from being a copy of this one.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        options = build_parser(next(iter(arguments), "")).parse_args(arguments)
+        if options.command not in WITHOUT_THREADS:
+            _compute_in_one_thread()
+        return options.execute(options)
+    except (TorchslamError, OSError) as error:
+        print(f"torchslam: error: {error}", file=sys.stderr)
+        return ERROR
+    except ModuleNotFoundError as error:
+        if (reason := explained(error)) is error:
+            raise
+        print(f"torchslam: error: {reason}", file=sys.stderr)
+        return ERROR
+    except KeyboardInterrupt:
+        print("torchslam: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+class Version(argparse.Action):
+    """Looked up only when asked for: reading the metadata takes half as long as all the rest of the help."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:
+        print(f"torchslam {torchslam.__version__}")
+        parser.exit()
+
+
+def _compute_in_one_thread() -> None:
+    """Unless the user says otherwise: a frame's tensors are small, threads cost more than they bring."""
+    import torch  # not before the arguments are known to be right
+
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
+
+
+def build_parser(chosen: str) -> argparse.ArgumentParser:
+    """The parser of all commands, with the arguments of the chosen one, which its module adds."""
+    parser = argparse.ArgumentParser(
+        prog="torchslam",
+        description="Monocular visual SLAM: images in, the camera's trajectory and a sparse map out.",
+    )
+    parser.add_argument("--version", action=Version, nargs=0, help="show the version and exit")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
+    for name, (home, summary) in COMMANDS.items():
+        command = commands.add_parser(
+            name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        if name == chosen:
+            module = import_module(f"torchslam.cli.{home}")
+            command.description = (module.__doc__ or "").strip()
+            module.add_arguments(command)
+            command.set_defaults(execute=module.execute)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,201 @@
+"""Make poses of another program better by the images, and write them in the form that they had.
+
+Poses and camera of COLMAP, of a transforms.json, or a TUM trajectory: from a phone, a network, another SLAM. The images
+are matched and triangulated; poses, points and, where the images contradict it, the focal length are adjusted. The
+results are those of a run, in the frame and the unit of the given poses; refined/ has them as they were given, with
+covariances. Images without a pose and poses without an image are left out.
+
+Exit status: 0 done, 2 an error, 3 the images make no map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchslam.calibration.report import contradiction
+from torchslam.cli import arguments
+from torchslam.cli.result_folder import prepare
+from torchslam.config import Config
+from torchslam.data import Sequence
+from torchslam.data.camera_argument import fit_camera, unknown_camera
+from torchslam.data.formats.given_poses import GivenPoses, read_poses
+from torchslam.data.opening import full_name
+from torchslam.data.sequence import Calibrated
+from torchslam.errors import ConfigError, SequenceError, TrajectoryError
+from torchslam.evaluation import Evaluation, evaluate
+from torchslam.io.calibration_file import check_replaceable, is_found, write_calibration
+from torchslam.io.export.colors import paint
+from torchslam.io.pictures import draw
+from torchslam.io.report import metrics, summary, table
+from torchslam.io.results import CALIBRATION, read_results, write_results
+from torchslam.refine import CameraChoice, Refined, refine
+from torchslam.refine.files import write_refined
+from torchslam.types import Trajectory
+
+DONE, NO_MAP = 0, 3
+RADIAL = 2  # coefficients of the distortion that may be found
+REFINED = "refined"  # folder in the results
+
+
+@dataclass(frozen=True)
+class Plan:
+    """source, fps: what the sequence was opened from; choice, radial: as in `refine`"""
+
+    source: str
+    fps: float | None
+    output: Path
+    device: torch.device
+    overwrite: bool
+    choice: CameraChoice
+    radial: int
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    arguments.add_sequence(parser)
+    parser.add_argument(
+        "--poses",
+        required=True,
+        metavar="FILE|DIR",
+        help="TUM trajectory, COLMAP model (folder with images.bin or images.txt), or transforms.json. Its camera is "
+        "taken unless --camera says another one",
+    )
+    parser.add_argument(
+        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
+    camera = parser.add_mutually_exclusive_group()
+    camera.add_argument(
+        "--refine-camera",
+        action="store_true",
+        help="take the focal length of the images wherever they determine it, not only where they contradict the given "
+        "one",
+    )
+    camera.add_argument("--fix-camera", action="store_true", help="leave the camera as it is")
+    parser.add_argument(
+        "--refine-distortion", action="store_true", help="also k1 and k2, where the images ask for them"
+    )
+    arguments.add_device(parser)
+    arguments.add_config(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    if options.fix_camera and options.refine_distortion:
+        raise ConfigError("--refine-distortion: --fix-camera leaves the camera as it is")
+    given = read_poses(options.poses)
+    sequence = _with_camera(arguments.sequence(options), given, options.camera)
+    is_guess = sequence.calibrated is Calibrated.GUESSED
+    choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.JUDGED
+    plan = Plan(
+        options.path,
+        options.fps,
+        options.output,
+        options.device,
+        options.overwrite,
+        CameraChoice.FIXED if options.fix_camera else choice,
+        RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0,
+    )
+    return run(sequence, given, arguments.config(options), plan)
+
+
+def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> int:
+    """Refine, evaluate, write, draw, report; returns the exit status."""
+    prepare(plan.output, plan.overwrite, resume=False)
+    check_replaceable(plan.output / CALIBRATION)
+    refined = refine(
+        sequence,
+        given,
+        config,
+        plan.choice,
+        plan.radial,
+        plan.device,
+        told=lambda words: print(f"torchslam: {words}", file=sys.stderr),
+    )
+    figures = _write(refined, sequence, plan)
+    written = {} if refined.run.failure else {"refined": str(write_refined(plan.output / REFINED, refined))}
+    rows = _used(refined, sequence) | summary(figures) | written | {"results": str(plan.output)}
+    rows.pop("speed", None)  # there is no frame after frame
+    if "online ATE" in rows:
+        rows["ATE as given"] = rows.pop("online ATE")
+    print(f"\n{sequence.name}\n{table(rows)}")
+    if refined.run.failure:
+        print(f"torchslam: {refined.run.failure}", file=sys.stderr)
+        return NO_MAP
+    return DONE
+
+
+def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> Sequence:
+    """The sequence with the camera that comes with the poses, unless the user named one; a guess where nobody knows."""
+    if sequence.known_length is None:
+        raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
+    if camera is None and given.calibration is not None:
+        return sequence.with_camera(fit_camera(given.calibration, sequence.size, str(given.path)))
+    if sequence.calibrated is Calibrated.MISSING:
+        print("torchslam: no calibration here: the images decide", file=sys.stderr)
+        return sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
+    return sequence
+
+
+def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
+    """Evaluate, colour the map, write, draw; returns the figures."""
+    finished = refined.run
+    before = Trajectory.empty() if finished.failure else finished.online
+    after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
+    figures = metrics(finished, after, None if ate_before is None else ate_before.ate_m)
+    figures |= {
+        "camera": _words(refined, sequence),
+        "focal_px": [float(sequence.camera.focal), float(finished.camera.focal)],
+        "without_pose": refined.without_pose,
+        "without_image": refined.without_image,
+        "rounds": refined.rounds,
+        "dropped": sequence.dropped,
+        "source": full_name(plan.source),
+        "source_fps": plan.fps,
+    }
+    paint([world.map for world in finished.worlds], sequence, finished.session)
+    write_results(finished, sequence, figures, plan.output)
+    path = plan.output / CALIBRATION
+    if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
+        write_calibration(path, finished.camera, [figures["camera"]])
+    elif is_found(path):
+        path.unlink()
+    draw(read_results(plan.output), plan.output)
+    return figures
+
+
+def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
+    """Against ground truth, where there is one and there are poses to compare."""
+    if sequence.groundtruth is None or not len(trajectory):
+        return None
+    try:
+        return evaluate(trajectory, sequence.groundtruth)
+    except TrajectoryError as error:
+        print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
+        return None
+
+
+def _words(refined: Refined, sequence: Sequence) -> str:
+    """What became of the camera."""
+    found, focal = refined.camera, float(refined.run.camera.focal)
+    if found is None:
+        return f"focal length {focal:.1f} px, as given"
+    if torch.equal(refined.run.camera.params.cpu(), sequence.camera.params):
+        against = contradiction(sequence.camera, found) or "the images do not contradict it"
+        return f"focal length {focal:.1f} px, as given; {against}"
+    std = found.std * focal
+    return f"focal length {focal:.1f} ± {std:.1f} px by the images, given {float(sequence.camera.focal):.1f}"
+
+
+def _used(refined: Refined, sequence: Sequence) -> dict[str, str]:
+    """How many poses there were and how they were used, label by label."""
+    words = f"{len(refined.given)} from {refined.given.path}"
+    if refined.without_image:
+        words += f"; {refined.without_image} of no image here"
+    if refined.without_pose:
+        words += f"; {refined.without_pose} of {len(sequence)} images have none"
+    return {"poses": words}

@@ -1,0 +1,287 @@
+"""Run SLAM on a sequence and write trajectory, map, figures and pictures.
+
+Without a calibration, and with `--camera auto`, the images say what the camera is: calibration.txt in the results.
+
+Exit status: 0 done, 2 an error, 3 no map could be initialised or no frame be localised; 130 and 143 ended by Ctrl-C
+and by SIGTERM (what there is by then is written, and --resume goes on from the last checkpoint).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchslam.calibration.auto import RADIAL, find_camera
+from torchslam.cli import arguments
+from torchslam.cli.progress import ProgressBar
+from torchslam.cli.result_folder import Checkpoints, prepare
+from torchslam.cli.signals import Stopping
+from torchslam.config import Config
+from torchslam.data import Sequence
+from torchslam.data.camera_argument import unknown_camera
+from torchslam.data.opening import full_name
+from torchslam.data.sequence import Calibrated
+from torchslam.errors import ConfigError, ResultsError
+from torchslam.io.calibration_file import is_found
+from torchslam.io.export.colors import paint
+from torchslam.io.export.recording import import_rerun
+from torchslam.io.metrics import figures_of
+from torchslam.io.pictures import draw
+from torchslam.io.report import doubts, summary, table
+from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
+from torchslam.io.viewer.frames import VIDEO, LiveView, Screen, Watching, film_of
+from torchslam.io.viewer.page import VIEW, write_view
+from torchslam.parallel.workers import helped
+from torchslam.system.checkpoint import read_checkpoint
+from torchslam.system.front_end import source
+from torchslam.system.run import Progressed, Run, run_sequence
+from torchslam.system.slam import SLAM
+from torchslam.types import StepResult
+
+DONE = 0
+NO_MAP = 3
+CHECKPOINT_EVERY = 20  # keyframes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where a run reads and writes.
+
+    source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
+                where that was said
+    output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
+    map:        file of a saved map to go on in, without `mapping` only to localise in it
+    checkpoint: keyframes from one checkpoint to the next; 0: none
+    refine:     improve the given camera by the images first; distortion: its distortion, too
+    processes:  how many; None: what is best
+    view:       show the run live in rerun; video: write a film of what is tracked
+    """
+
+    source: str
+    output: Path
+    device: torch.device
+    overwrite: bool = False
+    resume: bool = False
+    map: Path | None = None
+    mapping: bool = True
+    checkpoint: int = CHECKPOINT_EVERY
+    refine: bool = False
+    distortion: bool = False
+    processes: int | None = None
+    view: bool = False
+    video: bool = False
+    fps: float | None = None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    arguments.add_sequence(parser)
+    parser.add_argument(
+        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
+    )
+    existing = parser.add_mutually_exclusive_group()
+    existing.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
+    existing.add_argument(
+        "--resume", action="store_true", help="go on from the folder's checkpoint, if it has one"
+    )
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="DIR|FILE",
+        help="go on in a saved map: its file, or the results it is in, with their configuration unless --config",
+    )
+    parser.add_argument(
+        "--localize", action="store_true", help="with --map: find poses in it, and leave it as it is"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=arguments.not_negative,
+        default=CHECKPOINT_EVERY,
+        metavar="N",
+        help="save the state every N keyframes at the most, for --resume; 0: never (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--refine-camera", action="store_true", help="improve the focal length by the images before the run"
+    )
+    parser.add_argument(
+        "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
+    )
+    parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
+    parser.add_argument(
+        "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
+    )
+    arguments.add_device(parser)
+    arguments.add_processes(parser)
+    arguments.add_config(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    if options.map is not None and (options.refine_camera or options.refine_distortion):
+        raise ConfigError("--refine-camera: a --map has the camera that it was made with")
+    if options.localize and options.map is None:
+        raise ConfigError("--localize needs a --map to find poses in")
+    if options.view:
+        import_rerun()
+    saved = options.map
+    if saved is not None and saved.is_dir():
+        beside = saved / CONFIG
+        options.config = options.config or (beside if beside.is_file() else None)
+        saved = saved / MAP
+    plan = Plan(
+        source=options.path,
+        output=options.output,
+        device=options.device,
+        overwrite=options.overwrite,
+        resume=options.resume,
+        map=saved,
+        mapping=not options.localize,
+        checkpoint=options.checkpoint,
+        refine=options.refine_camera or options.refine_distortion,
+        distortion=options.refine_distortion,
+        processes=options.processes,
+        view=options.view,
+        video=options.video,
+        fps=options.fps,
+    )
+    return run(_sequence(options), arguments.config(options), plan)
+
+
+def _sequence(options: argparse.Namespace) -> Sequence:
+    """The sequence; without a calibration, as with `--camera auto`."""
+    found = arguments.sequence(options)
+    if found.calibrated is not Calibrated.MISSING or found.known_length is None:
+        return found
+    print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)
+    return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
+
+
+def run(sequence: Sequence, config: Config, plan: Plan) -> int:
+    """Run, evaluate, write, draw, report; returns the exit status."""
+    prepare(plan.output, plan.overwrite, plan.resume)
+    sequence, found = _with_camera(sequence, config, plan)
+    slam, so_far = _begin(sequence, config, plan)
+    sequence = source(sequence, config, slam.camera)
+    checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
+    processes = 1 if plan.view or plan.video else plan.processes  # images are wanted here, not elsewhere
+    with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
+        is_live, latencies = (
+            not len(sequence.timestamps),
+            list[float](),
+        )  # of a live source: from the capture of a frame to its pose
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
+        with bar as progress:
+
+            def after_frame(result: StepResult) -> None:
+                if is_live:
+                    latencies.append(1e3 * (time.time() - result.timestamp))
+                checkpoints.offer(at_once=stopping.is_wanted)
+                watching.show(result)
+                progress.update(result)
+
+            with helped(watching.sequence, slam, processes, so_far.next) as frames:
+                finished = run_sequence(
+                    slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
+                )
+        stopping.begin("when the results are written")
+        figures = _write(finished, sequence, plan, found, latencies)
+        watching.end(finished)
+    written = {"results": plan.output, "view": plan.output / VIEW}
+    written |= {"video": plan.output / VIDEO} if plan.video else {}
+    words = summary(figures) | {label: str(path) for label, path in written.items()}
+    print(f"\n{sequence.name}\n{table(words)}")
+    for doubt in doubts(figures):
+        print(f"torchslam: warning: {doubt}", file=sys.stderr)
+    if finished.interrupted:
+        print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
+        return stopping.status
+    checkpoints.remove()
+    if finished.failure:
+        print(f"torchslam: {finished.failure}", file=sys.stderr)
+        return NO_MAP
+    return DONE
+
+
+def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:
+    """The sequence with the camera of the run, and what there is to say of it where the images found it."""
+    is_guess = sequence.calibrated is Calibrated.GUESSED and sequence.known_length is not None
+    if plan.map is not None or not (plan.refine or is_guess):
+        if not plan.resume and is_found(plan.output / CALIBRATION):
+            (plan.output / CALIBRATION).unlink()
+        return sequence, ""
+    radial = RADIAL if plan.distortion or is_guess else 0
+    goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
+    return find_camera(
+        sequence,
+        config,
+        plan.output,
+        plan.device,
+        radial,
+        goes_on,
+        lambda words: print(f"torchslam: camera: {words}", file=sys.stderr),
+    )
+
+
+def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progressed]:
+    """The system before the first frame, or after the last one that a checkpoint knows."""
+    checkpoint = plan.output / CHECKPOINT
+    if plan.resume and checkpoint.exists():
+        slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
+        print(f"torchslam: going on at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
+        return slam, so_far
+    if plan.resume:
+        print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
+    if plan.map is None:
+        return SLAM(sequence.camera.to(plan.device), config), Progressed()
+    slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
+    known, mine = slam.camera, sequence.camera.to(torch.float64)
+    same = known.params.shape == mine.params.shape  # to the nine digits of a calibration file
+    same = same and torch.allclose(known.params.cpu(), mine.params, rtol=1e-8, atol=0)
+    if known.size != mine.size or (
+        sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
+        and (known.model != mine.model or not same)
+    ):
+        raise ResultsError(
+            f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
+            f"the sequence has {_words(mine.model, mine.params, mine.size)}"
+        )
+    return slam, Progressed()
+
+
+def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> Watching:
+    """What shows the frames as they pass; a film of an earlier run goes."""
+    (plan.output / VIDEO).unlink(missing_ok=True)
+    screens: list[Screen] = [LiveView.spawn(slam)] if plan.view else []
+    if plan.video:
+        screens.append(film_of(sequence, plan.output))
+    return Watching(slam, sequence, screens)
+
+
+def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
+    numbers = ",".join(f"{number:.9g}" for number in params.tolist())
+    return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
+
+
+def _write(
+    finished: Run, sequence: Sequence, plan: Plan, camera: str, latencies: list[float]
+) -> dict[str, object]:
+    """Evaluate, colour the map, write, draw; returns the figures.
+
+    camera: what there is to say of it before the run; latencies: milliseconds, of a live source
+    """
+    figures = figures_of(
+        finished, sequence, camera, lambda words: print(f"torchslam: warning: {words}", file=sys.stderr)
+    )
+    if latencies:
+        median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
+        figures["latency_ms"] = {"median": median, "p95": p95}
+    figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
+    paint([world.map for world in finished.worlds], sequence, finished.session)
+    write_results(finished, sequence, figures, plan.output)
+    results = read_results(plan.output)
+    draw(results, plan.output)
+    write_view(results, plan.output)
+    return figures

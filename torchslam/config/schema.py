@@ -1,0 +1,295 @@
+"""What a configuration is made of: frozen dataclasses that check themselves, read from TOML and written back.
+
+A setting is declared with its type, its default and what it allows; whatever builds a section - a constructor,
+`dataclasses.replace`, a TOML file, an override - goes through the same check. An unknown key in a file is an error
+that names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, get_type_hints
+
+from torchslam.errors import ConfigError
+from torchslam.plugins import is_known, registered
+from torchslam.utils.bounded_read import read_text
+
+Value = TypeVar("Value", bool, int, float, str)
+Section = TypeVar("Section", bound="Settings")
+MAX_BYTES = 1 << 16
+"""Of a file of settings: all of them with all that there is to say of them are a quarter of that."""
+SHOWN = 200
+"""Characters of a value in a message."""
+MAX_LINE = 1 << 12
+"""Characters of a line: the time that a key of many parts takes grows with the square of their number."""
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What a setting may be, beside its type; `str` says it in words.
+
+    low, high: the range of a number, both ends in it
+    above:     a lower end that is not in the range
+    also:      a number outside of the range that means something else
+    choices:   of a string; empty for any
+    group:     of entry points, whose names are choices as well, and so is PACKAGE:NAME
+    """
+
+    low: float = 0
+    high: float = math.inf
+    above: float = -math.inf
+    choices: tuple[str, ...] = ()
+    also: float | None = None
+    group: str = ""
+
+    def __contains__(self, value: object) -> bool:
+        if isinstance(value, bool):
+            return True
+        if isinstance(value, int | float):
+            is_finite = isinstance(value, int) or math.isfinite(value)  # isfinite makes floats of integers
+            is_inside = is_finite and self.low <= value <= self.high and value > self.above
+            return is_inside or value == self.also
+        if not self.choices or value in self.choices:
+            return True
+        return bool(self.group) and isinstance(value, str) and is_known(self.group, value)
+
+    def __str__(self) -> str:
+        if self.choices:
+            known = [*self.choices, *(sorted(registered(self.group)) if self.group else ())]
+            return f"one of {', '.join(known)}{', or PACKAGE:NAME' if self.group else ''}"
+        start = f"at least {self.low}" if self.above < self.low else f"above {self.above}"
+        also = "" if self.also is None else f"{self.also} or "
+        return f"{also}{start} and {'finite' if self.high == math.inf else f'at most {self.high}'}"
+
+
+def setting(
+    default: Value,
+    about: str = "",
+    *,
+    low: float = 0,
+    high: float = math.inf,
+    above: float = -math.inf,
+    choices: tuple[str, ...] = (),
+    also: float | None = None,
+    grows: bool = False,
+    group: str = "",
+) -> Value:
+    """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number.
+
+    about: what it is, in words, for `explained`
+    grows: whether it is a length in the image, for `enlarged`
+    """
+    allowed = Allowed(low, high, above, choices, also, group)
+    return field(default=default, metadata={"allowed": allowed, "about": about, "grows": grows})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of the frozen dataclasses of a configuration: bool, int, float and str, and further sections.
+
+    The argument `section` of the class is its place in the configuration, for messages; none for the outermost one.
+    Raises ConfigError for a value of the wrong type or not allowed. An integer serves as a float.
+    """
+
+    _prefix: ClassVar[str] = ""
+
+    def __init_subclass__(cls, section: str = "", **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        cls._prefix = f"{section}." if section else ""
+
+    def __post_init__(self) -> None:
+        for name, (kind, allowed) in _declared(type(self)).items():
+            value = _checked(self._prefix + name, getattr(self, name), kind, allowed)
+            object.__setattr__(self, name, value)
+
+
+def choices(kind: type[Settings]) -> dict[str, tuple[str, ...]]:
+    """The choices of every setting that has some, by its full name."""
+    return {name: allowed.choices for name, allowed in _everything(kind) if allowed.choices}
+
+
+def merged(config: Section, path: Path | str | None = None, overrides: Iterable[str] = ()) -> Section:
+    """The configuration changed by a TOML file, changed by overrides of the form `section.key=value`.
+
+    Raises ConfigError for a missing or malformed file, an unknown key, or a value of the wrong type or not allowed.
+    """
+    if path is not None:
+        config = _merge(config, _read_toml(Path(path)), str(path), type(config))
+    for override in overrides:
+        config = _merge(config, _parse_override(override), f"--set {_short(override)}", type(config))
+    return config
+
+
+def enlarged(config: Section, factor: float) -> Section:
+    """The configuration with every setting that `grows` multiplied by a factor, as far as its range allows."""
+    changes: dict[str, Any] = {}
+    for name in _declared(type(config)):
+        value = getattr(config, name)
+        if isinstance(value, Settings):
+            changes[name] = enlarged(value, factor)
+    changes |= {
+        f.name: min(factor * getattr(config, f.name), f.metadata["allowed"].high)
+        for f in fields(config)
+        if f.metadata.get("grows")
+    }
+    return replace(config, **changes)
+
+
+def to_toml(config: Settings) -> str:
+    """The configuration as TOML, every value written out."""
+    values = {name: getattr(config, name) for name in _declared(type(config))}
+    sections = {name: value for name, value in values.items() if isinstance(value, Settings)}
+    lines = [f"{name} = {_toml_value(value)}" for name, value in values.items() if name not in sections]
+    for name, section in sections.items():
+        lines += ["", f"[{name}]", to_toml(section).rstrip("\n")]
+    return "\n".join(lines) + "\n"
+
+
+def explained(config: Settings) -> str:
+    """The configuration as TOML, above every value what it is, what it may be and what it is by default."""
+    lines, inner = [], []
+    for declared in fields(config):
+        value, about = getattr(config, declared.name), declared.metadata.get("about", "")
+        if isinstance(value, Settings):
+            words = (type(value).__doc__ or "").strip().splitlines()
+            # A dataclass without a docstring has its signature in place of one.
+            inner += [
+                "",
+                *(f"# {line.strip()}" for line in words[:1] if "(" not in line),
+                f"[{declared.name}]",
+            ]
+            inner.append(explained(value).rstrip("\n"))
+            continue
+        allowed = _declared(type(config))[declared.name][1]
+        is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
+        limits = "" if is_free else f"{allowed}; "
+        lines += [f"# {about}", f"#   {limits}default {_toml_value(declared.default)}"]
+        lines.append(f"{declared.name} = {_toml_value(value)}")
+    return "\n".join(lines + inner) + "\n"
+
+
+def _declared(kind: type[Settings]) -> dict[str, tuple[type, Allowed]]:
+    """Type and constraint of each setting, by name."""
+    hints = get_type_hints(kind)
+    return {f.name: (hints[f.name], f.metadata.get("allowed", Allowed())) for f in fields(kind)}
+
+
+def _everything(kind: type[Settings]) -> Iterator[tuple[str, Allowed]]:
+    """Full name and constraint of each setting, and of each section before what is in it."""
+    for name, (inner, allowed) in _declared(kind).items():
+        yield kind._prefix + name, allowed
+        if issubclass(inner, Settings):
+            yield from _everything(inner)
+
+
+def _checked(name: str, value: Any, kind: type, allowed: Allowed) -> Any:
+    """The value, an integer as a float where a float is wanted. Raises ConfigError."""
+    number = value
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+    if type(number) is not kind:
+        raise ConfigError(f"{name} must be of type {kind.__name__}, not {_shown(value)}")
+    if number not in allowed:
+        raise ConfigError(f"{name} must be {allowed}, not {_shown(value)}")
+    if kind is str and not _is_unicode(value):
+        raise ConfigError(f"{name} must be text that can be written as UTF-8, not {value!r}")
+    return number
+
+
+def _shown(value: object) -> str:
+    try:
+        return _short(repr(value))
+    except (ValueError, RecursionError):  # an integer of thousands of digits, tables in tables
+        return f"this {type(value).__name__}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
+
+
+def _is_unicode(text: str) -> bool:
+    """Whether there are no lone surrogates, as of a file name in another encoding."""
+    return not any("\ud800" <= character <= "\udfff" for character in text)
+
+
+def _toml_value(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace(
+            "\x7f", "\\u007f"
+        )  # the one JSON leaves and TOML forbids
+    return repr(value)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        text = read_text(path, MAX_BYTES, "a configuration")
+        longest = max(map(len, text.splitlines()), default=0)
+        if longest > MAX_LINE:
+            raise ConfigError(
+                f"{path}: a line of {longest} characters, more than the {MAX_LINE} that are read"
+            )
+        return tomllib.loads(text)
+    except FileNotFoundError:
+        raise ConfigError(f"configuration file {path} does not exist") from None
+    except OSError as error:
+        raise ConfigError(f"configuration file {path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # of syntax, encoding, a number with thousands of digits
+        raise ConfigError(f"{path} is not valid TOML: {error}") from None
+
+
+def _parse_override(text: str) -> dict[str, Any]:
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(
+            f"--set {_shown(text)}: write it as section.key=value, for example --set features.num_keypoints=2000"
+        )
+    if len(text) > MAX_LINE:
+        raise ConfigError(
+            f"--set {_short(text)}: {len(text)} characters, more than the {MAX_LINE} that are read"
+        )
+    parsed: Any
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except (ValueError, RecursionError):
+        parsed = value.strip()  # a bare word is a string
+    section, _, name = key.strip().rpartition(".")
+    return {section: {name: parsed}} if section else {name: parsed}
+
+
+def _merge(config: Section, values: Mapping[str, Any], source: str, root: type[Settings]) -> Section:
+    """The section with some values changed; `root`, the outermost one, is for suggestions."""
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        name = config._prefix + key
+        if key not in _declared(type(config)):
+            raise ConfigError(f"{source}: unknown key {name!r}{_suggestion(name, root)}")
+        current = getattr(config, key)
+        if isinstance(current, Settings):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{source}: {name} is a section, write {name}.key = value")
+            value = _merge(current, value, source, root)
+        changes[key] = value
+    try:
+        return replace(config, **changes)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
+
+
+def _suggestion(name: str, root: type[Settings]) -> str:
+    known = [known for known, _ in _everything(root)]
+    nearest = (
+        difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        or [k for k in known if k.endswith("." + name)][:1]
+    )
+    return f"; did you mean {nearest[0]!r}?" if nearest else f"; known are {', '.join(known)}"

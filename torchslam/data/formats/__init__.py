@@ -1,0 +1,1 @@
+"""File formats: images, text, calibrations, trajectories, poses of other programs."""

@@ -1,0 +1,221 @@
+"""Poses of images by another program: a TUM trajectory, a COLMAP model or a transforms.json."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchslam.data.association import nearest
+from torchslam.data.calibration import Calibration
+from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
+from torchslam.data.formats.text_file import parse_floats, read_text
+from torchslam.data.formats.trajectory_file import read_trajectory
+from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
+from torchslam.errors import CalibrationError, TrajectoryError
+from torchslam.geometry.conventions import opengl
+from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
+from torchslam.utils import bounded_read as regular_file
+
+TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
+TRANSFORMS = "transforms.json"
+# COLMAP, src/colmap/sensor/models.h: the numbers of the models in binary files.
+MODEL_NAMES = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+}
+_MAX_BYTES = 1 << 30
+_POINT_BYTES = 24  # of an observation in images.bin
+_ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """N poses, each of an image known by its time or by its name.
+
+    kind:        "tum", "colmap" or "nerfstudio"
+    path:        the file, of COLMAP the folder
+    T_cw:        (N, 4, 4) world to camera, camera axes x right, y down, z forward
+    timestamps:  (N,) seconds, where images are known by their times
+    names:       N names of image files, where they are known by these
+    calibration: of the images, where the program says it
+    """
+
+    kind: str
+    path: Path
+    T_cw: Tensor
+    timestamps: Tensor | None = None
+    names: tuple[str, ...] = ()
+    calibration: Calibration | None = None
+
+    def __len__(self) -> int:
+        return len(self.T_cw)
+
+    def rows(self, sequence: Sequence) -> Tensor:
+        """(F,) which pose each frame of a sequence has, -1 where it has none; no pose is that of two frames.
+
+        Raises TrajectoryError where no frame has one.
+        """
+        if self.timestamps is None:
+            found = _by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
+            how = f"no image is called as those in it, such as {self.names[0]}"
+        else:
+            found = _by_time(self.timestamps, sequence.timestamps)
+            how = (
+                f"its times, from {float(self.timestamps[0])} to {float(self.timestamps[-1])} s, are not those of the "
+                f"images, from {float(sequence.timestamps[0])} to {float(sequence.timestamps[-1])} s"
+            )
+        if not bool((found >= 0).any()):
+            raise TrajectoryError(f"{self.path}: no pose is that of an image of {sequence.name}: {how}")
+        return found
+
+
+def read_poses(path: str | Path) -> GivenPoses:
+    """The poses in a TUM trajectory, a folder with a COLMAP model, or a transforms.json (or a folder with one).
+
+    Raises TrajectoryError or CalibrationError naming the file.
+    """
+    path = Path(path)
+    if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
+        if (path / TRANSFORMS).is_file():
+            return _read_transforms(path / TRANSFORMS)
+        for name in ("images.bin", "images.txt"):
+            if (path / name).is_file():
+                return _read_colmap(path, binary=name.endswith("bin"))
+        raise TrajectoryError(f"{path}: neither images.bin or images.txt of COLMAP nor {TRANSFORMS} in it")
+    if path.name in ("images.bin", "images.txt"):
+        return _read_colmap(path.parent, binary=path.suffix == ".bin")
+    if path.suffix.lower() == ".json":
+        return _read_transforms(path)
+    trajectory = read_trajectory(path)
+    return GivenPoses(TUM, path, se3_inverse(trajectory.T_wc), trajectory.timestamps)
+
+
+# --- which pose is whose -------------------------------------------------------------------------------------
+
+
+def _by_time(times: Tensor, frames: Tensor) -> Tensor:
+    """(F,) the nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
+    rows, distances = nearest(frames, times)
+    back, _ = nearest(times, frames)
+    mutual = back[rows] == torch.arange(len(frames))
+    return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
+
+
+def _by_name(names: tuple[str, ...], images: list[str]) -> Tensor:
+    """(F,) the pose with most of the name in common from its end: `0/a.png` is that of `rgb/0/a.png`.
+
+    Without a suffix as well (the first transforms.json had none); a name that two images have is that of none.
+    """
+    for key in (lambda name: PurePath(name).parts, lambda name: PurePath(name).with_suffix("").parts):
+        depth = max(len(key(name)) for name in names)
+        for length in range(depth, 0, -1):
+            ends = [key(name)[-length:] for name in names]
+            image_ends = [key(image)[-length:] for image in images]
+            single, own = Counter(ends), Counter(image_ends)
+            rows = {end: row for row, end in enumerate(ends) if single[end] == 1}
+            found = torch.tensor([rows.get(end, -1) if own[end] == 1 else -1 for end in image_ends])
+            if bool((found >= 0).any()):
+                return found
+    return torch.full((len(images),), -1)
+
+
+# --- COLMAP --------------------------------------------------------------------------------------------------
+
+
+def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
+    """Source: https://colmap.github.io/format.html."""
+    read = _binary_images if binary else _text_images
+    images = sorted(read(folder / f"images.{'bin' if binary else 'txt'}"))
+    if not images:
+        raise TrajectoryError(f"{folder}: no images in the model")
+    table = torch.tensor([numbers for _, numbers in images], dtype=torch.float64)
+    if not bool(table.isfinite().all()) or bool((table[:, :4].norm(dim=-1) - 1).abs().gt(0.05).any()):
+        raise TrajectoryError(f"{folder}: a quaternion that does not have unit length, or no number")
+    quaternions = table[:, :4].roll(-1, dims=-1) / table[:, :4].norm(dim=-1, keepdim=True)
+    T_cw = rigid(matrix_from_quaternion(quaternions), table[:, 4:])
+    text = folder / "cameras.txt"
+    calibration = _binary_camera(folder / "cameras.bin") if binary else read_calibration(text)
+    return GivenPoses(COLMAP, folder, T_cw, None, tuple(name for name, _ in images), calibration)
+
+
+def _text_images(path: Path) -> list[tuple[str, list[float]]]:
+    """Names and `qw qx qy qz tx ty tz`; every second line lists points and may be empty."""
+    lines = [line for line in read_text(path, TrajectoryError).splitlines() if not line.startswith("#")]
+    images = []
+    for line in lines[::2]:
+        words = line.split(maxsplit=9)
+        if not words:
+            continue
+        if len(words) != 10:
+            raise TrajectoryError(f"{path}: expected `id qw qx qy qz tx ty tz camera name`, got `{line}`")
+        images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
+    return images
+
+
+def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
+    images = []
+    try:
+        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
+        (count,) = struct.unpack_from("<Q", data)
+        at = 8
+        for _ in range(count):
+            _, *numbers, _ = struct.unpack_from("<I7dI", data, at)
+            end = data.index(b"\0", at + 64)
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            images.append((data[at + 64 : end].decode(), numbers))
+            at = end + 9 + _POINT_BYTES * points
+    except (OSError, struct.error, ValueError, OverflowError) as cause:
+        raise TrajectoryError(f"{path}: not COLMAP's images: {cause}") from cause
+    return images
+
+
+def _binary_camera(path: Path) -> Calibration:
+    """The single camera of a cameras.bin."""
+    try:
+        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
+        (count,) = struct.unpack_from("<Q", data)
+        if count != 1:
+            raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
+        number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
+        name = MODEL_NAMES.get(model, str(model))
+        keys = COLMAP_MODELS.get(name, ("",))[0].split()
+        params = struct.unpack_from(f"<{len(keys)}d", data, 32)
+    except (OSError, struct.error) as cause:
+        raise CalibrationError(f"{path}: not COLMAP's cameras: {cause}") from cause
+    return from_colmap(path, [" ".join(map(str, (number, name, width, height, *params)))])
+
+
+# --- transforms.json -----------------------------------------------------------------------------------------
+
+
+def _read_transforms(path: Path) -> GivenPoses:
+    """Frames as nerfstudio, instant-ngp and the first NeRF write them; a world that was moved stays as it is."""
+    try:
+        content: Any = regular_file.parse_json(read_text(path, TrajectoryError, regular_file.JSON_BYTES))
+        frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
+        T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64)
+    except (ValueError, KeyError, TypeError, RuntimeError, OverflowError) as cause:
+        raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
+    if T_wc.shape[1:] not in ((4, 4), (3, 4)):
+        raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
+    R = T_wc[:, :3, :3]
+    if not bool(T_wc.isfinite().all() & ((R @ R.mT - torch.eye(3, dtype=R.dtype)).abs() < _ORTHOGONAL).all()):
+        raise TrajectoryError(f"{path}: a transform_matrix that is no rotation and translation")
+    T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
+    is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it
+    calibration = read_calibration(path) if is_shared else None
+    return GivenPoses(NERFSTUDIO, path, T_cw, None, tuple(name for name, _ in frames), calibration)

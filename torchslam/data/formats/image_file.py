@@ -1,0 +1,146 @@
+"""Image files to tensors. A file that ends early is an error, also where decoders fill the rest with grey."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from torchslam.data.formats import png
+from torchslam.errors import FrameError
+from torchslam.utils import bounded_read as regular_file
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+WIDTH, HEIGHT = 256, 257  # tags of a TIFF
+AS_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+MAX_BYTES = 1 << 29
+"""An image file above this size is not read."""
+MAX_PIXELS = 1 << 26
+"""Pixels of the largest image that is decoded: a small file may promise any number of them."""
+
+
+def read_grey(path: str | Path, where: str, bits: int = 8) -> Tensor:
+    """An image file as (1, 1, H, W) float32 grey in [0, 1].
+
+    bits: how many carry something in files of 16 bits (`bit_depth`)
+
+    Raises FrameError at `where` for a file that is missing, truncated, too large or not an image.
+    """
+    return grey_to_tensor(read_pixels(path, where), bits)
+
+
+def read_colour(path: str | Path, where: str) -> Tensor:
+    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_grey` does."""
+    return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
+
+
+def read_pixels(path: str | Path, where: str) -> np.ndarray:
+    """An image file as (H, W) grey, uint8 or uint16. Raises FrameError as `read_grey`."""
+    return _read(path, where, AS_GREY)
+
+
+def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
+    try:
+        data = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
+    except OSError as cause:
+        raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
+    if _is_truncated(data):
+        raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
+    image = decode_pixels(data, flags)
+    if image is None:
+        raise FrameError(f"{where}: {path} is not an image, or a damaged one")
+    return image
+
+
+def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
+    """An image file's bytes as (H, W) grey, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
+    whole image."""
+    if not data or _promised_pixels(data) > MAX_PIXELS:
+        return None
+    if flags == AS_GREY and (grey := png.decode_grey(data)) is not None:
+        return grey
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
+        return None
+    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
+
+
+def bit_depth(images: Iterable[np.ndarray]) -> int:
+    """How many bits carry something: 8, or what the brightest pixel of some images of 16 bits needs, 10 to 16."""
+    brightest = max((int(image.max()) for image in images if image.dtype == np.uint16), default=0)
+    return 8 if brightest == 0 else next(bits for bits in (10, 12, 14, 16) if brightest < 1 << bits)
+
+
+def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
+    """(H, W) uint8, or uint16 of which `bits` carry something -> (1, 1, H, W) float32 in [0, 1]."""
+    if grey.dtype == np.uint16:
+        white = (1 << bits) - 1 if bits > 8 else 65535
+        floats = grey.astype(np.float32)
+        floats /= white  # in place: of a large image one copy less
+        return torch.from_numpy(floats).clamp_(max=1.0)[None, None]
+    return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
+
+
+def bgr_to_tensor(image: np.ndarray) -> Tensor:
+    """(H, W, 3) uint8 blue, green, red, as OpenCV has it -> red, green, blue."""
+    return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def _promised_pixels(data: bytes) -> int:
+    """How many pixels a header promises, in all its pages; more than are decoded where it does not say."""
+    if data.startswith((b"II*\0", b"MM\0*")):
+        return _tiff_pixels(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images: these have their limit
+            with Image.open(io.BytesIO(data)) as image:
+                return image.width * image.height
+    except Exception:  # a damaged header fails in any way
+        return MAX_PIXELS + 1
+
+
+def _tiff_pixels(data: bytes) -> int:
+    """Of the first page of a TIFF: Pillow does not open all kinds that OpenCV reads. Source: TIFF 6.0, section 2."""
+    order: Literal["little", "big"] = "little" if data.startswith(b"II") else "big"
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], order)
+
+    start = number(4, 4)
+    sides = {WIDTH: 0, HEIGHT: 0}
+    for at in range(start + 2, start + 2 + 12 * number(start, 2), 12):
+        if number(at, 2) in sides:  # entries: tag, type (3: two bytes, 4: four), count, value
+            sides[number(at, 2)] = number(at + 8, 2 if number(at + 2, 2) == 3 else 4)
+    return sides[WIDTH] * sides[HEIGHT] or MAX_PIXELS + 1
+
+
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG or PNG file lacks its end; other formats are left to the decoder."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
+    if data.startswith(b"\xff\xd8"):
+        return data.rfind(b"\xff\xd9") < _start_of_scan(data)
+    return False
+
+
+def _start_of_scan(data: bytes) -> int:
+    """Where a JPEG's own pixels start, behind any embedded thumbnail; the file's end if they never do."""
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xDA:
+            return position
+        if marker == 0xFF:  # a fill byte
+            position += 1
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return len(data)

@@ -1,0 +1,70 @@
+"""Small text files of lists and numbers, read with errors that name file and line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from torchslam.errors import TorchslamError
+from torchslam.utils import bounded_read as regular_file
+
+MAX_BYTES = 1 << 27
+"""A text file above this size is not read: lists and poses of a million frames are smaller."""
+MAX_DIGITS = 19
+"""Of a whole number: nanoseconds since 1970 have 19, until 2286."""
+MAX_LINE = 1 << 16
+"""Characters of a line of numbers."""
+
+
+def read_text(path: str | Path, error: type[TorchslamError], limit: int | None = None) -> str:
+    """The text of a file. Raises `error` where it does not exist, is not text or is too large.
+
+    limit: bytes; None: MAX_BYTES
+    """
+    try:
+        return regular_file.read_text(path, MAX_BYTES if limit is None else limit, "a text that is read")
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    except ValueError as cause:
+        raise error(f"{path}: cannot be read: {cause}") from cause
+
+
+def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
+    """The lines of a file that say something, with their numbers from 1; `#` after a space starts a comment.
+
+    Raises `error` where the file does not exist, is not text or is too large.
+    """
+    for number, line in enumerate(read_text(path, error).splitlines(), start=1):
+        content = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
+        if content:
+            yield number, content
+
+
+def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[float]:
+    """The finite numbers of a line, apart by spaces or commas. Raises `error` at `where` otherwise."""
+    if len(text) > MAX_LINE:
+        raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
+    numbers = []
+    for word in text.replace(",", " ").split():
+        try:
+            number = float(word)
+        except ValueError:
+            raise error(f"{where}: `{word}` is not a number") from None
+        if not math.isfinite(number):
+            raise error(f"{where}: `{word}` is not a finite number")
+        numbers.append(number)
+    return numbers
+
+
+def parse_count(text: str) -> int | None:
+    """A whole number from 0 on, of at most 19 digits; None for anything else."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
+
+
+def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:
+    """Raises `error` at `where` unless a timestamp is later than the one before it."""
+    if timestamp <= before:
+        relation = "repeats" if timestamp == before else "is earlier than"
+        raise error(f"{where}: timestamp {timestamp!r} {relation} the one before")

@@ -1,0 +1,290 @@
+"""Recordings of ROS: bags of ROS 1 and 2, MCAP, through `rosbags` (the extra `bags`).
+
+`robot.bag?topic=/cam1/image_raw` names one of several cameras.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.calibration import Calibration
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.formats.calibration_files import checked
+from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, grey_to_tensor
+from torchslam.data.sequence import Sequence
+from torchslam.errors import FrameError, SequenceError
+from torchslam.utils.bounded_read import check_regular
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+LOOKS_FOR = "a ROS bag (.bag, .mcap, or a folder with metadata.yaml)"
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+MAX_MESSAGES = 2_000_000
+MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
+"""Bytes of a recording, and of the text that describes it."""
+MAX_FILES = 10_000
+SAMPLES = 20
+"""Images in which the brightest pixel is looked for, where they have 16 bits."""
+
+# https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them grey.
+GREY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
+COLOURS = {
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": (4, cv2.COLOR_BGRA2GRAY),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    # OpenCV names a pattern by its second row.
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of images, with the calibration that was recorded beside it.
+
+    times: seconds since 1970, by the images' own stamps, or by when they were recorded where they have none
+    """
+
+    connection: Connection
+    times: list[float]
+    calibration: Calibration | None
+
+
+class BagSequence(Sequence):
+    """The images of one topic, read in order; going back reads from the start again."""
+
+    def __init__(self, path: Path, reader: AnyReader, topic: Topic, camera: GivenCamera | None) -> None:
+        """Raises SequenceError where no image can be read, CalibrationError for a camera that does not fit."""
+        self._path, self._reader, self._connection = path, reader, topic.connection
+        # Messages may be recorded late: frames come in the order in which they were taken.
+        order = sorted(range(len(topic.times)), key=lambda message: topic.times[message])
+        self._messages = [
+            message
+            for number, message in enumerate(order)
+            if number == 0 or topic.times[message] > topic.times[order[number - 1]]
+        ]
+        self._position = 0
+        self._stream: Iterator[Any] = iter(())
+        self._rewind()
+        self._bits, size = 8, None
+        for message in sorted(self._messages)[:SAMPLES]:
+            image = self._read(message)
+            self._bits = max(self._bits, bit_depth([image]))
+            size = size or (image.shape[1], image.shape[0])
+        assert size is not None  # a topic has images
+        camera = topic.calibration if camera is None else camera
+        left_out = len(order) - len(self._messages)
+        super().__init__(
+            path.stem,
+            f"ROS bag, {topic.connection.topic}",
+            None if camera is None else fit_camera(camera, size, str(path)),
+            torch.tensor([topic.times[message] for message in self._messages], dtype=torch.float64),
+            size=size,
+            guessed=is_guessed(camera),
+            notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {
+            "_reader": None,
+            "_stream": None,
+            "_connection": self._connection.topic,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Raises SequenceError where the recording has gone."""
+        self.__dict__.update(state)
+        self._reader = _open_reader(self._path)
+        self._connection = _connection(self._reader, state["_connection"])
+        self._rewind()
+
+    def image(self, index: int) -> Tensor:
+        try:
+            grey = self._read(self._messages[index])
+        except SequenceError as error:
+            raise FrameError(str(error)) from error
+        if (grey.shape[1], grey.shape[0]) != self.size:
+            raise FrameError(f"{self.image_name(index)}: has another size than the first image")
+        return grey_to_tensor(grey, self._bits)
+
+    def image_name(self, index: int) -> str:
+        return f"{self._path}{self._connection.topic}#{index}"
+
+    def _rewind(self) -> None:
+        self._stream, self._position = self._reader.messages([self._connection]), 0
+
+    def _read(self, message: int) -> np.ndarray:
+        """(H, W) grey pixels of a message, by its place in the recording."""
+        if message < self._position:
+            self._rewind()
+        where = f"{self._path}{self._connection.topic}, message {message}"
+        with _errors(where):
+            while True:
+                _, _, raw = next(self._stream)
+                self._position += 1
+                if self._position > message:
+                    break
+            content: Any = self._reader.deserialize(raw, self._connection.msgtype)
+            if self._connection.msgtype == COMPRESSED:
+                grey = decode_pixels(content.data[:MAX_BYTES].tobytes())
+                if grey is None:
+                    raise SequenceError(f"{where}: `{content.format}` is not an image, or a damaged one")
+                return grey
+            return to_grey(content, where)
+
+
+def to_grey(message: Any, where: str) -> np.ndarray:
+    """A sensor_msgs/Image as (H, W), uint8 or uint16. Raises SequenceError at `where` for other encodings."""
+    encoding, step = message.encoding, message.step
+    height, width = message.height, message.width
+    if encoding in GREY:
+        kind = np.dtype(GREY[encoding])
+        channels, pixels = 1, kind.newbyteorder(">" if message.is_bigendian else "<")
+    elif encoding in COLOURS:
+        channels, pixels = COLOURS[encoding][0], np.dtype(np.uint8)
+    else:
+        known = ", ".join([*GREY, *COLOURS])
+        raise SequenceError(f"{where}: encoding `{encoding}` is not read; there are {known}")
+    row = width * channels * pixels.itemsize
+    if min(height, width) < 1 or step < row or len(message.data) < height * step:
+        raise SequenceError(
+            f"{where}: {len(message.data)} bytes are too few for {width}x{height} of {encoding}"
+        )
+    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, :row]
+    image = np.ascontiguousarray(rows).view(pixels)
+    if encoding in GREY:
+        return image.astype(GREY[encoding])
+    image = image.reshape(height, width, channels) if channels > 1 else image
+    return cv2.cvtColor(image, COLOURS[encoding][1])
+
+
+def matches(path: str) -> bool:
+    """Whether this is a bag's file, or the folder of one of ROS 2."""
+    source = Path(path.partition("?topic=")[0])
+    return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
+
+
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
+    """The images of a recording; without `camera`, by the camera_info beside them.
+
+    Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
+    """
+    name, _, query = path.partition("?")
+    wanted = dict(parse_qsl(query)).get("topic")
+    source = Path(name)
+    reader = _open_reader(source)
+    return BagSequence(source, reader, _find_topic(reader, name, wanted), camera)
+
+
+def _open_reader(path: Path) -> AnyReader:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
+    with _errors(str(path)):
+        for file in itertools.islice(path.iterdir(), MAX_FILES) if path.is_dir() else (path,):
+            if not file.is_dir():
+                limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
+                check_regular(file, limit, "a file of a recording")
+        # A single file of ROS 2 is in the folder of its recording, or a recording of its own.
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    return reader
+
+
+def _connection(reader: AnyReader, topic: str) -> Connection:
+    """The one that a topic's images come by."""
+    return next(
+        each for each in reader.connections if each.topic == topic and each.msgtype in (IMAGE, COMPRESSED)
+    )
+
+
+def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
+    """The topic to be read. Raises SequenceError where there is none, or several and none is named."""
+    if not all(isinstance(each.topic, str) for each in reader.connections):
+        raise SequenceError(f"{path}: cannot be read: topics without a name")
+    images = [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
+    topics = list(dict.fromkeys(each.topic for each in images if "depth" not in each.topic.lower()))
+    if wanted is not None:
+        topics = [wanted] if any(each.topic == wanted for each in images) else []
+    if not topics:
+        there = ", ".join(sorted({each.topic for each in images})) or "none"
+        raise SequenceError(f"{path}: no images on {wanted or 'any topic'}; topics of images: {there}")
+    if len(topics) > 1:
+        proposals = " or ".join(f"'{path}?topic={topic}'" for topic in topics[:6])
+        raise SequenceError(f"{path}: {len(topics)} topics of images; which one? Give {proposals}")
+    connection = _connection(reader, topics[0])
+    beside = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == beside]
+    calibration = None
+    times: list[float] = []
+    with _errors(path):
+        for info, _, raw in reader.messages(infos) if infos else ():
+            rectified = "rect" in topics[0].rpartition("/")[2] or "_rect" in topics[0]
+            calibration = from_camera_info(
+                reader.deserialize(raw, info.msgtype), f"{path}{beside}", rectified
+            )
+            break
+        for _, recorded, raw in reader.messages([connection]):
+            if len(times) == MAX_MESSAGES:
+                raise SequenceError(f"{path}: more than {MAX_MESSAGES} images")
+            stamp: Any = reader.deserialize(raw, connection.msgtype)
+            nanoseconds = stamp.header.stamp.sec * 1_000_000_000 + stamp.header.stamp.nanosec
+            times.append((nanoseconds or recorded) / 1e9)
+    if not times:
+        raise SequenceError(f"{path}: no images on {topics[0]}")
+    return Topic(connection, times, calibration)
+
+
+def from_camera_info(message: Any, source: str, rectified: bool) -> Calibration | None:
+    """The calibration in a sensor_msgs/CameraInfo; None where it is all zero, as drivers without one send it.
+
+    rectified: whether the images are, so that the projection P holds and no distortion
+    """
+    # ROS 1 has upper-case names.
+    K, D, P = (getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDP")
+    if K[0] <= 0:
+        return None
+    size = (int(message.width), int(message.height)) if message.width and message.height else None
+    if rectified and P[0] > 0:
+        return Calibration.from_numbers([P[0], P[5], P[2], P[6]], source, size=size)
+    intrinsics = [float(value) for value in (K[0], K[4], K[2], K[5])]
+    return checked(intrinsics, [float(value) for value in D], source, message.distortion_model, size)
+
+
+@contextlib.contextmanager
+def _errors(where: str) -> Iterator[None]:
+    """What reading a recording may raise, as SequenceError at `where`: damaged files fail in any way there is."""
+    try:
+        yield
+    except SequenceError:
+        raise
+    except StopIteration:
+        raise SequenceError(f"{where}: the recording ends before it") from None
+    except Exception as cause:  # rosbags and the decompressors below it have no common error
+        raise SequenceError(f"{where}: cannot be read: {type(cause).__name__}: {cause}") from cause

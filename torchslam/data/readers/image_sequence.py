@@ -1,0 +1,124 @@
+"""A sequence of image files: what the readers of ETH3D, TUM, KITTI, EuRoC and plain folders all end in."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import Iterable
+from collections.abc import Sequence as Listed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.calibration import size_text
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.formats.image_file import bit_depth, read_colour, read_grey, read_pixels
+from torchslam.data.formats.text_file import check_later
+from torchslam.data.sequence import Sequence
+from torchslam.errors import FrameError, SequenceError
+from torchslam.types import Trajectory
+
+SAMPLES = 20
+"""Images in which the brightest pixel of a sequence of 16 bits is looked for."""
+ATTEMPTS = 20
+"""Unreadable images after which a sequence is given up."""
+
+
+@dataclass(frozen=True)
+class ImageEntry:
+    """One image of a list.
+
+    timestamp: seconds
+    path:      of the image file
+    where:     the list's file and line that name it, or the image itself, for messages
+    """
+
+    timestamp: float
+    path: Path
+    where: str
+
+
+class ImageSequence(Sequence):
+    """Images from files, decoded when asked for."""
+
+    def __init__(
+        self,
+        name: str,
+        kind: str,
+        entries: Listed[ImageEntry],
+        camera: GivenCamera | None,
+        groundtruth: Trajectory | None = None,
+        notes: Iterable[str] = (),
+    ) -> None:
+        """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
+        first images can be read; CalibrationError for a camera of another image size."""
+        _check_order(name, entries)
+        size, self._bits = _examine(entries)
+        notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
+        super().__init__(
+            name,
+            kind,
+            None if camera is None else fit_camera(camera, size, name, entries[0].path),
+            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64),
+            groundtruth,
+            size=size,
+            guessed=is_guessed(camera),
+            notes=notes,
+        )
+        self._entries = entries
+
+    def image(self, index: int) -> Tensor:
+        entry = self._entries[index]
+        image = read_grey(entry.path, entry.where, self._bits)
+        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        return image
+
+    def colour(self, index: int) -> Tensor:
+        entry = self._entries[index]
+        image = read_colour(entry.path, entry.where)
+        self._check_size(entry, (image.shape[1], image.shape[0]))
+        return image
+
+    def image_name(self, index: int) -> str:
+        return str(self._entries[index].path)
+
+    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
+        if size != self.size:
+            raise FrameError(
+                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
+            )
+
+
+def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
+    if not entries:
+        raise SequenceError(f"{name}: no images")
+    for before, entry in itertools.pairwise(entries):
+        check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
+
+
+def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
+    """(width, height) that most of the first three readable images have, since the first may be the odd one, and how
+    many of their bits are used: of 16, what the brightest pixel of some images all along needs."""
+    sizes: list[tuple[int, int]] = []
+    failures: list[FrameError] = []
+    bits = 8
+    is_deep = False
+    for entry in entries:
+        try:
+            image = read_pixels(entry.path, entry.where)
+            sizes.append((image.shape[1], image.shape[0]))
+            bits, is_deep = max(bits, bit_depth([image])), is_deep or image.dtype == np.uint16
+        except FrameError as failure:
+            failures.append(failure)
+        if len(sizes) == 3 or len(failures) == ATTEMPTS:
+            break
+    if not sizes:
+        raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
+    for entry in entries[:: max(1, len(entries) // SAMPLES)] if is_deep else ():
+        with contextlib.suppress(FrameError):  # said when the frame is read
+            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where)]))
+    return Counter(sizes).most_common(1)[0][0], bits

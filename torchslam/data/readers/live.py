@@ -1,0 +1,242 @@
+"""A camera by its number, or a stream by its address: frames that nobody has time for are gone after a while."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.formats.image_file import grey_to_tensor
+from torchslam.data.readers.video import SUFFIXES
+from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.errors import FrameError, SequenceError
+
+LOOKS_FOR = "a camera's number, or an rtsp:// or http:// address"
+ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
+PATIENCE = 15.0
+"""Seconds without a frame after which a stream is taken to have ended."""
+BACKLOG = 10
+"""Frames that wait while one takes long, as one that is mapped does; the oldest goes when there are more."""
+STEADY = 1.0
+"""Seconds by which a source's own clock may run off from ours before it is not believed."""
+STALE = 0.5
+"""Seconds after which the frame that was looked at when the source was opened is no beginning of a run."""
+
+
+class Capture(Protocol):
+    """As much of cv2.VideoCapture as a live source needs."""
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, np.ndarray]: ...
+
+    def get(self, property_id: int) -> float: ...
+
+    def release(self) -> None: ...
+
+
+class LiveSequence(Sequence):
+    """Frames as they come, by a thread that keeps the newest few; `image` waits for one that is newer than the last.
+
+    It watches from the first frame that is asked for: until then nothing is missed, and there is no thread, beside
+    which other processes could not be copies of this one.
+
+    Frames are numbered as they are given, without gaps, whatever was dropped between them. Nobody knows how many there
+    will be, so that there is no `len`; behind the last frame comes `EndOfSequence`. Timestamps are seconds since 1970
+    at which a frame was captured, by the source's own clock where it has one that runs.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        capture: Capture,
+        camera: GivenCamera | None,
+        patience: float = PATIENCE,
+        backlog: int = BACKLOG,
+    ) -> None:
+        """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
+        self._capture = capture
+        self._patience = patience
+        self._clock = CaptureClock()
+        self._fresh = threading.Condition()
+        self._arrived: deque[tuple[float, np.ndarray]] = deque(maxlen=backlog)
+        self._ended = self._closing = False
+        self._dropped = self._replaced = 0
+        self._limit: int | None = None
+        self._given, self._time = 0, 0.0
+        self._is_watched = False
+        self._thread = self._watch_until(lambda: bool(self._arrived))
+        self._thread.join(patience)
+        if not self._arrived:
+            self.close()
+            raise SequenceError(f"{name}: no frame came within {patience:g} s: is it there, and free?")
+        first = self._arrived[0][1]
+        size = (first.shape[1], first.shape[0])
+        super().__init__(
+            name,
+            "live",
+            None if camera is None else fit_camera(camera, size, name),
+            torch.zeros(0, dtype=torch.float64),
+            size=size,
+            guessed=is_guessed(camera),
+        )
+
+    def __len__(self) -> int:
+        if self._limit is None:
+            raise TypeError(f"{self.name}: nobody knows how many frames there will be")
+        return self._limit
+
+    @property
+    def known_length(self) -> int | None:
+        return self._limit
+
+    @property
+    def dropped(self) -> int:
+        return self._dropped
+
+    @property
+    def waiting(self) -> int:
+        return len(self._arrived)
+
+    def part(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Sequence:
+        """The first `stop` frames: nothing else can be chosen of what is not there yet. Raises SequenceError."""
+        if start or stride != 1:
+            raise SequenceError(f"{self.name}: of a live source only the end can be chosen (--stop, --limit)")
+        self._limit = stop
+        return self
+
+    def image(self, index: int) -> Tensor:
+        """The next frame. Raises EndOfSequence where the source has ended, FrameError for a frame that is gone."""
+        if index < self._given:
+            raise FrameError(
+                f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
+            )
+        if not self._is_watched and not self._ended:
+            self._begin()
+        with self._fresh:
+            self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
+            if not self._arrived:
+                self.close()
+                raise EndOfSequence(f"{self.name}: ended after {self._given} frames")
+            self._time, frame = self._arrived.popleft()
+            self._dropped += self._replaced  # what comes after the last frame that is asked for is not missed
+            self._replaced = 0
+        self._given = index + 1
+        if (frame.shape[1], frame.shape[0]) != self.size:
+            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        return grey_to_tensor(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+
+    def image_name(self, index: int) -> str:
+        return f"{self.name}#{index}"
+
+    def timestamp(self, index: int) -> float:
+        return self._time
+
+    def describe(self) -> dict[str, str]:
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "frames": "as they come",
+            "size": f"{self.size[0]}x{self.size[1]}",
+            "camera": self._describe_camera(),
+        }
+
+    def close(self) -> None:
+        """Stop watching and let the source go."""
+        self._closing = True
+        if not self._thread.is_alive():
+            self._end()
+
+    def _begin(self) -> None:
+        """Watch from now on, without what was seen long ago."""
+        self._is_watched = True
+        if time.time() - self._arrived[0][0] > STALE:
+            self._arrived.clear()
+        self._thread = self._watch_until(lambda: False)
+
+    def _watch_until(self, is_enough: Callable[[], bool]) -> threading.Thread:
+        """A thread that keeps the newest frames until that is enough, the source ends or it is closed."""
+
+        def watch() -> None:
+            ends = True
+            try:
+                while not self._closing and self._keep_next():
+                    if is_enough():
+                        ends = False
+                        return
+            finally:
+                if ends:
+                    self._end()
+
+        thread = threading.Thread(target=watch, name="torchslam live source", daemon=True)
+        thread.start()
+        return thread
+
+    def _keep_next(self) -> bool:
+        """Whether there was one more frame, or one that could not be decoded."""
+        if not self._capture.grab():
+            return False
+        captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
+        decoded, frame = self._capture.retrieve()
+        if decoded:
+            with self._fresh:
+                self._replaced += len(self._arrived) == self._arrived.maxlen
+                self._arrived.append((captured, frame))
+                self._fresh.notify_all()
+        return True
+
+    def _end(self) -> None:
+        with self._fresh:
+            if not self._ended:
+                self._capture.release()
+            self._ended = True
+            self._fresh.notify_all()
+
+
+class CaptureClock:
+    """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
+
+    A frame's arrival wavers with the network and with what else the machine does; the source's clock does not.
+    """
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._own = self._last = 0.0
+
+    def at(self, own: float, now: float) -> float:
+        """Seconds since 1970 of a frame that has the time `own` and came at `now`; it never goes back."""
+        stands = own <= self._own  # a source without a clock says the same every time
+        if self._offset is None or stands or abs(own + self._offset - now) > STEADY:
+            self._offset = now - own
+        self._own = own
+        self._last = max(own + self._offset, self._last + 1e-6)
+        return self._last
+
+
+def matches(path: str) -> bool:
+    """Whether this is an address, or the number of a camera and no file."""
+    if ADDRESS.fullmatch(path):
+        return (
+            not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
+        )  # a file does not drop frames
+    return re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
+
+
+def open(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
+    """A camera or a stream. Raises SequenceError where it cannot be opened."""
+    number = path.isdecimal()
+    shown = re.sub(r"//[^/@]*@", "//", path)  # without a password
+    capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
+    if not capture.isOpened():
+        raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
+    return LiveSequence(f"camera {path}" if number else shown, capture, camera)

@@ -1,0 +1,1 @@
+"""Matching of descriptors: brute force, by projection, within a radius."""

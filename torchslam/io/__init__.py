@@ -1,0 +1,1 @@
+"""Results of a run: files, reports, plots, the viewer and exports."""

@@ -1,0 +1,101 @@
+"""What exports are made of: posed frames of one run in one world, the points they see, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchslam.errors import ResultsError
+from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
+from torchslam.map.submap import World
+
+
+@dataclass(frozen=True)
+class Scene:
+    """F posed frames in order of time, P points and O observations, ordered by frame; on the CPU.
+
+    frame_ids:   (F,) in the sequence; timestamps: (F,) seconds
+    is_keyframe: (F,) bool
+    T_cw:        (F, 4, 4)
+    points_w:    (P, 3), each seen by two frames or more; colors: (P, 3) uint8 red, green, blue
+    frame_index, point_index: (O,)
+    pixels:      (O, 2) of the observed keypoints
+    """
+
+    camera: Camera
+    frame_ids: Tensor
+    timestamps: Tensor
+    is_keyframe: Tensor
+    T_cw: Tensor
+    points_w: Tensor
+    colors: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    pixels: Tensor
+
+    @property
+    def T_wc(self) -> Tensor:
+        """(F, 4, 4) camera to world."""
+        return se3_inverse(self.T_cw)
+
+    @property
+    def image_names(self) -> list[str]:
+        """What the images are called in an export, in the order of their frames."""
+        return [f"{index:06d}.png" for index in self.frame_ids.tolist()]
+
+    def turned(self, R: Tensor) -> Scene:
+        """The same scene in a world that is turned by R (3, 3): points p become R p."""
+        T_cw = self.T_cw.clone()
+        T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
+        return replace(self, T_cw=T_cw, points_w=self.points_w @ R.mT)
+
+    def errors(self) -> Tensor:
+        """(O,) distances of the points' projections from the observed pixels."""
+        points_c = transform(self.T_cw[self.frame_index], self.points_w[self.point_index][:, None])
+        return squared_reprojection_errors(points_c[:, 0], self.pixels, self.camera).sqrt()
+
+    def point_errors(self) -> Tensor:
+        """(P,) mean of the errors of a point: their mean over all points is what COLMAP calls reprojection error."""
+        total = torch.zeros(len(self.points_w), dtype=self.pixels.dtype)
+        count = torch.bincount(self.point_index, minlength=len(total))
+        return total.index_add(0, self.point_index, self.errors()) / count
+
+
+def scene_of(world: World, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
+    """The frames of one session in a world that was read from a file, or its keyframes alone.
+
+    Observations of points that lie outside of the camera's model, and points that fewer than two of the frames see,
+    are left out. Raises ResultsError where there are no frames.
+    """
+    if world.map.num_keyframes == 0:
+        raise ResultsError(f"world {world.number} is empty")
+    graph = world.history.graph(world.map, camera, world.number)
+    wanted = (graph.sessions == session) & (graph.is_keyframe | (not keyframes_alone))
+    rows = torch.nonzero(wanted)[:, 0]
+    if len(rows) == 0:
+        raise ResultsError(
+            f"world {world.number} holds no frames of this run: it was only localised, or all of it is elsewhere"
+        )
+    rows = rows[torch.argsort(graph.timestamps[rows], stable=True)]
+    slot = torch.full((len(graph.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
+    points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
+    is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
+    tracks = torch.bincount(graph.point_index[is_kept], minlength=len(graph.points_w))
+    is_kept &= tracks[graph.point_index] >= 2
+    seen = torch.nonzero(is_kept)[:, 0]
+    seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
+    points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
+    return Scene(
+        camera=camera.to(torch.float64),
+        frame_ids=graph.frame_ids[rows],
+        timestamps=graph.timestamps[rows],
+        is_keyframe=graph.is_keyframe[rows],
+        T_cw=graph.T_cw[rows].double(),
+        points_w=graph.points_w[points].double(),
+        colors=world.map.points["colors"][graph.point_ids[points]],
+        frame_index=slot[graph.frame_index[seen]],
+        point_index=point_index,
+        pixels=graph.pixels[seen].double(),
+    )

@@ -1,0 +1,265 @@
+"""Where the camera went and what it saw: path, map and camera axes, in two 3-D views and from above."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from torchslam.io.plots import style
+from torchslam.io.plots.ellipses import draw_ellipses
+from torchslam.types import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+    from mpl_toolkits.mplot3d import Axes3D
+
+MAX_POINTS = 25_000
+MAX_CAMERAS = 30
+MAX_ELLIPSES = 1500  # of points; more hide the picture
+POINT_ELLIPSE = "#cdc6c9"
+TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Everything drawn, as numpy arrays in upright axes (z up)."""
+
+    path: np.ndarray
+    rotations: np.ndarray
+    cameras: np.ndarray
+    camera_covariances: np.ndarray  # of their positions; zero where unknown
+    points: np.ndarray
+    point_covariances: np.ndarray
+    groundtruth: np.ndarray
+    labels: tuple[str, str, str]
+    gaps: np.ndarray
+
+
+def plot_scene(
+    trajectory: Trajectory,
+    points_w: Tensor,
+    groundtruth: Trajectory | None = None,
+    keyframes: Trajectory | None = None,
+    unit: str = "m",
+    title: str = "",
+) -> Figure:
+    """The path, the map and the camera axes from two sides, equal scales on all axes.
+
+    trajectory: every posed frame, already aligned to the ground truth where there is one
+    points_w:   (L, 3) in the same frame
+    keyframes:  whose axes are drawn: red x, green y, blue z (the viewing direction); by default all frames'
+    unit:       of length; "" where the scale is unknown
+    """
+    scene = _scene(trajectory, points_w, groundtruth, keyframes)
+    box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
+    with style.house_style():
+        figure = style.new_figure(11.0, 4.7)
+        # The layout engine would leave half of the picture to the invisible corners of the cubes.
+        figure.set_layout_engine("none")
+        for column, azimuth in enumerate((-62.0, 28.0)):
+            axes = figure.add_axes((0.52 * column, 0.07, 0.48, 0.87), projection="3d", computed_zorder=False)
+            _draw_3d(axes, scene, box, azimuth, style.length_label(unit))
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="lower center", ncols=len(labels))
+        figure.suptitle(_title(title, scene, box), x=0.015, y=0.98, ha="left", fontsize=10.5)
+    return figure
+
+
+def plot_top_view(
+    trajectory: Trajectory,
+    points_w: Tensor,
+    groundtruth: Trajectory | None = None,
+    keyframes: Trajectory | None = None,
+    unit: str = "m",
+    title: str = "",
+    keyframe_covariances_w: Tensor | None = None,
+    point_covariances_w: Tensor | None = None,
+) -> Figure:
+    """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
+
+    keyframe_covariances_w, point_covariances_w: (K, 3, 3) and (L, 3, 3) of the positions, drawn as ellipses of three
+        standard deviations, those of keyframes magnified by the power of ten in the legend; none where they are zero
+    """
+    scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
+    box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
+    span = box[:, 1] - box[:, 0]
+    width = float(np.clip(6.2 * span[0] / span[1], 4.5, 11.0))
+    with style.house_style():
+        figure = style.new_figure(width, float(np.clip(width * span[1] / span[0], 3.2, 7.0)) + 0.7)
+        axes = figure.add_subplot()
+        _draw_above(axes, scene, box)
+        label = style.length_label(unit)
+        axes.set(xlim=box[0], ylim=box[1], aspect="equal")
+        axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
+        figure.suptitle(_wrapped(_title(title, scene, box), width), x=0.02, ha="left", fontsize=10.5)
+        figure.legend(loc="outside lower center", ncols=4 if width > 8.0 else 2)
+    return figure
+
+
+def _scene(
+    trajectory: Trajectory,
+    points_w: Tensor,
+    groundtruth: Trajectory | None,
+    keyframes: Trajectory | None,
+    keyframe_covariances_w: Tensor | None = None,
+    point_covariances_w: Tensor | None = None,
+) -> _Scene:
+    T_wc = style.to_numpy(trajectory.T_wc)
+    upright, labels = style.upright_axes(T_wc)
+    shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
+    rows = style.thin(len(shown), MAX_CAMERAS)
+    points = style.to_numpy(points_w).reshape(-1, 3)
+    finite = np.isfinite(points).all(axis=1)
+    truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
+    return _Scene(
+        path=T_wc[:, :3, 3] @ upright.T,
+        rotations=upright @ shown[rows, :3, :3],
+        cameras=shown[rows, :3, 3] @ upright.T,
+        camera_covariances=_turned(keyframe_covariances_w, len(shown), upright)[rows],
+        points=points[finite] @ upright.T,
+        point_covariances=_turned(point_covariances_w, len(points), upright)[finite],
+        groundtruth=truth @ upright.T,
+        labels=labels,
+        gaps=_gaps(style.to_numpy(trajectory.timestamps)),
+    )
+
+
+def _turned(covariances_w: Tensor | None, count: int, upright: np.ndarray) -> np.ndarray:
+    """Covariances (count, 3, 3) in upright axes, zero where there are none."""
+    if covariances_w is None:
+        return np.zeros((count, 3, 3))
+    return upright @ style.to_numpy(covariances_w) @ upright.T
+
+
+def _gaps(timestamps: np.ndarray) -> np.ndarray:
+    """Rows before which the path is broken: more than five usual intervals without a pose."""
+    if len(timestamps) < 3:
+        return np.zeros(0, dtype=int)
+    intervals = np.diff(timestamps)
+    return np.flatnonzero(intervals > 5.0 * np.median(intervals)) + 1
+
+
+def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit: str) -> None:
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    points = _drawn_points(scene.points, box)
+    axes.scatter(*points.T, c=points[:, 2], depthshade=False, zorder=1, **_dots(points))
+    for index, part in enumerate(np.split(scene.path, scene.gaps)):
+        axes.plot(*part.T, color=style.ESTIMATE, lw=2.4, zorder=3, label="_" * (index > 0) + "estimate")
+    if len(scene.groundtruth):
+        axes.plot(*scene.groundtruth.T, zorder=4, label="ground truth", **TRUTH_LINE)
+    length = 0.04 * float((box[:, 1] - box[:, 0]).max())
+    for axis, color in enumerate(style.AXES_RGB):
+        tips = scene.cameras + length * scene.rotations[:, :, axis]
+        lines = Line3DCollection(np.stack([scene.cameras, tips], axis=1), colors=color, lw=1.0, zorder=2)
+        lines.set_label(f"camera {'xyz'[axis]}")
+        axes.add_collection3d(lines)
+    axes.set(xlim=box[0], ylim=box[1], zlim=box[2], proj_type="ortho")
+    axes.view_init(elev=28.0, azim=azimuth)
+    _fit(axes, box)
+    for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), scene.labels, strict=True):
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis.set_label_text(f"{name} ({unit})")
+        axis.labelpad = 0.0 if axis is axes.zaxis else 6.0
+        axis.set_major_locator(_few_ticks())
+
+
+def _fit(axes: Axes3D, box: np.ndarray) -> None:
+    """Equal scales, and the largest zoom at which the box and its labels stay in their half of the picture."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    spans = box[:, 1] - box[:, 0]
+    axes.set_box_aspect(tuple(spans))
+    axes.apply_aspect()
+    corners = np.stack(np.meshgrid(*box, indexing="ij"), axis=-1).reshape(-1, 3)
+    x, y, _ = proj_transform(*corners.T, axes.get_proj())
+    room = axes.get_position(original=True)
+    extent = np.ptp(axes.transData.transform(np.stack([x, y], axis=1)), axis=0)
+    available = np.array([room.width, room.height]) * axes.get_figure(root=True).bbox.size
+    axes.set_box_aspect(tuple(spans), zoom=float(0.84 * (available / extent).min()))
+
+
+def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
+    from matplotlib.collections import LineCollection
+
+    points = _drawn_points(scene.points, box)
+    label = "map point (lighter: higher)"
+    axes.scatter(points[:, 0], points[:, 1], c=points[:, 2], label=label, **_dots(points))
+    for index, part in enumerate(np.split(scene.path, scene.gaps)):
+        axes.plot(*part[:, :2].T, color=style.ESTIMATE, lw=2.4, label="_" * (index > 0) + "estimate")
+    if len(scene.groundtruth):
+        axes.plot(*scene.groundtruth[:, :2].T, label="ground truth", **TRUTH_LINE)
+    length = 0.035 * float((box[:, 1] - box[:, 0]).max())
+    tips = scene.cameras + length * scene.rotations[:, :, 2]
+    lines = LineCollection(
+        list(np.stack([scene.cameras, tips], axis=1)[:, :, :2]), colors=style.AXES_RGB[2], lw=0.9
+    )
+    lines.set_label("viewing direction")
+    axes.add_collection(lines)
+    rows = style.thin(len(scene.points), MAX_ELLIPSES)
+    draw_ellipses(
+        axes,
+        scene.points[rows, :2],
+        scene.point_covariances[rows, :2, :2],
+        "map point",
+        POINT_ELLIPSE,
+        linewidth=0.5,
+        zorder=0.5,
+    )
+    width = float((box[:, 1] - box[:, 0]).max())
+    draw_ellipses(
+        axes,
+        scene.cameras[:, :2],
+        scene.camera_covariances[:, :2, :2],
+        "keyframe",
+        style.ACCENT,
+        magnified_in=width,
+    )
+    if len(scene.path):
+        axes.plot(*scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, label="start")
+        axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, label="end")
+
+
+def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """The points (L, 3) inside the picture, thinned where there are very many."""
+    points = points[style.inside(points[:, : len(box)], box)]
+    return points[style.thin(len(points), MAX_POINTS)]
+
+
+def _dots(points: np.ndarray) -> dict[str, Any]:
+    """How points are drawn: larger where there are few, in muted colours away from those of the path."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    heights = LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])
+    return {
+        "cmap": heights,
+        "s": float(np.clip(8e3 / max(len(points), 1), 1.5, 5.0)),
+        "alpha": 0.75,
+        "linewidths": 0,
+    }
+
+
+def _few_ticks() -> MaxNLocator:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=5, steps=[1, 2, 5, 10])
+
+
+def _wrapped(title: str, width_inches: float) -> str:
+    """The title in lines that fit a narrow picture."""
+    return "\n".join(textwrap.wrap(title, int(12 * width_inches)))
+
+
+def _title(title: str, scene: _Scene, box: np.ndarray) -> str:
+    """The caption with the figures behind the picture: points, and how many of them lie outside of it."""
+    dimensions = len(box)
+    outside = len(scene.points) - int(style.inside(scene.points[:, :dimensions], box).sum())
+    figures = f"{len(scene.path)} poses, {len(scene.points)} points"
+    figures += f" ({outside} outside the picture)" if outside else ""
+    return f"{title}: {figures}" if title else figures

@@ -1,0 +1,185 @@
+"""What view.html shows: the worlds of a run with z up, around their middle, as far as a page can hold them."""
+
+from __future__ import annotations
+
+import base64
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.association import nearest
+from torchslam.errors import TrajectoryError
+from torchslam.evaluation import Evaluation, evaluate
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.conventions import upright_rotation
+from torchslam.io.export.recording import gaps
+from torchslam.io.pictures import aligned
+from torchslam.io.plots.style import robust_box, thin
+from torchslam.io.results import Results
+from torchslam.map.submap import World
+from torchslam.system.run import keyframe_trajectory
+from torchslam.types import State, Trajectory
+
+MAX_POINTS = 150_000  # of all worlds together: 20 bytes each in the page
+MAX_FRAMES = 20_000  # 100 bytes each in the page
+MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
+FRUSTUM = 0.035  # its depth, in radii of the scene
+STATES = tuple(State)
+
+
+def page_data(results: Results) -> dict[str, Any]:
+    """Everything that the page needs, ready for JSON; the numbers as `encoded`. Same results, same data.
+
+    frames: one row for each that is shown: index, seconds since the first, state, ...
+    worlds: those with frames of the run, the main one first, each as `_world` has it
+    """
+    figures = results.metrics
+    frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
+    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
+    reasons = list(dict.fromkeys(frame.reason for frame in frames))
+    number_of = {reason: number for number, reason in enumerate(reasons)}
+    paths = {figures["world"]: results.trajectory} | results.others
+    shown = [world for world in results.worlds if len(paths.get(world.number, ()))]
+    shown.sort(key=lambda world: world.number != figures["world"])
+    budget = MAX_POINTS / max(sum(world.map.num_points for world in shown), 1)
+    accuracy = f" · ATE {figures['ate_m']:.3g} m" if "ate_m" in figures else ""
+    return {
+        "title": Path(figures.get("source") or "torchslam").name,
+        "facts": f"{len(results.frames)} frames, {figures['posed']} posed{accuracy}",
+        "failure": figures.get("failure", ""),
+        "corners": _corners(results.camera).tolist(),
+        "reasons": reasons,
+        "frames": {
+            "index": encoded([frame.index for frame in frames], "int32"),
+            "seconds": encoded(times - times[:1], "float64"),
+            "state": encoded([STATES.index(frame.state) for frame in frames], "uint8"),
+            "keyframe": encoded([frame.is_keyframe for frame in frames], "uint8"),
+            "inliers": encoded([frame.inliers for frame in frames], "int32"),
+            "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
+        },
+        "worlds": [
+            _world(world, paths[world.number], results, times, int(budget * world.map.num_points))
+            for world in shown
+        ],
+    }
+
+
+def encoded(values: Tensor | np.ndarray | list[Any], kind: str) -> dict[str, str]:
+    """Numbers as base64 of their little-endian bytes, row by row."""
+    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
+    if sys.byteorder == "big":
+        array = array.byteswap()
+    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def decoded(packed: dict[str, str]) -> np.ndarray:
+    """What `encoded` made of numbers, flat."""
+    kind = np.dtype(packed["type"]).newbyteorder("<")
+    return np.frombuffer(base64.b64decode(packed["data"]), kind)
+
+
+def _world(
+    world: World, path: Trajectory, results: Results, times: Tensor, max_points: int
+) -> dict[str, Any]:
+    """A world as it is shown: upright, around the middle of its box; aligned and in metres with ground truth.
+
+    S_shown_map: (4, 4) similarity from the map to what is shown
+    frame, keyframe: (F,), (K,) rows of `frames`; poses, keyframe_poses: (F, 3, 4), (K, 3, 4) camera to world
+    errors:      (F,) metres, NaN where unknown; breaks: rows before which the path is broken
+    truth:       (M, 3); points, colors: (P, 3), no colours where no image was seen; points_total: before thinning
+    box:         (2, 3) lowest and highest corner around what matters; radius: half its diagonal
+    """
+    evaluation = _evaluation(path, results)
+    S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
+    keyframes = keyframe_trajectory(world.map, results.session)
+    up = torch.eye(4, dtype=torch.float64)
+    up[:3, :3] = upright_rotation(aligned(Trajectory(path.timestamps, se3_inverse(world.map.T_cw)), S).T_wc)
+    S = up @ S
+    points_w, colors = _points(world)
+    box = torch.from_numpy(
+        robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy()).T.copy()
+    )
+    S[:3, 3] -= box.mean(dim=0)
+    box = box - box.mean(dim=0)
+    errors = torch.full((len(path),), torch.nan, dtype=torch.float64)
+    truth = torch.zeros(0, 3, dtype=torch.float64)
+    if evaluation is not None:
+        errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
+        to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
+        truth = transform(to_shown, _during(results, path).positions_w)
+        truth = truth[thin(len(truth), MAX_FRAMES)]
+    frame, rows = _shown_rows(path.timestamps, times)
+    keyframe, keyframe_rows = _shown_rows(keyframes.timestamps, times)
+    shown, kept = aligned(path, S).T_wc[rows], torch.from_numpy(thin(len(points_w), max_points))
+    breaks = gaps(frame)
+    steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
+    steps[[row - 1 for row in breaks]] = 0.0
+    return {
+        "name": f"{world.number}" + (", the main one" if world.number == results.metrics["world"] else ""),
+        "unit": "" if evaluation is None else "m",
+        "S_shown_map": S.tolist(),
+        "frame": encoded(frame, "int32"),
+        "poses": encoded(shown[:, :3], "float32"),
+        "errors": encoded(errors[rows], "float32"),
+        "breaks": breaks,
+        "path_length": float(steps.sum()),
+        "truth": encoded(truth, "float32"),
+        "keyframe": encoded(keyframe, "int32"),
+        "keyframe_poses": encoded(aligned(keyframes, S).T_wc[keyframe_rows][:, :3], "float32"),
+        "points": encoded(transform(S, points_w)[kept], "float32"),
+        "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
+        "points_total": len(points_w),
+        "box": box.tolist(),
+        "radius": float((box[1] - box[0]).norm()) / 2,
+        "frustum": FRUSTUM * float((box[1] - box[0]).norm()) / 2,
+    }
+
+
+def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
+    """The errors of the poses in a world; None where there is nothing to compare them with."""
+    if results.groundtruth is None:
+        return None
+    try:
+        return evaluate(path, results.groundtruth)
+    except TrajectoryError:
+        return None
+
+
+def _during(results: Results, path: Trajectory) -> Trajectory:
+    """The ground truth from the first to the last pose of a world."""
+    truth = results.groundtruth
+    assert truth is not None  # else there is no evaluation
+    during = (truth.timestamps >= path.timestamps[0]) & (truth.timestamps <= path.timestamps[-1])
+    return Trajectory(truth.timestamps[during], truth.T_wc[during])
+
+
+def _points(world: World) -> tuple[Tensor, Tensor]:
+    """(P, 3) positions and (P, 3) colours of the living points."""
+    if world.map.num_points == 0:
+        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
+    ids = world.map.living_points()
+    positions_w = world.map.positions_w[ids].double()
+    finite = positions_w.isfinite().all(dim=-1)
+    return positions_w[finite], world.map.points["colors"][ids][finite]
+
+
+def _shown_rows(timestamps: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Which of the frames that are shown have a pose, ascending, and in which row of the poses it is."""
+    if len(timestamps) == 0 or len(times) == 0:
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    row, distance = nearest(times, timestamps)
+    frame = torch.nonzero(distance < 1e-6)[:, 0]  # files keep nanoseconds
+    return frame, row[frame]
+
+
+def _corners(camera: Camera) -> Tensor:
+    """(4, 3) rays through the corners of the image, one unit ahead, in turn around it."""
+    fx, fy, cx, cy = camera.params.double()[:4]
+    x = (torch.tensor([0.0, 1, 1, 0]) * (camera.width - 1) - cx) / fx
+    y = (torch.tensor([0.0, 0, 1, 1]) * (camera.height - 1) - cy) / fy
+    slopes = torch.stack((x, y), dim=-1).clamp(-MAX_SLOPE, MAX_SLOPE)
+    return torch.nn.functional.pad(slopes, (0, 1), value=1.0)

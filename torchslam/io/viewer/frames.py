@@ -1,0 +1,234 @@
+"""The frames of a run as they pass: live in rerun, and as a film of what was tracked."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import warnings
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.sequence import Sequence, Transformed
+from torchslam.errors import ResultsError
+from torchslam.geometry import se3_inverse
+from torchslam.io.export.recording import APPLICATION, CAMERA, Recorder, gaps, import_rerun
+from torchslam.io.export.undistortion import Undistorter, pinhole_within, undistorted_pixels
+from torchslam.map.map import Map
+from torchslam.system.run import Run
+from torchslam.system.slam import SLAM
+from torchslam.types import State, StepResult, Trajectory
+
+VIDEO = "tracked.mp4"
+MAX_WIDTH = 960  # pixels of the film: it is to stay small
+BAR = 26  # pixels, for the words under the image
+USUAL_RATE = 30.0  # frames per second of a film of what nobody knows the rate of
+COLOURS = {  # blue, green, red
+    State.INITIALIZING: (170, 200, 215),
+    State.TRACKING: (65, 190, 87),
+    State.UNCERTAIN: (225, 130, 190),
+    State.LOST: (61, 85, 200),
+}
+UNMATCHED = (150, 150, 150)
+FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
+
+
+@dataclass(frozen=True)
+class Glimpse:
+    """One frame and what became of it.
+
+    image:     (H, W) uint8 grey
+    keypoints: (N, 2) all that were found; tracked: (m, 2) those whose map points hold the pose, where it is believed
+    """
+
+    result: StepResult
+    image: np.ndarray
+    keypoints: Tensor
+    tracked: Tensor
+
+
+class Screen(Protocol):
+    """Shows frames one after the other."""
+
+    def show(self, glimpse: Glimpse) -> None: ...
+
+    def end(self, run: Run) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Watching:
+    """Passes what a run sees on to screens.
+
+    sequence: to be run instead of the one that is watched: it remembers the last image, so that none is read twice
+    """
+
+    def __init__(self, slam: SLAM, sequence: Sequence, screens: list[Screen]) -> None:
+        self._slam, self._screens = slam, screens
+        self._closing = ExitStack()
+        for screen in screens:
+            self._closing.callback(screen.close)
+        self._memory = _Memory(sequence) if screens else None
+        self.sequence = self._memory or sequence
+
+    def __enter__(self) -> Watching:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._closing.close()
+
+    def show(self, result: StepResult) -> None:
+        """After a frame."""
+        if self._memory is None:
+            return
+        assert self._memory.last is not None  # the frame's own
+        seen = self._slam.seen
+        glimpse = Glimpse(
+            result,
+            (self._memory.last[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy(),
+            seen.keypoints[seen.mask],
+            tracked_pixels(self._slam, result.index),
+        )
+        for screen in self._screens:
+            screen.show(glimpse)
+
+    def end(self, run: Run) -> None:
+        """After the last frame, and all that was learned since."""
+        for screen in self._screens:
+            screen.end(run)
+
+
+class _Memory(Transformed):
+    """The same sequence, which remembers the last image that was read."""
+
+    last: Tensor | None = None
+
+    def image(self, index: int) -> Tensor:
+        self.last = super().image(index)
+        return self.last
+
+
+def tracked_pixels(slam: SLAM, index: int) -> Tensor:
+    """(m, 2) where a frame of this session sees map points; none while its pose is not believed."""
+    frames, seen = slam.history.frames, slam.history.observations
+    if len(frames) == 0 or len(seen) == 0:
+        return torch.zeros(0, 2, dtype=torch.float64)
+    is_it = (frames["frame_index"] == index) & (frames["session"] == slam.session.number)
+    return seen["pixels"][torch.isin(seen["row"], torch.nonzero(is_it)[:, 0])]
+
+
+class LiveView:
+    """A viewer of rerun that follows a run: camera, image and keypoints of every frame, the map at every keyframe.
+
+    The world is that of the map, y down. Images and keypoints are shown without distortion.
+    """
+
+    def __init__(self, slam: SLAM, recording: Any) -> None:
+        """Raises ResultsError for a camera that no pinhole can stand for."""
+        self._slam, self._recording, self._recorder = slam, recording, Recorder(recording)
+        self._camera = slam.camera.to("cpu")
+        self._pinhole = pinhole_within(self._camera)
+        self._undistort = None if self._camera.model == "pinhole" else Undistorter(self._camera)
+        self._start: float | None = None
+        self._state: State | None = None
+        self._recorder.world("RDF")
+        self._recorder.lens(CAMERA, self._pinhole)
+
+    @classmethod
+    def spawn(cls, slam: SLAM) -> LiveView:
+        """In a window of its own. Raises ResultsError where there is no rerun, or its viewer does not start."""
+        rr = import_rerun()
+        recording = rr.RecordingStream(APPLICATION)
+        try:
+            # It came with rerun; that is not on the path where the environment is not activated.
+            beside = shutil.which("rerun", path=str(Path(sys.executable).parent))
+            rr.spawn(recording=recording, executable_path=beside)
+        except RuntimeError as error:
+            raise ResultsError(f"--view: the viewer of rerun does not start: {error}") from None
+        return cls(slam, recording)
+
+    def show(self, glimpse: Glimpse) -> None:
+        result, recorder = glimpse.result, self._recorder
+        self._start = result.timestamp if self._start is None else self._start
+        recorder.at(result.index, result.timestamp - self._start)
+        if result.T_cw is not None:
+            recorder.pose(CAMERA, se3_inverse(result.T_cw))
+        recorder.image(CAMERA, glimpse.image if self._undistort is None else self._undistort(glimpse.image))
+        pixels = glimpse.tracked.cpu()
+        if self._undistort is not None:
+            pixels = undistorted_pixels(pixels.to(self._camera.params), self._camera, self._pinhole)
+        recorder.keypoints(CAMERA, pixels)
+        if result.state is not self._state:
+            self._state = result.state
+            recorder.words("state", ": ".join(filter(None, (result.state.value, result.reason))))
+        if result.is_keyframe:
+            slam = self._slam
+            self._map(slam.map, slam.history.trajectory(slam.map, slam.session.number), painted=False)
+
+    def end(self, run: Run) -> None:
+        if len(run.trajectory):
+            self._map(run.map, run.trajectory, painted=True)
+
+    def close(self) -> None:
+        try:
+            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+        except RuntimeError as error:  # somebody closed the window: the run itself is well
+            warnings.warn(f"the viewer of rerun did not get everything: {error}", stacklevel=2)
+        self._recording.disconnect()
+
+    def _map(self, slam_map: Map, path: Trajectory, painted: bool) -> None:
+        ids = slam_map.living_points()
+        self._recorder.points(slam_map.positions_w[ids], slam_map.points["colors"][ids] if painted else None)
+        self._recorder.path(path.positions_w, gaps(path.timestamps))
+
+
+class Film:
+    """tracked.mp4: every frame with its keypoints, those that hold the pose in the colour of the state."""
+
+    def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
+        """size: (width, height) of the images. Raises ResultsError where no film can be written."""
+        self._scale = min(1.0, MAX_WIDTH / size[0])
+        # Codecs ask for even sides.
+        self._size = (int(size[0] * self._scale) // 2 * 2, int(size[1] * self._scale) // 2 * 2)
+        self._writer = cv2.VideoWriter(
+            str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (self._size[0], self._size[1] + BAR)
+        )
+        if not self._writer.isOpened():
+            raise ResultsError(f"{path}: this OpenCV cannot write it")
+
+    def show(self, glimpse: Glimpse) -> None:
+        result = glimpse.result
+        image = cv2.cvtColor(
+            cv2.resize(glimpse.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
+        )
+        for pixels, colour, radius in (
+            (glimpse.keypoints, UNMATCHED, 1),
+            (glimpse.tracked, COLOURS[result.state], 3),
+        ):
+            for x, y in (pixels * self._scale).round().int().tolist():
+                cv2.circle(image, (x, y), radius, colour, 1, cv2.LINE_AA)
+        image = cv2.copyMakeBorder(image, 0, BAR, 0, 0, cv2.BORDER_CONSTANT, value=(24, 21, 19))
+        words = f"{result.index}  {result.state.value}  {result.inliers or ''}  {result.reason}"
+        place = (8, image.shape[0] - 8)
+        cv2.putText(
+            image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, COLOURS[result.state], 1, cv2.LINE_AA
+        )
+        self._writer.write(image)
+
+    def end(self, run: Run) -> None:
+        """Nothing: what is learned later does not change what was seen."""
+
+    def close(self) -> None:
+        self._writer.release()
+
+
+def film_of(sequence: Sequence, directory: Path) -> Film:
+    """A film of a sequence in the folder of results, at its rate."""
+    rate = sequence.frame_rate if sequence.known_length is not None and len(sequence.timestamps) > 1 else 0.0
+    return Film(directory / VIDEO, sequence.size, rate or USUAL_RATE)

@@ -1,0 +1,7 @@
+"""Places that were seen before: which keyframes look like a frame."""
+
+from __future__ import annotations
+
+from torchslam.loop_closing.keyframe_database import Places
+
+__all__ = ["Places"]

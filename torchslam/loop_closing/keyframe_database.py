@@ -1,0 +1,155 @@
+"""Which keyframes show the same place as a frame? The memory of places that relocalisation and loop closing ask.
+
+The score of two images sums, over the words they share, how rare the word is and how close their codes are
+(`global_descriptor`). It is 1 for an image with itself and 0 for images without anything in common. How well it
+finds places, beside the alternatives, and what a query costs: experiments/places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from torchslam.loop_closing.global_descriptor import binary, likeness, rendered_words, words_and_codes
+
+STRONGEST = (
+    400  # descriptors of an image that count: nearly as good as all of them, at less than half the cost
+)
+NO_KEY = -1
+
+_CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
+_FIRST_CAPACITY = 64
+_MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
+
+
+class Places:
+    """Keyframes, named by keys of the caller, as words and codes; asked for those that look like a frame.
+
+    Rows of descriptors are in order of falling strength, as the extractors give them. Floats (N, D) of unit length
+    serve as well as bits (N, 32); all images of one memory must be of one kind.
+
+    words: (W, 32) uint8, the vocabulary. Without it, bits use that of rendered images, which the package brings along,
+           and floats the descriptors of the first keyframe that has at least 64.
+    """
+
+    def __init__(self, words: Tensor | None = None) -> None:
+        self._words = words
+        self._keys = torch.zeros(0, dtype=torch.int64)  # (slots,) NO_KEY where the slot is free
+        self._codes = torch.zeros(0, 0, dtype=torch.int64)  # (W, slots), of each word in each keyframe
+        self._used = torch.zeros(0, 0)  # (W, slots) float32, 1 where the keyframe has the word, else 0
+        self._slots: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        """How many keyframes there are."""
+        return len(self._slots)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._slots
+
+    @property
+    def keys(self) -> Tensor:
+        """(n,) int64 keys of all keyframes, ascending."""
+        return torch.sort(self._keys[self._keys != NO_KEY]).values
+
+    # --- changing --------------------------------------------------------------------------------------------
+
+    def add(self, key: int, descriptors: Tensor, mask: Tensor) -> None:
+        """Remember a keyframe by its descriptors (N, 32) uint8 or (N, D) floats, those of the mask (N,).
+
+        Raises ValueError for a negative key or one that is already there.
+        """
+        if key < 0 or key in self._slots:
+            raise ValueError(f"a key must be new and at least 0, not {key}")
+        floats, descriptors = descriptors.is_floating_point(), _strongest(descriptors, mask)
+        slot = self._free_slot(descriptors.device)
+        if self._words is None and (not floats or len(descriptors) >= _MIN_FLOAT_WORDS):
+            self._words = descriptors if floats else rendered_words(descriptors.device)
+        if self._words is not None and len(self._codes) == 0:
+            self._take_words(self._words.to(descriptors.device))
+        if self._words is not None:
+            used, codes = words_and_codes(descriptors, self._words)
+            self._used[used, slot], self._codes[used, slot] = 1.0, codes
+        self._keys[slot] = key
+        self._slots[key] = slot
+
+    def remove(self, keys: Tensor | Iterable[int]) -> None:
+        """Forget keyframes (n,). Raises KeyError, before anything changes, where one is not there."""
+        keys = _as_list(keys)
+        slots = [self._slots[key] for key in keys]
+        self._keys[slots] = NO_KEY
+        self._used[:, slots] = 0.0
+        for key in keys:
+            self._slots.pop(key, None)
+
+    # --- asking ----------------------------------------------------------------------------------------------
+
+    def query(self, descriptors: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """All keyframes by their similarity to an image of descriptors (N, 32) or (N, D), those of the mask (N,).
+
+        Returns keys (n,) int64 and scores (n,) float32 in [0, 1], the best first, of equals the lower key first.
+        """
+        if not self._slots or self._words is None:
+            return self.keys, torch.zeros(len(self), device=self._keys.device)
+        return self._ranked(*words_and_codes(_strongest(descriptors, mask), self._words))
+
+    def like(self, key: int) -> tuple[Tensor, Tensor]:
+        """As `query` for the image of a keyframe that is there. Raises KeyError where it is not."""
+        slot = self._slots[key]
+        used = torch.nonzero(self._used[:, slot])[:, 0]
+        return self._ranked(used, self._codes[used, slot])
+
+    def _ranked(self, used: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and scores by similarity to an image that uses words (n,) with codes (n,), in order."""
+        size = len(self._keys)
+        # A word that no keyframe has yet is taken to be as rare as one that a single one has.
+        rarity = torch.log((len(self) + 1) / self._used.sum(1).clamp(min=1.0)).square()
+        shared = self._used.new_zeros(size)
+        for rows in torch.arange(len(used), device=used.device).split(max(1, _CHUNK // size)):
+            word = used[rows]
+            alike = likeness(self._codes.index_select(0, word), codes[rows, None])
+            shared += rarity[word] @ alike.mul_(self._used.index_select(0, word))
+        own = rarity[used].sum()
+        scores = shared / (own * (rarity @ self._used)).sqrt().clamp(min=1e-12)
+        slots = torch.nonzero(self._keys != NO_KEY)[:, 0]
+        slots = slots[torch.argsort(self._keys[slots])]
+        ranked = torch.sort(scores[slots].clamp(max=1.0), descending=True, stable=True)
+        return self._keys[slots][ranked.indices], ranked.values
+
+    # --- storage ---------------------------------------------------------------------------------------------
+
+    def _take_words(self, words: Tensor) -> None:
+        """Describe the keyframes from now on by these words (W, 32); those there are, empty ones, have none."""
+        self._words = words
+        self._codes = torch.zeros(len(words), len(self._keys), dtype=torch.int64, device=words.device)
+        self._used = torch.zeros(len(words), len(self._keys), device=words.device)
+
+    def _free_slot(self, device: torch.device) -> int:
+        """The lowest slot that no keyframe has, with nothing in it."""
+        if len(self) == len(self._keys):
+            self._reserve(len(self) + 1, device)
+        return int(torch.nonzero(self._keys == NO_KEY)[0, 0])
+
+    def _reserve(self, size: int, device: torch.device) -> None:
+        """Room for `size` keyframes; it grows by a quarter at least, so that adding one costs the same on average."""
+        capacity = max(_FIRST_CAPACITY, size, len(self._keys) * 5 // 4)
+        self._keys = _widened(self._keys, capacity, NO_KEY, device)
+        self._codes = _widened(self._codes, capacity, 0, device)
+        self._used = _widened(self._used, capacity, 0, device)
+
+
+def _strongest(descriptors: Tensor, mask: Tensor) -> Tensor:
+    """(<= STRONGEST, 32) uint8: the first descriptors of the mask, as bits."""
+    return binary(descriptors[torch.nonzero(mask)[:STRONGEST, 0]])
+
+
+def _widened(columns: Tensor, capacity: int, fill: int, device: torch.device) -> Tensor:
+    """The tensor (..., n) with `capacity` columns, the new ones filled."""
+    new = torch.full((*columns.shape[:-1], capacity), fill, dtype=columns.dtype, device=device)
+    new[..., : columns.shape[-1]] = columns
+    return new
+
+
+def _as_list(keys: Tensor | Iterable[int]) -> list[int]:
+    return [int(key) for key in (keys.tolist() if isinstance(keys, Tensor) else keys)]

@@ -1,0 +1,191 @@
+"""How do two keyframes lie to each other whose maps do not know of each other? A similarity, checked both ways."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.geometry import (
+    Camera,
+    estimate_similarity,
+    fits,
+    rigid,
+    se3_inverse,
+    sim3_inverse,
+    sim3_scale,
+    transform,
+)
+from torchslam.geometry.ransac import samples_needed
+from torchslam.map.map import Map
+from torchslam.optim import refine_pose
+from torchslam.tracking.correspondences import match_near, match_views, project_points
+from torchslam.tracking.matcher import DescriptorMatcher
+
+_RADIUS_PX = 8.0  # around the projection by a first similarity
+_AROUND = 10  # keyframes whose points are looked for in the other map
+_NEEDED = 12  # inliers of the first similarity that are worth a closer look
+_CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
+_KERNEL_SCALE = 2.0
+WIDER = 2.0  # times the noise: a similarity has its own
+
+
+@dataclass(frozen=True)
+class Relation:
+    """A keyframe of one map seen from another map.
+
+    S_21:    (4, 4) similarity from the world of map 1 to that of map 2
+    forward: points of map 2 that keyframe 1 sees where S_21 has them; backward: of map 1 in keyframe 2
+    pairs:   points that keyframe 1 sees and that both maps have
+    """
+
+    S_21: Tensor
+    forward: int
+    backward: int
+    pairs: int
+
+
+def relate(
+    map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
+) -> Relation | None:
+    """The similarity between two maps by a keyframe of each; None where they do not show the same for certain.
+
+    The two may be one map: then keyframe 1 is seen from the place where keyframe 2 is.
+    """
+    T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config)
+    if T_12 is None:
+        return None
+    points_2 = map_2.points_seen_by(neighbourhood(map_2, keyframe_2))
+    ids, keypoints = find(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
+    settings = config.loops
+    if len(ids) < settings.min_matches:
+        return None
+    T_12, agrees = _refined(map_2, ids, T_12, map_1, keyframe_1, keypoints, camera)
+    ids, keypoints = ids[agrees], keypoints[agrees]
+    own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
+    ids, own = ids[own >= 0], own[own >= 0]
+    if int(agrees.sum()) < settings.min_matches or len(ids) < settings.min_pairs:
+        return None
+    T_11 = map_1.T_cw[keyframe_1]
+    # How much longer the unit of map 1 is: the depths of the same points tell, as one pose alone does not.
+    depth_1 = transform(T_11, map_1.positions_w[own])[:, 2]
+    depth_2 = transform(T_12, map_2.positions_w[ids])[:, 2]
+    scale = (depth_2 / depth_1).median()
+    S_21 = se3_inverse(T_12) @ rescaling(scale) @ T_11
+    points_1 = map_1.points_seen_by(neighbourhood(map_1, keyframe_1))
+    T_21 = seen_from(map_2.T_cw[keyframe_2], S_21)
+    back, _ = agreeing(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
+    if len(back) < settings.min_matches // 2:
+        return None
+    return Relation(S_21, int(agrees.sum()), len(back), len(own))
+
+
+def confirms(
+    relation: Relation, map_1: Map, other: int, map_2: Map, near_2: Tensor, camera: Camera, settings: Config
+) -> bool:
+    """Whether another keyframe of map 1 sees the points around keyframes near_2 (k,) of map 2 where it should."""
+    T_o2 = seen_from(map_1.T_cw[other], sim3_inverse(relation.S_21))
+    ids, _ = agreeing(map_2, map_2.points_seen_by(near_2), T_o2, map_1, other, camera, settings)
+    return len(ids) >= settings.loops.min_matches // 2
+
+
+def neighbourhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
+    """(k,) a keyframe and those that share most points with it."""
+    near = slam_map.covisible(keyframe, count)
+    return torch.cat([near.new_tensor([keyframe]), near])
+
+
+def rescaling(scale: Tensor) -> Tensor:
+    """(4, 4) the similarity that multiplies by a scale ()."""
+    eye = torch.eye(3, dtype=scale.dtype, device=scale.device)
+    return rigid(scale * eye, eye.new_zeros(3))
+
+
+def seen_from(T_cw: Tensor, S_wv: Tensor) -> Tensor:
+    """(4, 4) the rigid pose in world v of a camera at T_cw in world w; S_wv: similarity from v to w.
+
+    The scale has no effect on what a camera sees.
+    """
+    S_cv = T_cw @ S_wv
+    scale = sim3_scale(S_cv)
+    return rigid(S_cv[:3, :3] / scale, S_cv[:3, 3] / scale)
+
+
+def find(
+    slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
+) -> tuple[Tensor, Tensor]:
+    """(m,), (m,) points (n,) of a map and keypoints of another map's keyframe, which is at T_cw in this one."""
+    view = other.view(keyframe)
+    angle = config.tracking.max_view_angle_deg
+    near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
+    pairs = match_near(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
+    return pairs.first, pairs.second
+
+
+def agreeing(
+    slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
+) -> tuple[Tensor, Tensor]:
+    """As `find`, those alone that are seen where they should be, more noise allowed for that of the similarity."""
+    ids, keypoints = find(slam_map, point_ids, T_cw, other, keyframe, camera, config)
+    view = other.view(keyframe)
+    points_c = transform(T_cw, slam_map.positions_w[ids])
+    errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
+    good = fits(errors, WIDER**2 * config.measurement.chi_square)
+    return ids[good], keypoints[good]
+
+
+def _first_guess(
+    map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
+) -> Tensor | None:
+    """(4, 4) the pose of keyframe 1 in map 2, from points that both see; None where there is none."""
+    view_1, view_2 = map_1.view(keyframe_1), map_2.view(keyframe_2)
+    points_1 = map_1.keyframes["point_ids"][keyframe_1]
+    points_2 = map_2.keyframes["point_ids"][keyframe_2]
+    rows_1, rows_2 = match_views(
+        replace(view_1, mask=view_1.mask & (points_1 >= 0)),
+        replace(view_2, mask=view_2.mask & (points_2 >= 0)),
+        config.matching,
+    )
+    if len(rows_1) < _NEEDED:
+        return None
+    T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
+    # Where this many samples show no similarity that so few matches agree with, there is none.
+    samples = samples_needed(torch.tensor([_NEEDED]), torch.tensor([len(rows_1)]), 3, _CONFIDENCE)
+    found = estimate_similarity(
+        transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
+        transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
+        view_1.keypoints[rows_1][None],
+        view_2.keypoints[rows_2][None],
+        camera,
+        camera,
+        view_1.noise[rows_1].tolerance[None],
+        view_2.noise[rows_2].tolerance[None],
+        seed=config.seed,
+        confidence=_CONFIDENCE,
+        max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
+    )
+    if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
+        return None
+    return seen_from(torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2)
+
+
+def _refined(
+    slam_map: Map, ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, keypoints: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """(4, 4), (n,): the pose of another map's keyframe by points (n,) it sees at keypoints (n,), and who agrees."""
+    view, points_w = other.view(keyframe), slam_map.positions_w[ids]
+    pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
+    refined = refine_pose(
+        T_cw[None],
+        points_w[None],
+        pixels[None],
+        camera,
+        weights=noise.weights[None],
+        kernel="cauchy",
+        scale=_KERNEL_SCALE,
+        backward="detached",
+    ).T_cw[0]
+    return refined, fits(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

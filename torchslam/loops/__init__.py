@@ -1,7 +1,0 @@
-"""Places that were seen before: which keyframes look like a frame."""
-
-from __future__ import annotations
-
-from torchslam.loops.places import Places
-
-__all__ = ["Places"]

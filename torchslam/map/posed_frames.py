@@ -1,0 +1,257 @@
+"""What a run remembers of every posed frame: where it was, and which points it saw at which pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry import CHI_SQUARE_95, Camera, Noise, fits, se3_inverse, transform
+from torchslam.map.map import NO_KEYPOINT, Map, key_of
+from torchslam.map.schema import FRAMES, OBSERVATIONS
+from torchslam.map.table import Table
+from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
+from torchslam.types import Tracked, Trajectory, View
+
+_ASTRAY = 4.0 * CHI_SQUARE_95  # twice as far off as a fit may be: the final adjustment moves frames by less
+_MOST = 0.75  # of what a frame saw, which must agree before the rest is forgotten
+_AT_ONCE = 1 << 16  # observations: a pose for each takes memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunGraph(ObservationGraph):
+    """The graph of a run, which knows where its rows come from.
+
+    frame_ids:      (F,) frames of the sequence of their session
+    sessions:       (F,) which run over the map saw them
+    point_ids:      (P,) rows of the points of the map of their world
+    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
+                    NO_KEYPOINT where a patch was followed
+    """
+
+    frame_ids: Tensor
+    sessions: Tensor
+    point_ids: Tensor
+    keypoint_index: Tensor
+
+    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
+        "frame_ids": ("F", (), int),
+        "sessions": ("F", (), int),
+        "point_ids": ("P", (), int),
+        "keypoint_index": ("O", (), int),
+    }
+
+
+class History:
+    """Poses relative to a keyframe, so that they follow when the map is adjusted; observations as flat rows."""
+
+    def __init__(self) -> None:
+        self.frames = Table(FRAMES)
+        self.observations = Table(OBSERVATIONS)
+
+    def add(self, view: View, tracked: Tracked, T_cr: Tensor, reference: int) -> None:
+        """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
+        device, view = T_cr.device, view.weighed(tracked.keypoints, tracked.weights)
+        row = self.frames.append(
+            frame_index=torch.tensor([view.index], device=device),
+            session=torch.tensor([view.session], device=device),
+            timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=device),
+            T_cr=T_cr[None],
+            reference=torch.tensor([reference], device=device),
+        )
+        self.observations.append(
+            row=row.expand(tracked.inliers),
+            point_ids=tracked.point_ids,
+            keypoints=tracked.keypoints
+            if view.has_features
+            else torch.full_like(tracked.keypoints, NO_KEYPOINT),
+            pixels=view.keypoints[tracked.keypoints],
+            scales=view.scales[tracked.keypoints],
+            information=view.information[tracked.keypoints],
+        )
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def count(self, session: int | None = None) -> int:
+        """How many frames were posed, in one session or in all."""
+        if session is None or len(self) == 0:
+            return len(self)
+        return int((self.frames["session"] == session).sum())
+
+    @property
+    def keys(self) -> Tensor:
+        """(F,) names of the frames, as of keyframes: session and frame in one."""
+        return key_of(self.frames["session"], self.frames["frame_index"])
+
+    def T_cw(self, slam_map: Map) -> Tensor:
+        """(F, 4, 4) poses of the frames in the order they were added, by the map as it is now."""
+        return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference"]]
+
+    def trajectory(self, slam_map: Map, session: int | None = None) -> Trajectory:
+        """Camera to world, ordered by time; the frames of one session, or of all."""
+        if len(self) == 0:
+            return Trajectory.empty()
+        T_cw, timestamps = self.T_cw(slam_map), self.frames["timestamp"]
+        if session is not None:
+            rows = self.frames["session"] == session
+            T_cw, timestamps = T_cw[rows], timestamps[rows]
+        order = torch.argsort(timestamps, stable=True)
+        return Trajectory(timestamps[order].clone(), se3_inverse(T_cw[order]))
+
+    def rescale(self, factors: Tensor) -> None:
+        """The unit of length around each keyframe changes by factors (K,): what refers to it follows."""
+        if len(self):
+            self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference"]][:, None]
+
+    def append(self, other: History, keyframes: int, points: int) -> None:
+        """Add the frames of another history whose keyframe and point rows moved by these numbers."""
+        if len(other) == 0:
+            return
+        frames, seen = other.frames.columns(), other.observations.columns()
+        seen["row"] = seen["row"] + len(self)
+        seen["point_ids"] = seen["point_ids"] + points
+        frames["reference"] = frames["reference"] + keyframes
+        self.frames.append(**frames)
+        self.observations.append(**seen)
+
+    def refer(self, heirs: Tensor, slam_map: Map) -> None:
+        """Let frames that refer to keyframe i refer to heirs (K,)[i] from now on, without moving them."""
+        old = self.frames["reference"]
+        moves = torch.nonzero(heirs[old] != old)[:, 0]
+        new = heirs[old[moves]]
+        T_rr = slam_map.T_cw[old[moves]] @ se3_inverse(slam_map.T_cw[new])
+        self.frames["T_cr"][moves] = self.frames["T_cr"][moves] @ T_rr
+        old[moves] = new
+
+    def take_over(self, slam_map: Map, keyframes: Tensor) -> None:
+        """Keep what the map knows of keyframes (k,): their frames see from now on what the keyframes see.
+
+        A keyframe without a frame gets one.
+        """
+        kept = slam_map.keyframes
+        rows = torch.cat([self._frame_of(slam_map, keyframe) for keyframe in keyframes.tolist()])
+        self.frames["T_cr"][rows] = kept["T_cw"][keyframes] @ se3_inverse(
+            slam_map.T_cw[self.frames["reference"][rows]]
+        )
+        is_kept = torch.zeros(len(self), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
+        row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
+        seen = slam_map.observations(keyframes)
+        self._overwrite(
+            torch.nonzero(is_kept[self.observations["row"]])[:, 0],
+            row=row_of[seen.keyframe_index],
+            point_ids=seen.point_index,
+            keypoints=seen.keypoint_index,
+            pixels=seen.pixels,
+            scales=seen.scales,
+            information=seen.information,
+        )
+
+    def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
+        """Put fresh observations in the place of stale rows (n,), ascending: nothing is copied as long as they fit."""
+        count = min(len(stale), len(fresh["row"]))
+        for name, values in fresh.items():
+            self.observations[name][stale[:count]] = values[:count]
+        if count < len(stale):
+            is_left = torch.ones(len(self.observations), dtype=torch.bool, device=stale.device)
+            self.observations.keep(torch.nonzero(is_left.index_fill(0, stale[count:], False))[:, 0])
+        self.observations.append(**{name: values[count:] for name, values in fresh.items()})
+
+    def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
+        """(1,) the row of the frame that a keyframe was made of, added where it is missing."""
+        own = {
+            name: slam_map.keyframes[name][keyframe][None] for name in ("frame_index", "session", "timestamp")
+        }
+        is_frame = self.frames["frame_index"] == own["frame_index"]
+        row = torch.nonzero(is_frame & (self.frames["session"] == own["session"]))[:1, 0]
+        if len(row):
+            return row
+        eye = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)[None]
+        return self.frames.append(T_cr=eye, reference=slam_map.ids(keyframe), **own)
+
+    def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
+        """Points got the rows (L,), negative where they are gone: merged ones count as their heirs, dead ones not."""
+        if len(self.observations) == 0:
+            return
+        renamed = rows[slam_map.resolve(self.observations["point_ids"])]
+        self.observations["point_ids"][:] = renamed
+        if bool((renamed < 0).any()):
+            self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
+
+    def forget_strays(self, slam_map: Map, camera: Camera) -> None:
+        """Forget what frames saw far from where the map has it by now: its point was merged with another, or moved.
+
+        One such observation would pull a frame off its place that few points hold. Where many of a frame's do not
+        agree, they stay: it may be the frame that is off its place.
+        """
+        T_cw, seen_by = self.T_cw(slam_map), self.observations["row"]
+        every = torch.arange(len(seen_by), device=T_cw.device)
+        agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_AT_ONCE)])
+        count = torch.bincount(seen_by, minlength=len(self))
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MOST * count
+        kept = agrees | ~is_right[seen_by]
+        if not bool(kept.all()):
+            self.observations.keep(torch.nonzero(kept)[:, 0])
+
+    def _agree(self, rows: Tensor, T_cw: Tensor, slam_map: Map, camera: Camera) -> Tensor:
+        """(n,) whether observations, by row (n,), are not far from where frames at T_cw (F, 4, 4) have their points."""
+        seen = {name: values[rows] for name, values in self.observations.columns().items()}
+        points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
+        points_c = transform(T_cw[seen["row"]], points_w[:, None])[:, 0]
+        noise = Noise(seen["scales"], seen["information"])
+        return fits(noise.squared_reprojection(points_c, seen["pixels"], camera), _ASTRAY)
+
+    def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
+        """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
+
+        Keyframes bring all their observations, the other frames those of points that keyframes see.
+        """
+        seen = slam_map.observations()
+        point_ids = torch.unique(seen.point_index)
+        between = torch.nonzero(~torch.isin(self.keys, slam_map.keys))[:, 0]
+        slot = torch.full((len(self),), -1, device=point_ids.device)
+        slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
+        heirs = slam_map.resolve(self.observations["point_ids"])
+        # A flag per point: `isin` would sort all that was ever seen.
+        is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
+        is_seen[point_ids] = True
+        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
+        keyframes = slam_map.keyframes
+
+        def with_own(values: Tensor, name: str) -> Tensor:
+            """A column at a time: the observations are most of what a long run holds in memory."""
+            return torch.cat([values, self.observations[name][rows]])
+
+        return RunGraph(
+            timestamps=torch.cat([keyframes["timestamp"], self.frames["timestamp"][between]]),
+            T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
+            points_w=slam_map.positions_w[point_ids],
+            frame_index=torch.cat([seen.keyframe_index, slot[self.observations["row"][rows]]]),
+            point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
+            pixels=with_own(seen.pixels, "pixels"),
+            weights=Noise(with_own(seen.scales, "scales"), with_own(seen.information, "information")).weights,
+            camera=camera,
+            is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
+            < slam_map.num_keyframes,
+            frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),
+            world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
+            sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
+            point_ids=point_ids,
+            keypoint_index=with_own(seen.keypoint_index, "keypoints"),
+        )
+
+    def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
+        """Move the map and the frames to the solution of their own graph; the map keeps how certain it is."""
+        (bundle,) = solution.keyframes
+        count = slam_map.num_keyframes
+        slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
+        slam_map.points["positions_w"][graph.point_ids] = solution.points_w
+        keyframes = torch.arange(count, device=graph.point_ids.device)
+        slam_map.take_covariances(keyframes, graph.point_ids, bundle.covariance())
+        keys = key_of(graph.sessions, graph.frame_ids)
+        order = torch.argsort(keys)
+        solved = order[torch.searchsorted(keys[order], self.keys)]
+        T_rw = slam_map.T_cw[self.frames["reference"]]
+        self.frames["T_cr"][:] = solution.T_cw[solved] @ se3_inverse(T_rw)

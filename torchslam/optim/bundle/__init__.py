@@ -1,0 +1,1 @@
+"""Bundle adjustment of poses, points and cameras: sparse, dense in batches, and the NumPy backend of tracking."""

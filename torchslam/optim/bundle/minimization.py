@@ -1,0 +1,302 @@
+"""Bundle adjustments as `implicit.minimum` takes them: a batch, in the order of the problem, whatever solves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.robust import Kernel
+from torchslam.optim.bundle.dense import GridBundle
+from torchslam.optim.bundle.dense_layout import GridLayout, build_grid_layout, fits_grids, grid_data
+from torchslam.optim.bundle.priors import prior_terms
+from torchslam.optim.bundle.problem import Given, flat_rows
+from torchslam.optim.bundle.schur import Marginals
+from torchslam.optim.bundle.sparse import Bundle, Estimate
+from torchslam.optim.bundle.sparse_layout import Layout, Moving, build_layout, what_moves
+from torchslam.optim.core.batching import Tensors
+from torchslam.optim.core.implicit import Ndims
+from torchslam.optim.core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize
+from torchslam.optim.core.residuals import Observations, linearize_each, only
+from torchslam.optim.core.tangent import move, pull_back, push, retract
+
+# Of all grids that are solved at once: what they need stays in the processor's cache, or keeps an accelerator busy.
+_CELLS_AT_ONCE, _CELLS_ON_DEVICE = 1 << 14, 1 << 20
+
+
+class Found(NamedTuple):
+    """The estimates, what moved (B, F), (B, P), what counted (B, O), and how it went (B,)."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    params: Tensor
+    success: Tensor
+    moved_frames: Tensor
+    moved_points: Tensor
+    used: Tensor
+    cost: Tensor
+    iterations: Tensor
+    converged: Tensor
+    initial_cost: Tensor
+
+    @property
+    def estimate(self) -> Estimate:
+        return Estimate(self.T_cw, self.points_w, self.params)
+
+
+class Part(NamedTuple):
+    """Elements that are solved together, and their layout: that of one problem, or grids of several."""
+
+    rows: slice
+    layout: Layout | GridLayout
+
+
+class Bundles(LeastSquares[X, M], Protocol[X, M]):
+    """What solves elements, `Bundle` one and `GridBundle` many, in a way and an order of its own."""
+
+    @property
+    def start(self) -> X: ...
+
+    def definite(self, model: M) -> Tensor:
+        """(B,) whether all that moves is determined, up to the gauge."""
+        ...
+
+    def ordered(self, estimate: Estimate) -> X:
+        """The estimate (B, ...) in the order of the problems as this one has it."""
+        ...
+
+    def in_order(self, estimate: X) -> Estimate:
+        """The way back."""
+        ...
+
+    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+        """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
+        ...
+
+    def marginals(self, estimate: Estimate) -> Marginals:
+        """Covariances in the order of the problems."""
+        ...
+
+
+class BundleMinimization:
+    """Bundle adjustments of inputs `Given`; vectors are frames (B, F, 6), points (B, P, 3) and cameras (B, C n): along
+    the directions (K, n) in which each may move, none where they are fixed."""
+
+    num_unknowns = 3
+    num_vectors = 3
+
+    def __init__(
+        self,
+        camera: Camera,
+        kernel: Kernel,
+        free_camera: bool | Tensor,
+        iterations: int,
+        tolerance: float,
+        progress: Progress | None,
+        check: bool = True,
+        matrices: bool = False,
+    ) -> None:
+        """matrices: whether weights are inverse covariances"""
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+            (2, 2, 1),
+            (3, 2, 2, 0, 1, 1, 1, 0, 0, 0, 0),
+            (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 0, 1, 1, 1, 1, 1),
+        )
+        self.camera, self.kernel = camera, kernel
+        self.free_camera = free_camera
+        self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
+        self.check = check
+        self._last: tuple[Tensor, Moving, list[Part]] | None = None
+
+    def minimize(self, inputs: Tensors) -> Found:
+        given = Given(*inputs)
+        moving, parts = self._laid_out(given)
+        return Found(*_joined([self._minimize(given, moving, part) for part in parts]))
+
+    def _minimize(self, given: Given, moving: Moving, part: Part) -> Found:
+        bundle, moving = self._bundle(given, part), Moving(*(mask[part.rows] for mask in moving))
+        model, convergence = minimize(
+            bundle, bundle.start, self.iterations, self.tolerance, self._progress(given, part)
+        )
+        with torch.no_grad():
+            success = bundle.solvable & given.finite[part.rows]
+            if self.check:
+                success = success & bundle.definite(model)
+        return Found(
+            *bundle.in_order(model.estimate),
+            success,
+            moving.frames,
+            moving.points,
+            moving.counted,
+            convergence.cost,
+            convergence.iterations,
+            convergence.converged,
+            convergence.initial_cost,
+        )
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        found, given = Found(*found), Given(*inputs)
+        with torch.no_grad():
+            solvers = [
+                (part.rows, bundle.exact_solver(_part(found.estimate, part)))
+                for part, bundle in self._bundles(given)
+            ]
+
+        def solve(right: Tensors) -> Tensors:
+            solved = _joined([solver(tuple(x[rows] for x in right)) for rows, solver in solvers])
+            success = found.success[:, None]
+            return tuple(torch.where(success if x.ndim == 2 else success[..., None], x, 0.0) for x in solved)
+
+        return solve
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        frames, points, camera = direction
+        found, given = Found(*found), Given(*inputs)
+        at = self.at_minimum(found, given)
+        in_frames = flat_rows(given.frame_index, given.T_cw.shape[1])
+        in_points = flat_rows(given.point_index, given.points_w.shape[1])
+        T_cw = at.T_cw.flatten(0, 1).index_select(0, in_frames)
+        seen = at.points_w.flatten(0, 1).index_select(0, in_points)[..., None]
+        points_c = (T_cw[:, :3, :3] @ seen).squeeze(-1) + T_cw[:, :3, 3]
+        cameras, in_cameras = self.camera.with_params(at.params.flatten(0, 1)), None
+        if len(cameras.params) > 1:
+            in_cameras = flat_rows(given.camera_of, at.params.shape[1])
+        observed = Observations(
+            given.pixels.flatten(0, 1),
+            only(found.used, given.weights).flatten(0, 1),
+            cameras[0 if in_cameras is None else in_cameras],
+            self.kernel,
+            given.scale[:, None].expand_as(given.counted).flatten(),
+        )
+        is_free = self.free_camera is not False
+        lin = linearize_each(observed, points_c, is_free)
+        velocity = move(points_c, frames.flatten(0, 1).index_select(0, in_frames))
+        moving = points.flatten(0, 1).index_select(0, in_points)[..., None]
+        velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
+        if is_free:
+            turning = self._along(camera, at.params).flatten(0, 1)
+            turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
+            velocity = torch.cat((velocity, turning), dim=-1)
+        slope = (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
+        terms = prior_terms(
+            given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
+        )
+        if terms is None:
+            return slope
+        return slope + (terms.frames_gradient * frames).sum() + (terms.camera_gradient * camera).sum()
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        frames, points, camera = direction
+        T_cw, points_w, params, *rest = found
+        params = params + self._along(camera, params)
+        return retract(T_cw, frames), points_w + points, params, *rest
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        frames, points, camera = direction
+        return push(found[0], frames), points, self._along(camera, found[2])
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        frames, points, params = gradient
+        directions = self._directions(params)
+        camera = params[..., :0] if directions is None else params @ directions
+        return pull_back(found[0], frames), points, camera.flatten(1)
+
+    def _directions(self, params: Tensor) -> Tensor | None:
+        """(K, n) along which parameters (..., K) may move; None where they do not."""
+        if isinstance(self.free_camera, Tensor):
+            return self.free_camera
+        size = params.shape[-1]
+        return torch.eye(size, dtype=params.dtype, device=params.device) if self.free_camera else None
+
+    def _along(self, step: Tensor, params: Tensor) -> Tensor:
+        """How a step (B, C n) changes the cameras' parameters (B, C, K)."""
+        directions = self._directions(params)
+        if directions is None:
+            return torch.zeros_like(params)
+        return step.unflatten(1, (params.shape[1], directions.shape[1])) @ directions.mT
+
+    def at_minimum(self, found: Found, given: Given) -> Estimate:
+        """The minima where things moved, the inputs, with their derivatives, where they did not."""
+        params = given.params if self.free_camera is False else found.params
+        if isinstance(
+            self.free_camera, Tensor
+        ):  # what does not move of the parameters reaches them unchanged
+            params = params + (given.params - given.params.detach())
+        return Estimate(
+            torch.where(found.moved_frames[..., None, None], found.T_cw, given.T_cw),
+            torch.where(found.moved_points[..., None], found.points_w, given.points_w),
+            params,
+        )
+
+    def last_step(self, found: Found, inputs: Tensors) -> Estimate:
+        """The estimates after one more step from the minima, with the gradient of that step."""
+        given = Given(*inputs)
+        at, steps = self.at_minimum(found, given), []
+        for part, bundle in self._bundles(given):
+            model = bundle.evaluate(bundle.ordered(_part(at, part)), ~bundle.solvable)
+            solution, _ = bundle.step(model, torch.zeros_like(model.cost))
+            steps.append(bundle.in_order(solution))
+        return Estimate(*_joined(steps))
+
+    def marginals(self, found: Found, inputs: Sequence[Tensor]) -> Marginals:
+        with torch.no_grad():
+            bundles = self._bundles(Given(*inputs))
+            return Marginals(
+                *_joined([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
+            )
+
+    def _progress(self, given: Given, part: Part) -> Progress | None:
+        """Told of the iterations of all elements, as if one came after the other."""
+        told, before = self.progress, self.iterations * part.rows.start
+        return None if told is None else lambda now, most: told(before + now, most * len(given.T_cw))
+
+    def _bundles(self, given: Given) -> list[tuple[Part, Bundles[Any, Any]]]:
+        return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
+
+    def _bundle(self, given: Given, part: Part) -> Bundles[Any, Any]:
+        given, layout = given.part(part.rows), part.layout
+        directions = self._directions(given.params)
+        if isinstance(layout, GridLayout):
+            return GridBundle(grid_data(layout, given), self.camera, self.kernel, directions)
+        one = Given(*(tensor[0] for tensor in given))
+        return Bundle(layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0])
+
+    def _laid_out(self, given: Given) -> tuple[Moving, list[Part]]:
+        """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
+        if self._last is None or not torch.equal(self._last[0], given.counted):
+            moving = what_moves(given)
+            self._last = given.counted, moving, _parts(given, moving)
+        return self._last[1:]
+
+
+def _parts(given: Given, moving: Moving) -> list[Part]:
+    """How a batch is solved: on grids, as many at once as fit, or one after the other."""
+    batch = len(given.T_cw)
+    use_grids = batch > 1 and fits_grids(given, moving)
+    size = 1
+    if use_grids:
+        cells = _CELLS_AT_ONCE if given.T_cw.device.type == "cpu" else _CELLS_ON_DEVICE
+        size = max(1, cells // (moving.frames.shape[1] * moving.points.shape[1]))
+    parts = []
+    for start in range(0, batch, size):
+        rows = slice(start, min(start + size, batch))
+        of_part = Moving(*(mask[rows] for mask in moving))
+        if use_grids:
+            parts.append(Part(rows, build_grid_layout(given.part(rows), of_part)))
+            continue
+        counted, frames, points = (mask[0] for mask in of_part)
+        index = given.frame_index[start], given.point_index[start]
+        parts.append(Part(rows, build_layout(*index, counted, frames, points)))
+    return parts
+
+
+def _part(estimate: Estimate, part: Part) -> Estimate:
+    return Estimate(*(tensor[part.rows] for tensor in estimate))
+
+
+def _joined(parts: Sequence[Tensors]) -> Tensors:
+    """Parts of a batch, one after the other."""
+    return parts[0] if len(parts) == 1 else tuple(torch.cat(tensors) for tensors in zip(*parts, strict=True))

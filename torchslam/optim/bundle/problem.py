@@ -1,0 +1,261 @@
+"""What a bundle adjustment is asked, and the same as finite tensors that all lead with a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.precision import check_dtypes
+from torchslam.optim.core.priors import CameraPrior, PosePrior
+from torchslam.optim.core.residuals import only, usable
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Who saw what where: O observations of P points by F frames; or B such problems at once.
+
+    T_cw:         (F, 4, 4) start, world to camera; (B, F, 4, 4) makes it a batch. What else of a batch has no leading
+                  dimension is the same for all.
+    points_w:     (P, 3) start
+    frame_index:  (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
+    pixels:       (O, 2)
+    camera:       one for all frames, params (K,); with `camera_index` C of them, all of one model and size, (C, K)
+    weights:      (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
+                  definite; one if None
+    fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are. One frame fixes all but the scale, which
+                  then is that of the start; with none the answer keeps the position and the orientation, too.
+                  Whatever more is fixed, or held by priors, constrains the shape.
+    fixed_points: rows of points_w, or a (P,) bool mask, likewise
+    mask:         (O,) bool, observations that count, all if None: what fills up the smaller problems of a batch may
+                  hold anything, its indices being in range
+    camera_index: (F,) int64 the camera of each frame
+    pose_prior:   where frames are expected: (F, 4, 4) with information (F, 6, 6), zero for frames without
+    camera_prior: where the parameters of a free camera are expected
+    """
+
+    T_cw: Tensor
+    points_w: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    pixels: Tensor
+    camera: Camera
+    weights: Tensor | None = None
+    fixed_frames: Tensor | Sequence[int] = (0,)
+    fixed_points: Tensor | Sequence[int] | None = None
+    mask: Tensor | None = None
+    camera_index: Tensor | None = None
+    pose_prior: PosePrior | None = None
+    camera_prior: CameraPrior | None = None
+
+    @property
+    def is_batch(self) -> bool:
+        return self.T_cw.ndim == 4
+
+
+class Inputs(NamedTuple):
+    """All that gradients may flow to, in the order of the problem; every tensor of a batch of B leads with it.
+
+    params (C, K), scale (); priors have no rows where there are none.
+    """
+
+    T_cw: Tensor
+    points_w: Tensor
+    pixels: Tensor
+    weights: Tensor
+    params: Tensor
+    scale: Tensor
+    prior_T_cw: Tensor
+    prior_information: Tensor
+    prior_params: Tensor
+    prior_params_information: Tensor
+
+    @property
+    def pose_prior(self) -> PosePrior | None:
+        return PosePrior(self.prior_T_cw, self.prior_information) if self.prior_T_cw.shape[-3] else None
+
+    @property
+    def camera_prior(self) -> CameraPrior | None:
+        if not self.prior_params.shape[-2]:
+            return None
+        return CameraPrior(self.prior_params, self.prior_params_information)
+
+
+class Given(NamedTuple):
+    """All that bundle adjustments are made of, batched: the tensors of `Inputs`, which observations count (B, O),
+    whether all frames that anything counts of are finite (B,), the rows of `BundleProblem`, and what may move, (B, F)
+    and (B, P)."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    pixels: Tensor
+    weights: Tensor
+    params: Tensor
+    scale: Tensor
+    prior_T_cw: Tensor
+    prior_information: Tensor
+    prior_params: Tensor
+    prior_params_information: Tensor
+    counted: Tensor
+    finite: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    camera_index: Tensor
+    free_frames: Tensor
+    free_points: Tensor
+
+    @property
+    def inputs(self) -> Inputs:
+        return Inputs(*self[: len(Inputs._fields)])
+
+    @property
+    def camera_of(self) -> Tensor:
+        """(B, O) the camera of each observation."""
+        return self.camera_index.gather(1, self.frame_index)
+
+    def part(self, rows: slice) -> Given:
+        """Some elements of the batch."""
+        return Given(*(tensor[rows] for tensor in self))
+
+
+def flat_rows(index: Tensor, size: int) -> Tensor:
+    """Rows (B * O,) of what was (B, size, ...) and is flattened to (B * size, ...), for index (B, O)."""
+    return (index + size * torch.arange(len(index), device=index.device)[:, None]).flatten()
+
+
+def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
+    """The problem as a batch, with zero or the identity for what is not finite.
+
+    Raises ValueError for shapes, dtypes and indices that do not fit.
+    """
+    T_cw = problem.T_cw if problem.is_batch else problem.T_cw[None]
+    if not len(T_cw):
+        raise ValueError("a batch must have a problem")
+    points_w, pixels, weights, asked = _rows(problem, T_cw)
+    params, camera_index = _cameras(problem, T_cw)
+    priors = _priors(problem, T_cw, params)
+    check_dtypes(
+        T_cw=T_cw,
+        points_w=points_w,
+        pixels=pixels,
+        weights=weights,
+        camera_params=params,
+        prior_T_cw=priors[0],
+        prior_information=priors[1],
+        prior_params=priors[2],
+        prior_params_information=priors[3],
+    )
+    (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
+    rows = asked.shape
+    frame_index = checked_rows("frame_index", problem.frame_index, rows, num_frames)
+    point_index = checked_rows("point_index", problem.point_index, rows, num_points)
+
+    is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
+    seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, rows)
+    counted = asked & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
+    wanted = frame_index.new_zeros(batch, num_frames)
+    wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
+    eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+    return Given(
+        torch.where(is_finite[..., None, None], T_cw, eye),
+        torch.where(torch.isfinite(points_w), points_w, 0.0),
+        torch.where(counted[..., None], pixels, 0.0),
+        only(counted, weights),
+        params,
+        torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
+        *priors,
+        counted,
+        (is_finite | ~wanted).all(-1),
+        frame_index,
+        point_index,
+        camera_index,
+        is_finite & ~as_mask(problem.fixed_frames, is_finite),
+        ~as_mask(problem.fixed_points, points_w[..., 0]),
+    )
+
+
+def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points (B, P, 3), and of the observations pixels (B, O, 2), weights (B, O) and which are asked for (B, O)."""
+    points_w, pixels = problem.points_w, problem.pixels
+    if T_cw.shape[2:] != (4, 4) or points_w.shape[-1:] != (3,) or pixels.shape[-1:] != (2,):
+        raise ValueError(
+            "T_cw, points_w and pixels must be (F, 4, 4), (P, 3) and (O, 2), not "
+            f"{tuple(T_cw.shape[1:])}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
+        )
+    batch, count = T_cw.shape[0], pixels.shape[-2]
+    points_w = _over("points_w", "(P, 3)", points_w, (batch, points_w.shape[-2], 3))
+    pixels = _over("pixels", "(O, 2)", pixels, (batch, count, 2))
+    weights = torch.ones_like(pixels[..., 0]) if problem.weights is None else problem.weights
+    asked = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
+    matrix = (2, 2) if weights.shape[-2:] == (2, 2) and weights.shape[-3:-2] == (count,) else ()
+    return (
+        points_w,
+        pixels,
+        _over("weights", "(O,) or (O, 2, 2)", weights, (batch, count, *matrix)),
+        _over("mask", "(O,)", asked, (batch, count)),
+    )
+
+
+def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
+    """Parameters (B, C, K) and the camera of each frame (B, F)."""
+    params, index = problem.camera.params, problem.camera_index
+    if index is None:
+        params = _over("camera.params", "(K,)", params, (len(T_cw), params.shape[-1]))
+        return params[:, None], torch.zeros(T_cw.shape[:2], dtype=torch.int64, device=T_cw.device)
+    params = _over("camera.params", "(C, K)", params, (len(T_cw), *params.shape[-2:]))
+    return params, checked_rows("camera_index", index, T_cw.shape[:2], params.shape[1])
+
+
+def _priors(problem: BundleProblem, T_cw: Tensor, params: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Means and informations (B, F, 4, 4), (B, F, 6, 6), (B, C, K), (B, C, K, K), without rows where there are none."""
+    (batch, num_frames), (_, num_cameras, size) = T_cw.shape[:2], params.shape
+    poses, camera = problem.pose_prior, problem.camera_prior
+    if poses is None:
+        poses = PosePrior(T_cw.new_zeros(0, 4, 4), T_cw.new_zeros(0, 6, 6))
+        num_frames = 0
+    if camera is None:
+        camera = CameraPrior(T_cw.new_zeros(0, size), T_cw.new_zeros(0, size, size))
+        num_cameras = 0
+    elif problem.camera_index is None:  # of the only one
+        camera = CameraPrior(camera.params[..., None, :], camera.information[..., None, :, :])
+    shape, square = (batch, num_cameras, size), (batch, num_cameras, size, size)
+    return (
+        _over("pose_prior.T_cw", "(F, 4, 4)", poses.T_cw, (batch, num_frames, 4, 4)),
+        _over("pose_prior.information", "(F, 6, 6)", poses.information, (batch, num_frames, 6, 6)),
+        _over("camera_prior.params", "as those of the camera", camera.params, shape),
+        _over("camera_prior.information", "a square matrix per camera", camera.information, square),
+    )
+
+
+def _over(name: str, described: str, tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """A tensor with the batch, whether or not it has it already."""
+    if tensor.shape not in (shape, shape[1:]):
+        raise ValueError(f"{name} must be {described} = {shape[1:]}, not {tuple(tensor.shape)}")
+    return tensor.expand(shape)
+
+
+def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) -> Tensor:
+    """Rows (B, N) that lie in 0 ... size - 1."""
+    if index.shape not in (shape, shape[1:]):
+        each = "frame" if name == "camera_index" else "observation"
+        raise ValueError(f"{name} must have one row per {each}, {shape[-1]}, not {tuple(index.shape)}")
+    if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < size:
+        raise ValueError(f"{name} must lie in 0 ... {size - 1}")
+    return index.expand(shape)
+
+
+def as_mask(rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
+    """A bool mask of the shape (B, N) of `like`, of rows given as one, or as indices."""
+    batch, count = like.shape
+    rows = torch.as_tensor(() if rows is None else rows, device=like.device)
+    if rows.dtype == torch.bool:
+        if rows.shape not in ((count,), (batch, count)):
+            raise ValueError(f"a mask of fixed rows must have shape ({count},), not {tuple(rows.shape)}")
+        return rows.expand(batch, count)
+    mask = torch.zeros(count, dtype=torch.bool, device=like.device)
+    mask[rows.long()] = True
+    return mask.expand(batch, count)

@@ -1,0 +1,1 @@
+"""What all solvers share: Levenberg-Marquardt, implicit gradients, manifolds, residuals and priors."""

@@ -1,0 +1,308 @@
+"""Gradients of a minimiser by the implicit function theorem, of any order and in both directions.
+
+At a minimum theta* of a cost with inputs x the gradient g(theta*, x) is zero, so d theta* = -H^-1 (dg/dx) dx with the
+exact Hessian H = dg/dtheta. For a loss with gradient v at theta* the gradient to the inputs is therefore
+-d/dx [g(theta*, x) . lambda] with H lambda = v: one linear solve and one pass of autograd over a scalar, however many
+iterations led to the minimum. The solve is differentiable in turn, by solves with the same H, so that gradients of
+gradients are right. Source: Krantz and Parks, "The implicit function theorem", 2002; Gould et al., "Deep declarative
+networks", 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Protocol, get_args
+
+import torch
+from torch import Tensor
+from torch._C import _are_functorch_transforms_active
+from torch._C._functorch import TransformType, get_interpreter_stack
+from torch.func import grad, vjp
+
+from torchslam.geometry.precision import full_precision
+from torchslam.optim.core.batching import InDims, Tensors, folded, leading, looped, many_times
+
+Backward = Literal["implicit", "unroll", "truncated", "detached"]
+"""How gradients pass a minimisation.
+
+"implicit":  the exact gradient at the minimum; memory does not depend on the iterations
+"unroll":    through every iteration, also to the start; memory grows with the iterations
+"truncated": through one last Gauss-Newton step from the detached minimum; biased with a robust kernel
+"detached":  none
+"""
+_BACKWARDS = get_args(Backward)  # looked up here: compiled graphs of older torch cannot
+
+Ndims = tuple[int, ...]
+
+
+def check_backward(backward: str) -> None:
+    """Raises ValueError unless `backward` is one of the modes."""
+    if backward not in _BACKWARDS:
+        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(_BACKWARDS)}")
+
+
+class Minimization(Protocol):
+    """A cost over unknowns theta and inputs x, and how it is minimised.
+
+    inputs: the tensors x. found: what `minimize` returns, first the `num_unknowns` tensors of theta. A vector, such as
+    a direction, is `num_vectors` tensors in the tangent space of theta. All but `minimize` and `factorized` must be
+    differentiable, without decisions that depend on values.
+    """
+
+    num_unknowns: int
+    num_vectors: int
+    ndims: tuple[Ndims, Ndims, Ndims] | None
+    """Dimensions of the tensors of a vector, of found and of inputs without that of a batch, which may lead each of
+    them; None where there are no batches."""
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        """The minimum, and what else is to know about it."""
+        ...
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        """The function v -> H^-1 v with the exact Hessian at the minimum; zero where that is not definite."""
+        ...
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        """() the derivative g . direction of the cost."""
+        ...
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        """`found` with theta moved along a direction."""
+        ...
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        """The change of the tensors of theta to first order in a direction."""
+        ...
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        """The gradient in the tangent space of a loss with this gradient in the tensors of theta."""
+        ...
+
+
+def minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
+    """What `problem.minimize` finds: theta with its implicit derivatives to the inputs, the rest detached.
+
+    Raises RuntimeError for forward mode within forward mode, in which torch would drop a part without a word.
+    """
+    stack = (get_interpreter_stack() or ()) if _are_functorch_transforms_active() else ()
+    if sum(transform.key() == TransformType.Jvp for transform in stack) > 1:
+        raise RuntimeError(
+            "forward mode within forward mode is not supported: take torch.func.jacfwd of torch.func.jacrev"
+        )
+    return _Minimum.apply(problem, *inputs)
+
+
+def attached_gradient(
+    problem: Minimization,
+    found: Tensors,
+    inputs: Tensors,
+    gradient: Sequence[Tensor],
+    needed: Sequence[bool],
+) -> list[Tensor | None]:
+    """The gradient to the inputs that need it of a loss with this gradient in what was found, itself without graph."""
+    direction = problem.factorized(found, inputs)(
+        problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
+    )
+    return _last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
+
+
+class _Minimum(torch.autograd.Function):
+    """inputs -> found."""
+
+    @staticmethod
+    @full_precision
+    def forward(problem: Minimization, *inputs: Tensor) -> Tensors:
+        return tuple(tensor.detach() for tensor in problem.minimize(inputs))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
+        ctx.problem, *tensors = inputs
+        ctx.num_inputs = len(tensors)
+        ctx.mark_non_differentiable(*output[ctx.problem.num_unknowns :])
+        ctx.save_for_backward(*tensors, *output)
+        ctx.save_for_forward(*tensors, *output)
+
+    @staticmethod
+    @full_precision
+    def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
+        problem, needed = ctx.problem, ctx.needs_input_grad[1:]
+        inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
+        if not torch.is_grad_enabled() and not _are_functorch_transforms_active():
+            return None, *attached_gradient(problem, found, inputs, gradient, needed)
+        right = problem.pull_back(found, gradient[: problem.num_unknowns])
+        direction = _solve(problem, right, found, inputs)
+        return None, *_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
+
+    @staticmethod
+    @full_precision
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
+        problem = ctx.problem
+        inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
+
+        def change_of_slope(direction: Tensors) -> Tensor:
+            return _along(lambda x: problem.slope(found, x, direction), inputs, changes)
+
+        at_zero = _zeros(problem.pull_back(found, found[: problem.num_unknowns]))
+        direction = _solve(problem, grad(change_of_slope)(at_zero), found, inputs)
+        change = problem.push(found, tuple(-part for part in direction))
+        return (*change, *(None for _ in found[problem.num_unknowns :]))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: InDims, problem: Minimization, *inputs: Tensor) -> tuple[Tensors, Any]:
+        def apply(*tensors: Tensor) -> Tensors:
+            return _Minimum.apply(problem, *tensors)
+
+        if problem.ndims is None:
+            found = looped(apply, info.batch_size, in_dims[1:], inputs)
+        else:
+            found = folded(apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs))
+        return found, (0,) * len(found)
+
+
+class _Solve(torch.autograd.Function):
+    """right, found, inputs -> H^-1 right; `many` dimensions of right sides of the same H lead `right`."""
+
+    @staticmethod
+    @full_precision
+    def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
+        right, found, inputs = _parts(problem, num_found, tensors)
+        return tuple(many_times(problem.factorized(found, inputs), many)(right))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
+        ctx.problem, ctx.many, ctx.num_found, *tensors = inputs
+        ctx.save_for_backward(*output, *tensors)
+        ctx.save_for_forward(*output, *tensors)
+
+    @staticmethod
+    @full_precision
+    def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
+        problem, many = ctx.problem, ctx.many
+        direction, tensors = _split(ctx.saved_tensors, problem.num_vectors)
+        _, found, inputs = _parts(problem, ctx.num_found, tensors)
+        adjoint = _solve(problem, gradient, found, inputs, many)
+
+        def curvature(tensors: Tensors) -> Tensor:
+            at = _split(tensors, len(found))
+            return -many_times(lambda ends: _curvature(problem, *at, *ends), many)((direction, adjoint)).sum()
+
+        needed = ctx.needs_input_grad[3 + problem.num_vectors :]
+        return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
+
+    @staticmethod
+    @full_precision
+    def jvp(ctx: Any, _: None, __: None, ___: None, *changes: Tensor | None) -> Tensors:
+        problem, many = ctx.problem, ctx.many
+        direction, tensors = _split(ctx.saved_tensors, problem.num_vectors)
+        right, found, inputs = _parts(problem, ctx.num_found, tensors)
+
+        def change_of_curvature(probe: Tensors) -> Tensor:
+            def curvature(tensors: Tensors) -> Tensor:
+                at = _split(tensors, len(found))
+                return many_times(lambda ends: _curvature(problem, *at, *ends), many)(
+                    (direction, probe)
+                ).sum()
+
+            return _along(curvature, (*found, *inputs), changes[len(right) :])
+
+        turned = grad(change_of_curvature)(_zeros(right))
+        left = tuple(
+            -part if change is None else change - part
+            for change, part in zip(changes[: len(right)], turned, strict=True)
+        )
+        return _solve(problem, left, found, inputs, many)
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: InDims, problem: Minimization, many: int, num_found: int, *tensors: Tensor
+    ) -> tuple[Tensors, Any]:
+        dims, count = in_dims[3:], problem.num_vectors
+        if all(dim is None for dim in dims[count:]):
+            right, found, inputs = _parts(problem, num_found, tensors)
+            right = tuple(leading(x, dim, info.batch_size) for x, dim in zip(right, dims, strict=False))
+            return _solve(problem, right, found, inputs, many + 1), (0,) * count
+
+        def apply(*tensors: Tensor) -> Tensors:
+            return _Solve.apply(problem, many, num_found, *tensors)
+
+        if problem.ndims is None:
+            return looped(apply, info.batch_size, dims, tensors), (0,) * count
+        before = (many,) * count + (0,) * (len(tensors) - count)
+        solved = folded(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
+        return tuple(part.movedim(many, 0) for part in solved), (0,) * count
+
+
+def _solve(
+    problem: Minimization, right: Sequence[Tensor], found: Tensors, inputs: Tensors, many: int = 0
+) -> Tensors:
+    return _Solve.apply(problem, many, len(found), *right, *found, *inputs)
+
+
+def _parts(
+    problem: Minimization, num_found: int, tensors: Sequence[Tensor]
+) -> tuple[Tensors, Tensors, Tensors]:
+    """A vector, found and inputs."""
+    right, rest = _split(tensors, problem.num_vectors)
+    found, inputs = _split(rest, num_found)
+    return right, found, inputs
+
+
+def _split(tensors: Sequence[Tensor], count: int) -> tuple[Tensors, Tensors]:
+    return tuple(tensors[:count]), tuple(tensors[count:])
+
+
+def _zeros(tensors: Tensors) -> Tensors:
+    return tuple(torch.zeros_like(tensor) for tensor in tensors)
+
+
+def _curvature(
+    problem: Minimization, found: Tensors, inputs: Tensors, direction: Tensors, probe: Tensors
+) -> Tensor:
+    """() probe . H direction, differentiable."""
+
+    def slope(step: Tensors) -> Tensor:
+        return problem.slope(problem.moved(found, step), inputs, probe)
+
+    turned = grad(slope)(_zeros(direction))
+    return torch.stack([(x * y).sum() for x, y in zip(turned, direction, strict=True)]).sum()
+
+
+def _last_gradient(
+    function: Callable[[Tensors], Tensor], tensors: Tensors, needed: Sequence[bool]
+) -> list[Tensor | None]:
+    """The gradient to the tensors that need it, itself without graph: the cheap way."""
+    leaves = tuple(x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True))
+    with torch.enable_grad():
+        value = function(leaves)
+    wanted = [leaf for leaf in leaves if leaf.requires_grad]
+    grads = iter(torch.autograd.grad(value, wanted, allow_unused=True))
+    return [next(grads) if need else None for need in needed]
+
+
+def _gradient(
+    function: Callable[[Tensors], Tensor], tensors: Tensors, needed: Sequence[bool]
+) -> list[Tensor | None]:
+    """The gradient to the tensors that need it, differentiable, under any transform."""
+    needed = [need and tensor.is_floating_point() for need, tensor in zip(needed, tensors, strict=True)]
+
+    def of(*wanted: Tensor) -> Tensor:
+        given = iter(wanted)
+        return function(tuple(next(given) if need else x for x, need in zip(tensors, needed, strict=True)))
+
+    value, pull = vjp(of, *(x for x, need in zip(tensors, needed, strict=True) if need))[:2]
+    grads = iter(pull(torch.ones_like(value)))
+    return [next(grads) if need else None for need in needed]
+
+
+def _along(
+    function: Callable[[Tensors], Tensor], tensors: Tensors, changes: Sequence[Tensor | None]
+) -> Tensor:
+    """() the derivative of a function along changes of its tensors, differentiable, by reverse mode alone."""
+    gradient = _gradient(function, tensors, [change is not None for change in changes])
+    products = [
+        (slope * change).sum()
+        for slope, change in zip(gradient, changes, strict=True)
+        if slope is not None and change is not None
+    ]
+    return torch.stack(products).sum()

@@ -1,0 +1,151 @@
+"""Levenberg-Marquardt for many independent least-squares problems at once.
+
+The loop knows nothing of poses or points: a `LeastSquares` problem evaluates a local quadratic model, proposes a damped
+step, and chooses per element between the old model and the new one. Every element has its own damping, accepts or
+rejects its own steps and stops on its own, so a batch gives what the elements alone would give. Under autograd the loop
+can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1963; Madsen, Nielsen and Tingleff,
+"Methods for non-linear least squares problems", 2004.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, Self, TypeVar, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from torchslam.optim.core.batching import joined, taken
+
+_INITIAL_DAMPING = 1e-4
+_DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
+_DAMPING_RANGE = (1e-10, 1e8)
+# Below this share of the cost, the decrease that a step promises says that the optimum is close.
+_NEAR = 1e-2
+
+
+Progress = Callable[[int, int], None]
+"""Told before each iteration its number, from 0, and how many there are at most."""
+
+
+class Model(Protocol):
+    """A local quadratic model of a cost; `cost` is (B,)."""
+
+    @property
+    def cost(self) -> Tensor: ...
+
+
+M = TypeVar("M", bound=Model)
+X = TypeVar("X")
+
+
+class LeastSquares(Protocol[X, M]):
+    """What the loop asks of a problem with estimate X and local models M."""
+
+    @property
+    def solvable(self) -> Tensor:
+        """(B,) bool, which elements to minimise; the others stay at their start."""
+        ...
+
+    def evaluate(self, estimate: X, near: Tensor) -> M:
+        """The cost and its quadratic model at an estimate. near: (B,) bool, the optimum is close."""
+        ...
+
+    def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
+        """The estimate that minimises the damped model, and the decrease (B,) of the cost that the model predicts.
+
+        damping: (B,), relative to the diagonal of the Hessian. The decrease is infinite where there is no solution.
+        """
+        ...
+
+    def select(self, accept: Tensor, new: M, old: M) -> M:
+        """Per element, `new` where `accept` (B,) and `old` elsewhere."""
+        ...
+
+
+@runtime_checkable
+class Divisible(Protocol):
+    """A problem whose models are named tuples of batched tensors: elements that have converged leave the batch."""
+
+    def part(self, rows: Tensor) -> Self:
+        """The problems of some elements."""
+        ...
+
+
+@runtime_checkable
+class Rounded(Protocol):
+    """A problem that knows how much of its costs is rounding: where no more is left, steps only shuffle it."""
+
+    def rounding(self) -> Tensor:
+        """(B,) the cost of exact data."""
+        ...
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How a minimisation went, per element.
+
+    iterations: (B,) int64 steps tried
+    converged:  (B,) bool, the last step promised less than the tolerance
+    initial_cost, cost: (B,) half the sum of robustified squared residuals, before and after
+    """
+
+    iterations: Tensor
+    converged: Tensor
+    initial_cost: Tensor
+    cost: Tensor
+
+    def of(self, row: int) -> Convergence:
+        """Of one element."""
+        one = slice(row, row + 1)
+        return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
+
+
+def minimize(
+    problem: LeastSquares[X, M],
+    start: X,
+    iterations: int,
+    tolerance: float,
+    progress: Progress | None = None,
+) -> tuple[M, Convergence]:
+    """Minimise from `start`; returns the model at the last accepted estimate.
+
+    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, or
+    when the residuals have vanished; it rests from then on. What `progress` raises ends the minimisation.
+    """
+    active = problem.solvable
+    model = problem.evaluate(start, torch.zeros_like(active))
+    initial_cost = model.cost.detach()
+    # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
+    rounding = torch.finfo(initial_cost.dtype).eps
+    slack = 1 + 100 * rounding
+    vanished = rounding**1.5 * initial_cost
+    if isinstance(problem, Rounded):
+        vanished = torch.maximum(vanished, problem.rounding())
+    damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
+    steps = torch.zeros_like(active, dtype=torch.int64)
+    rows, resting = torch.arange(len(active), device=active.device), []
+    for iteration in range(iterations):
+        if progress is not None:
+            progress(iteration, iterations)
+        estimate, decrease = problem.step(model, damping)
+        share = decrease.detach() / model.cost.detach()
+        trial = problem.evaluate(estimate, share < _NEAR)
+        accept = active & (share < torch.inf) & (trial.cost <= slack * model.cost)
+        steps = steps.index_add(0, rows, active.long())
+        active = active & (share > tolerance) & (model.cost.detach() > vanished)
+        model = problem.select(accept, trial, model)
+        damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
+        if not active.any():
+            break
+        if isinstance(problem, Divisible) and not active.all():
+            rest, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
+            resting.append((rows[rest], taken(model, rest)))
+            problem, model = problem.part(stay), taken(model, stay)
+            rows, active, damping, vanished = taken((rows, active, damping, vanished), stay)
+    converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
+    if resting:
+        where, models = zip(*resting, (rows, model), strict=True)
+        model = joined(models, where)
+    return model, Convergence(steps, converged, initial_cost, model.cost.detach())

@@ -1,0 +1,321 @@
+"""Robust least squares of any residual, batched, with the gradients of its minimum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import grad, jvp, vmap
+
+from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.robust import Kernel, robustify
+from torchslam.optim.core import levenberg_marquardt as levenberg
+from torchslam.optim.core.batching import Tensors, chosen, taken
+from torchslam.optim.core.implicit import Backward, Ndims, check_backward, minimum
+from torchslam.optim.core.levenberg_marquardt import Convergence
+from torchslam.optim.core.linear import DefiniteFactor, factorize
+from torchslam.optim.core.manifold import Manifold, Product
+from torchslam.optim.core.residuals import Linearization, flat_along
+
+Residual = Callable[..., Tensor]
+"""residual(*unknowns, *inputs) -> (B, N) or (B, N, D), each element from its own rows alone."""
+
+
+@dataclass(frozen=True)
+class LeastSquaresSolution:
+    """The minima of a batch.
+
+    unknowns:    as they were given, in the order in which they were given
+    cost:        (B,) half the sum of robustified squared whitened residuals, detached
+    success:     (B,) bool, the start and its residuals are finite, and all that moves is determined. If not, the
+                 estimate is the best that was found, but it has no gradient.
+    convergence: per element
+    """
+
+    unknowns: Tensors
+    cost: Tensor
+    success: Tensor
+    convergence: Convergence
+
+
+@full_precision
+def minimize(
+    residual: Residual,
+    start: Tensor | Sequence[Tensor],
+    inputs: Sequence[Tensor] = (),
+    manifolds: Manifold | Sequence[Manifold] = "euclidean",
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    kernel: Kernel = "none",
+    scale: Tensor | float = 1.0,
+    backward: Backward = "implicit",
+    iterations: int = 50,
+    tolerance: float = 1e-10,
+) -> LeastSquaresSolution:
+    """Minimise half the sum of rho(weight * |residual|^2) over unknowns by Levenberg-Marquardt, many problems at once.
+
+    residual:  function of the unknowns, then the inputs, to (B, N) or, where D numbers are robustified as one,
+               (B, N, D). It is called with any part of the batch. Its derivatives come from torch, which must be able
+               to take them forward and twice: `grid_sample` for instance can not, bilinear sums of gathered pixels can.
+    start:     one or several unknowns, all leading with B, together of few dimensions: their Hessian is dense
+    inputs:    all tensors that differ between elements or want a gradient, leading with B
+    manifolds: what each unknown moves on, see `Manifold`
+    weights:   (B, N) inverse variances, one if None
+    mask:      (B, N) bool, residuals that count, all if None; the others must be finite, with finite derivatives
+    scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
+    backward:  how gradients reach inputs, weights and scale, see `implicit.Backward`
+    tolerance: stop where a step promises to lower the cost by less than this share of it
+
+    Dense depth to dense depth, for instance, is a pose per element that depths and intrinsics have gradients through:
+
+        def residual(T_21, depth_1, depth_2, K):  # (B, 4, 4), (B, H, W), (B, H, W), (B, 3, 3) -> (B, H W)
+            points_2 = transform(T_21, backprojected(depth_1, K))
+            return bilinear(depth_2, projected(points_2, K)) - points_2[..., 2]
+
+        solution = minimize(residual, T_21, (depth_1, depth_2, K), "se3", kernel="huber", scale=0.02)
+
+    The implicit gradient is zero where the exact Hessian is not positive definite, that is, not at a strict minimum.
+    Raises ValueError for shapes and dtypes that do not fit, for unknown names, and for a residual that has gradients to
+    other tensors than its inputs, to which none would come.
+    """
+    check_backward(backward)
+    unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
+    names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
+    product = Product.of(names, unknowns)
+    weights, counted, scale = _checked(residual, unknowns, tuple(inputs), weights, mask, scale)
+    minimization = _Minimization(residual, product, len(unknowns), kernel, iterations, tolerance)
+    tensors = (*unknowns, counted, weights, scale, *inputs)
+    minimization.ndims = minimization.dimensions(tensors)
+    if backward == "unroll":
+        found = minimization.minimize(tensors)
+    else:
+        attached = backward == "implicit"
+        found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
+    solution, (success, cost, steps, converged, initial_cost) = (
+        found[: len(unknowns)],
+        found[len(unknowns) :],
+    )
+    if backward == "truncated":
+        solution = minimization.last_step(solution, tensors, success)
+    return LeastSquaresSolution(solution, cost, success, Convergence(steps, converged, initial_cost, cost))
+
+
+def _checked(
+    residual: Residual,
+    unknowns: Tensors,
+    inputs: Tensors,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    scale: Tensor | float,
+) -> Tensors:
+    """Weights (B, N), which residuals count (B, N), and the scale (B,)."""
+    batch, like = len(unknowns[0]), unknowns[0]
+    for number, tensor in enumerate((*unknowns, *inputs)):
+        name = f"unknown {number}" if number < len(unknowns) else f"input {number - len(unknowns)}"
+        if tensor.ndim == 0 or len(tensor) != batch:
+            raise ValueError(
+                f"{name} must lead with the batch of {batch}, not have shape {tuple(tensor.shape)}"
+            )
+    with torch.enable_grad():
+        value = residual(*(tensor.detach() for tensor in (*unknowns, *inputs)))
+    if value.requires_grad:
+        raise ValueError("the residual depends on a tensor with gradient that is not among its inputs")
+    if value.ndim not in (2, 3) or len(value) != batch:
+        raise ValueError(
+            f"the residual must be (B, N) or (B, N, D) with B = {batch}, not {tuple(value.shape)}"
+        )
+    rows = value.shape[:2]
+    weights = value.new_ones(rows) if weights is None else weights
+    counted = torch.ones(rows, dtype=torch.bool, device=value.device) if mask is None else mask
+    for name, tensor in (("weights", weights), ("mask", counted)):
+        if tensor.shape not in (rows, (1, rows[1])):
+            raise ValueError(f"{name} must be (B, N) = {tuple(rows)}, not {tuple(tensor.shape)}")
+    floats = {f"input {number}": x for number, x in enumerate(inputs) if x.is_floating_point()}
+    starts = {f"unknown {number}": x for number, x in enumerate(unknowns)}
+    check_dtypes(**starts, **floats, residual=value, weights=weights)
+    scale = torch.as_tensor(scale, dtype=like.dtype, device=like.device)
+    return weights.expand(rows), counted.expand(rows), scale.expand(batch)
+
+
+class _Model(NamedTuple):
+    """The local models of the costs (B,) at unknowns: gradient (B, n) and Hessian (B, n, n) in the tangent space."""
+
+    unknowns: Tensors
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+class _Data(NamedTuple):
+    """What the costs are made of, leading with the batch; zero weight where nothing counts."""
+
+    counted: Tensor
+    weights: Tensor
+    scale: Tensor
+    inputs: Tensors
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The least-squares problems for `levenberg.minimize`, and what follows from their minima."""
+
+    residual: Residual
+    product: Product
+    kernel: Kernel
+    data: _Data
+    solvable: Tensor
+
+    def part(self, rows: Tensor) -> _Problem:
+        data, solvable = taken((self.data, self.solvable), rows)
+        return _Problem(self.residual, self.product, self.kernel, data, solvable)
+
+    def evaluate(self, unknowns: Tensors, near: Tensor) -> _Model:
+        basis = self.product.basis(unknowns)
+
+        def moved(step: Tensor) -> Tensor:
+            return self._residuals(self.product.retract(unknowns, step))
+
+        zero = torch.zeros_like(basis[0])
+        r = moved(zero)
+        J = vmap(lambda step: jvp(moved, (zero,), (step,))[1], out_dims=-1)(basis)
+        lin = self._weighed(r, J)
+        J = lin.J.flatten(1, 2)
+        hessian = J.mT @ _pull(lin, near[:, None]).flatten(1, 2)
+        gradient = (J.mT @ lin.force.flatten(1)[..., None]).squeeze(-1)
+        return _Model(unknowns, lin.cost.sum(1), gradient, hessian)
+
+    def step(self, model: _Model, damping: Tensor) -> tuple[Tensors, Tensor]:
+        diagonal = damping[:, None] * model.hessian.diagonal(dim1=-2, dim2=-1)
+        floor = torch.finfo(damping.dtype).tiny ** 0.5  # what nothing depends on stays where it is
+        factor = factorize(model.hessian + torch.diag_embed(diagonal + floor), strict=False)
+        step = factor.solve(model.gradient[..., None]).squeeze(-1)
+        decrease = 0.5 * (step * model.gradient).sum(-1)
+        decrease = torch.where(factor.definite, decrease, torch.inf)
+        return self.product.retract(model.unknowns, -step), decrease
+
+    def select(self, accept: Tensor, new: _Model, old: _Model) -> _Model:
+        return new if accept.all() else chosen(accept, new, old)
+
+    def cost(self, unknowns: Tensors) -> Tensor:
+        """(B,)"""
+        r = self._residuals(unknowns)
+        return self._weighed(r, r[..., None]).cost.sum(1)
+
+    def slope(self, unknowns: Tensors, direction: Tensor) -> Tensor:
+        """(B,) the derivatives of the costs along directions (B, n)."""
+
+        def moved(step: Tensor) -> Tensor:
+            return self._residuals(self.product.retract(unknowns, step))
+
+        r, velocity = jvp(moved, (torch.zeros_like(direction),), (direction,))[:2]
+        return (self._weighed(r, velocity[..., None]).force * velocity).sum((1, 2))
+
+    def exact_factor(self, unknowns: Tensors) -> DefiniteFactor:
+        """Of the exact Hessians (B, n, n)."""
+        basis = self.product.basis(unknowns)
+
+        def gradient(step: Tensor) -> Tensor:
+            return grad(lambda step: self.cost(self.product.retract(unknowns, step)).sum())(step)
+
+        zero = torch.zeros_like(basis[0])
+        return factorize(vmap(lambda step: jvp(gradient, (zero,), (step,))[1], out_dims=-1)(basis))
+
+    def _residuals(self, unknowns: Tensors) -> Tensor:
+        """(B, N, D), zero where nothing counts."""
+        r = self.residual(*unknowns, *self.data.inputs)
+        r = r[..., None] if r.ndim == 2 else r
+        return torch.where(self.data.counted[..., None], r, 0.0)
+
+    def _weighed(self, residual: Tensor, J: Tensor) -> Linearization:
+        _, weights, scale, _ = self.data
+        rho, slope, curvature = robustify(weights * residual.square().sum(-1), self.kernel, scale[:, None])
+        return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
+
+
+def _pull(lin: Linearization, near: Tensor) -> Tensor:
+    """The Hessians of the costs in the residuals times J, (B, N, D, n); `near` as in `gauss_newton_expansion`."""
+    residual, weight = lin.residual, lin.weight
+    bend = flat_along(weight, lin.bend, residual.square().sum(-1), near)
+    along = (residual[..., None, :] @ lin.J) * (bend[..., None] * residual)[..., None]
+    return weight[..., None, None] * lin.J + along
+
+
+class _Minimization:
+    """`minimize` for `implicit.minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
+
+    num_vectors = 1
+
+    def __init__(
+        self,
+        residual: Residual,
+        product: Product,
+        num_unknowns: int,
+        kernel: Kernel,
+        iterations: int,
+        tolerance: float,
+    ) -> None:
+        self.residual, self.product, self.num_unknowns = residual, product, num_unknowns
+        self.kernel, self.iterations, self.tolerance = kernel, iterations, tolerance
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = None
+
+    def dimensions(self, tensors: Tensors) -> tuple[Ndims, Ndims, Ndims]:
+        """Of vectors, of what is found, and of inputs, without the batch."""
+        inputs = tuple(tensor.ndim - 1 for tensor in tensors)
+        return (1,), (*inputs[: self.num_unknowns], 0, 0, 0, 0, 0), inputs
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        start, finite = self.product.sanitized(inputs[: self.num_unknowns])
+        with torch.no_grad():
+            finite = finite & torch.isfinite(self._problem(inputs).cost(start))
+        problem = self._problem(inputs, finite)
+        model, convergence = levenberg.minimize(problem, start, self.iterations, self.tolerance)
+        with torch.no_grad():
+            success = finite & factorize(torch.where(finite[:, None, None], model.hessian, 0.0)).definite
+        how = convergence.iterations, convergence.converged, convergence.initial_cost
+        return *model.unknowns, success, convergence.cost, *how
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        unknowns, success = found[: self.num_unknowns], found[self.num_unknowns]
+        with torch.no_grad():
+            factor = self._problem(inputs).exact_factor(unknowns)
+
+        def solve(right: Tensors) -> Tensors:
+            of_successes = torch.where(success[:, None], right[0], 0.0)
+            return (factor.solve(of_successes[..., None]).squeeze(-1),)
+
+        return solve
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        # A success stands in for each failure: no gradient, but finite derivatives.
+        success = found[self.num_unknowns]
+        rows = torch.arange(len(success), device=success.device)
+        rows = torch.where(success, rows, success.long().argmax())
+        found, inputs = (tuple(x.index_select(0, rows) for x in part) for part in (found, inputs))
+        return self._problem(inputs).slope(found[: self.num_unknowns], direction[0]).sum()
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        split = self.num_unknowns
+        return *self.product.retract(found[:split], direction[0]), *found[split:]
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        return self.product.push(found[: self.num_unknowns], direction[0])
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        return (self.product.pull_back(found[: self.num_unknowns], gradient),)
+
+    def last_step(self, unknowns: Tensors, inputs: Tensors, success: Tensor) -> Tensors:
+        """The unknowns after one more step from the minimum, with the gradient of that step."""
+        problem = self._problem(inputs)
+        last = problem.evaluate(tuple(tensor.detach() for tensor in unknowns), ~success)
+        stepped, _ = problem.step(last, torch.zeros_like(last.cost))
+        return chosen(success, stepped, unknowns)
+
+    def _problem(self, inputs: Tensors, solvable: Tensor | None = None) -> _Problem:
+        counted, weights, scale, *rest = inputs[self.num_unknowns :]
+        weights = torch.where(counted, weights, 0.0)
+        data = _Data(counted, weights, scale, tuple(rest))
+        solvable = torch.ones_like(scale, dtype=torch.bool) if solvable is None else solvable
+        return _Problem(self.residual, self.product, self.kernel, data, solvable)

@@ -1,0 +1,1 @@
+"""Pose of a single frame from its matches with the map."""

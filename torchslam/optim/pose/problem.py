@@ -1,0 +1,224 @@
+"""What `refine_pose` minimises: its inputs, their local models, and the minimum with what its derivatives need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import transform
+from torchslam.geometry.precision import check_dtypes
+from torchslam.geometry.robust import Kernel
+from torchslam.optim.core.batching import Tensors
+from torchslam.optim.core.implicit import Ndims
+from torchslam.optim.core.levenberg_marquardt import minimize
+from torchslam.optim.core.linear import factorize
+from torchslam.optim.core.priors import PosePrior, prior_expansion, prior_hessian
+from torchslam.optim.core.residuals import (
+    Observations,
+    exact_expansion,
+    linearize,
+    only,
+    usable,
+    variance_factor,
+)
+from torchslam.optim.core.tangent import move, point_jacobian, pull_back, push, retract
+from torchslam.optim.pose.expansion import PoseModel, PoseObservations
+
+_MIN_POINTS = 3
+
+
+@dataclass(frozen=True)
+class PoseInputs:
+    """What a pose problem is made of: finite tensors, rows that do not count having weight zero."""
+
+    points_w: Tensor
+    observations: Observations
+    prior: PosePrior | None
+
+    @staticmethod
+    def sanitized(
+        T_cw: Tensor,
+        points_w: Tensor,
+        pixels: Tensor,
+        camera: Camera,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        kernel: Kernel,
+        scale: Tensor | float,
+        prior: PosePrior | None,
+    ) -> PoseInputs:
+        if T_cw.shape[1:] != (4, 4) or points_w.ndim != 3 or pixels.ndim != 3:
+            raise ValueError(
+                "T_cw, points_w and pixels must be (B, 4, 4), (B, N, 3) and (B, N, 2), not "
+                f"{tuple(T_cw.shape)}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
+            )
+        prior_T, information = (None, None) if prior is None else (prior.T_cw, prior.information)
+        check_dtypes(
+            T_cw=T_cw,
+            points_w=points_w,
+            pixels=pixels,
+            weights=weights,
+            camera_params=camera.params,
+            prior_T_cw=prior_T,
+            prior_information=information,
+        )
+        batch, count = T_cw.shape[0], points_w.shape[1]
+        shapes = [(size, count, *matrix) for size in (batch, 1) for matrix in ((), (2, 2))]
+        if weights is not None and weights.shape not in shapes:
+            raise ValueError(
+                f"weights must be (B, N) = {(batch, count)} or (B, N, 2, 2), not {tuple(weights.shape)}"
+            )
+        points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
+        weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+        weights = weights.expand(batch, *weights.shape[1:])
+        use = usable(pixels, points_w, weights)
+        use = use if mask is None else use & mask
+        rows = use[..., None]
+        scale = torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device)
+        if prior is not None:
+            prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
+        observations = Observations(
+            torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
+        )
+        return PoseInputs(torch.where(rows, points_w, 0.0), observations, prior)
+
+    def tensors(self) -> list[Tensor]:
+        """All that gradients may flow to."""
+        prior = () if self.prior is None else (self.prior.T_cw, self.prior.information)
+        return [self.points_w, *self.observations.tensors(), *prior]
+
+    def replaced(self, tensors: Sequence[Tensor]) -> PoseInputs:
+        """The same problem with other tensors, in the order of `tensors`."""
+        points_w, *rest = tensors
+        prior = None if self.prior is None else PosePrior(*rest[4:])
+        return PoseInputs(points_w, self.observations.replaced(rest[:4]), prior)
+
+
+class PoseProblem:
+    """The least-squares problem of `refine_pose`: for `minimize`, and what follows from its minimum."""
+
+    def __init__(self, inputs: PoseInputs) -> None:
+        self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
+        self.laid_out = PoseObservations(inputs.points_w, inputs.observations)
+        self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
+        counted = (self.observations.factors > 0).sum(-1)
+        self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
+
+    def evaluate(self, T_cw: Tensor, near: Tensor) -> PoseModel:
+        model = self.laid_out.expand(T_cw, near)
+        if self.prior is None:
+            return model
+        cost, gradient, hessian = prior_expansion(self.prior, T_cw)
+        return model._replace(
+            cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
+        )
+
+    def step(self, model: PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
+        # Elements without any weight stay solvable: their step is zero.
+        grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
+        damped = (model.hessian + model.bend) * grow + floor
+        factor, failed = torch.linalg.cholesky_ex(damped)
+        if failed.any():
+            damped = torch.where((failed > 0)[:, None, None], model.hessian * grow + floor, damped)
+            factor, _ = torch.linalg.cholesky_ex(damped)
+        xi = -torch.cholesky_solve(model.gradient[..., None], factor).squeeze(-1)
+        return retract(model.T_cw, xi), -0.5 * (xi * model.gradient).sum(-1)
+
+    def select(self, accept: Tensor, new: PoseModel, old: PoseModel) -> PoseModel:
+        if accept.all():
+            return new
+        matrix, vector = accept[:, None, None], accept[:, None]
+        return PoseModel(
+            torch.where(matrix, new.T_cw, old.T_cw),
+            torch.where(accept, new.cost, old.cost),
+            torch.where(vector, new.gradient, old.gradient),
+            torch.where(matrix, new.hessian, old.hessian),
+            torch.where(matrix, new.bend, 0.0),
+        )
+
+    def covariance(self, T_cw: Tensor) -> Tensor:
+        """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
+        lin = linearize(self.observations, transform(T_cw, self.points_w))
+        factor = variance_factor(self.observations, lin, num_parameters=6)[:, None, None]
+        information = self.laid_out.expand(T_cw, torch.zeros_like(self.solvable)).hessian
+        if self.prior is not None:  # in absolute units, which the residuals do not calibrate
+            information = information + factor * prior_expansion(self.prior, T_cw)[2]
+        return factor * factorize(information).solve(self.eye.expand_as(information))
+
+    def hessian(self, T_cw: Tensor) -> Tensor:
+        """The exact Hessian (B, 6, 6) of the cost in xi."""
+        points_c = transform(T_cw, self.points_w)
+        gradient, hessian = exact_expansion(self.observations, points_c)
+        G = point_jacobian(points_c)
+        result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
+        # The bend of the rotation itself: half of gradient . (omega x (omega x p)).
+        outer = gradient.mT @ points_c
+        bend = (
+            0.5 * (outer + outer.mT)
+            - outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * self.eye[:3, :3]
+        )
+        result = result + torch.nn.functional.pad(bend, (3, 0, 3, 0))
+        return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
+
+
+class PoseMinimization:
+    """`refine_pose` for `implicit.minimum`: found are the poses, and `success`, `cost` and how it went."""
+
+    num_unknowns = 1
+    num_vectors = 1
+
+    def __init__(self, inputs: PoseInputs, iterations: int, tolerance: float) -> None:
+        self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
+        prior = () if inputs.prior is None else (2, 2)
+        weights = inputs.observations.weights.ndim - 1
+        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+            (1,),
+            (2, 0, 0, 0, 0, 0),
+            (2, 2, 2, weights, 1, 1, *prior),
+        )
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        T_cw, problem = inputs[0], PoseProblem(self.inputs.replaced(inputs[1:]))
+        finite = torch.isfinite(T_cw).flatten(1).all(-1)
+        identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+        start = torch.where(finite[:, None, None], T_cw, identity)
+        model, convergence = minimize(problem, start, self.iterations, self.tolerance)
+        with torch.no_grad():
+            success = problem.solvable & factorize(model.hessian).definite & finite
+        refined = torch.where(success[:, None, None], model.T_cw, start.detach())
+        how = convergence.iterations, convergence.converged, convergence.initial_cost
+        return refined, success, convergence.cost, *how
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        T_cw, success, *_ = found
+        with torch.no_grad():
+            factor = factorize(PoseProblem(self.inputs.replaced(inputs[1:])).hessian(T_cw))
+
+        def solve(right: Tensors) -> Tensors:
+            right_of_successes = torch.where(success[:, None], right[0], 0.0)
+            return (factor.solve(right_of_successes[..., None]).squeeze(-1),)
+
+        return solve
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        T_cw, (xi,), problem = found[0], direction, self.inputs.replaced(inputs[1:])
+        points_c = transform(T_cw, problem.points_w)
+        lin = linearize(problem.observations, points_c)
+        velocity = lin.J @ move(points_c, xi[:, None])[..., None]
+        slope = (lin.force[..., None, :] @ velocity).sum()
+        if problem.prior is not None:
+            slope = slope + (prior_expansion(problem.prior, T_cw)[1] * xi).sum()
+        return slope
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        return retract(found[0], direction[0]), *found[1:]
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        return (push(found[0], direction[0]),)
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        return (pull_back(found[0], gradient[0]),)

@@ -1,0 +1,1 @@
+"""Pose graphs over SE(3) and Sim(3)."""

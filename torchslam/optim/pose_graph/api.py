@@ -1,0 +1,188 @@
+"""Pose graph optimisation over similarities, or rigid poses: sparse, robust, batched, differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.lie import sim3_scale
+from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.robust import Kernel
+from torchslam.optim.core.implicit import Backward, check_backward, minimum
+from torchslam.optim.core.levenberg_marquardt import Convergence
+from torchslam.optim.pose_graph.minimization import PoseGraphMinimization
+from torchslam.optim.pose_graph.model import Inputs
+
+# 95 % of the norms of seven standard normal numbers lie below.
+_SCALE = 3.75
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Nodes, and how some of them lie relative to others, as measured. A batch shares nodes and edges.
+
+    S_cw:        (B, K, 4, 4) or (K, 4, 4) start, world to node, similarities
+    edges:       (E, 2) int64 nodes (i, j)
+    S_ji:        (B, E, 4, 4) or (E, 4, 4) measured, from node i to node j
+    information: inverse covariances (B, E, D, D) or (E, D, D) of log(S_j S_i^-1 S_ji^-1), symmetric; D = 7:
+                 translation, rotation, log scale, or, without scale, 6; or weights (B, E) or (E,) of the identity; one
+                 if None
+    fixed:       rows of nodes, or a (B, K) or (K,) bool mask, that stay as they are
+    mask:        (B, E) or (E,) bool, edges that count, all if None
+    with_scale:  whether the scales of the nodes move; if not, the log scale is no part of the error either
+    """
+
+    S_cw: Tensor
+    edges: Tensor
+    S_ji: Tensor
+    information: Tensor | None = None
+    fixed: Tensor | Sequence[int] = (0,)
+    mask: Tensor | None = None
+    with_scale: bool = True
+
+
+@dataclass(frozen=True)
+class PoseGraphSolution:
+    """The minimum of a pose graph; without the B where the graph had none.
+
+    S_cw:        (B, K, 4, 4)
+    cost:        (B,) half the sum of robustified squared whitened errors, detached
+    success:     (B,) bool, something moves, and all that moves is determined. If not, the estimate is the best that was
+                 found, but it has no gradient.
+    moved:       (B, K) bool. What is fixed, not finite, or not joined with a fixed node by edges that count, stayed at
+                 its start (the identity, where that is no similarity), without gradient but to that start.
+    convergence: per element of the batch
+    """
+
+    S_cw: Tensor
+    cost: Tensor
+    success: Tensor
+    moved: Tensor
+    convergence: Convergence
+
+
+@full_precision
+def pose_graph_optimize(
+    graph: PoseGraph,
+    kernel: Kernel = "huber",
+    scale: Tensor | float = _SCALE,
+    backward: Backward = "implicit",
+    iterations: int = 30,
+    tolerance: float = 1e-8,
+) -> PoseGraphSolution:
+    """Minimise the robust errors log(S_j S_i^-1 S_ji^-1) of the edges over the nodes by Levenberg-Marquardt.
+
+    scale:    of the kernel, in units of the whitened error: a number, a scalar tensor or (B,)
+    backward: how gradients reach S_ji, information, scale and fixed nodes, see `implicit.Backward`. The gradient ends
+              at the start of what moves.
+    tolerance: stop where a step promises to lower the cost by less than this share of it
+
+    Edges that are not finite, have no weight or touch a node that is not finite do not count. Where the exact Hessian
+    is not positive definite, that is, not at a strict minimum, the implicit gradient is zero. Memory and time grow with
+    the fill-in of the graph, for trajectories about linearly in the nodes. Raises ValueError for shapes and indices
+    that do not fit and for unknown names. Source: Strasdat, Montiel and Davison, "Scale drift-aware large scale
+    monocular SLAM", 2010.
+    """
+    check_backward(backward)
+    counted, fixed, inputs = _sanitized(graph, scale)
+    minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
+    tensors = (*inputs, counted, fixed, graph.edges)
+    if backward == "unroll":
+        found = minimization.minimize(tensors)
+    else:
+        attached = backward == "implicit"
+        found = minimum(minimization, tensors if attached else [x.detach() for x in tensors])
+    solution, success, moving, cost, steps, converged, initial_cost = found
+    at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
+    if backward == "implicit":
+        solution = torch.where(moving[..., None, None], solution, inputs.S_cw)
+    elif backward == "truncated":
+        solution = minimization.last_step(at_minimum, tensors, success)
+    if backward != "detached":
+        solution = torch.where(success[:, None, None, None], solution, at_minimum)
+
+    row = slice(None) if graph.S_cw.ndim == 4 else 0
+    return PoseGraphSolution(
+        solution[row], cost[row], success[row], moving[row], Convergence(steps, converged, initial_cost, cost)
+    )
+
+
+def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor, Inputs]:
+    """Edges that count (B, E), fixed nodes (B, K), and the tensors, all batched and finite."""
+    S_cw, S_ji, edges = graph.S_cw, graph.S_ji, graph.edges
+    if S_cw.ndim not in (3, 4) or S_cw.shape[-2:] != (4, 4) or edges.ndim != 2 or edges.shape[1] != 2:
+        raise ValueError(
+            "S_cw and edges must be (B, K, 4, 4) or (K, 4, 4) and (E, 2), not "
+            f"{tuple(S_cw.shape)} and {tuple(edges.shape)}"
+        )
+    S_cw = S_cw if S_cw.ndim == 4 else S_cw[None]
+    (batch, num_nodes), num_edges = S_cw.shape[:2], len(edges)
+    if S_ji.shape[-3:] != (num_edges, 4, 4):
+        raise ValueError(
+            f"S_ji must be (B, E, 4, 4) or (E, 4, 4) with E = {num_edges}, not {tuple(S_ji.shape)}"
+        )
+    if num_edges and not 0 <= int(edges.min()) <= int(edges.max()) < num_nodes:
+        raise ValueError(f"edges must lie in 0 ... {num_nodes - 1}")
+    if (edges[:, 0] == edges[:, 1]).any():
+        raise ValueError("an edge must join two nodes, not one with itself")
+    S_ji = S_ji.expand(batch, num_edges, 4, 4)
+    check_dtypes(S_cw=S_cw, S_ji=S_ji, information=graph.information)
+    information = _information(graph, S_cw, batch, num_edges)
+
+    nodes, measured = _is_similarity(S_cw), _is_similarity(S_ji)
+    diagonal = information.detach().diagonal(dim1=-2, dim2=-1)
+    weighted = (
+        torch.isfinite(information).flatten(2).all(-1) & (diagonal >= 0).all(-1) & (diagonal > 0).any(-1)
+    )
+    counted = measured & weighted & nodes[:, edges[:, 0]] & nodes[:, edges[:, 1]]
+    if graph.mask is not None:
+        counted = counted & graph.mask
+    fixed = (_as_mask(graph.fixed, num_nodes, S_cw.device) & nodes).expand(batch, num_nodes)
+    eye = torch.eye(4, dtype=S_cw.dtype, device=S_cw.device)
+    scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
+    rows = counted[..., None, None]
+    return (
+        counted,
+        fixed,
+        Inputs(
+            torch.where(nodes[..., None, None], S_cw, eye),
+            torch.where(rows, S_ji, eye),
+            torch.where(rows, information, 0.0),
+            scale[..., None],
+        ),
+    )
+
+
+def _information(graph: PoseGraph, S_cw: Tensor, batch: int, num_edges: int) -> Tensor:
+    """Symmetric (B, E, D, D) from any of the forms it may be given in."""
+    dims = 7 if graph.with_scale else 6
+    eye = torch.eye(dims, dtype=S_cw.dtype, device=S_cw.device)
+    given = S_cw.new_ones(num_edges) if graph.information is None else graph.information
+    if given.ndim in (1, 2) and given.shape[-1] == num_edges:
+        given = given[..., None, None] * eye
+    elif given.ndim not in (3, 4) or given.shape[-3:] != (num_edges, dims, dims):
+        raise ValueError(
+            f"information must be (E,), (B, E), (E, {dims}, {dims}) or (B, E, {dims}, {dims}) with E = {num_edges}, "
+            f"not {tuple(given.shape)}"
+        )
+    return (0.5 * (given + given.mT)).expand(batch, num_edges, dims, dims)
+
+
+def _is_similarity(S: Tensor) -> Tensor:
+    """Whether matrices are finite and have a scale. (..., 4, 4) -> (...)."""
+    return torch.isfinite(S).flatten(-2).all(-1) & (sim3_scale(S.detach()) > 0)
+
+
+def _as_mask(rows: Tensor | Sequence[int], count: int, device: torch.device) -> Tensor:
+    """A bool mask (count,) of rows, or the mask (B, count) or (count,) that was given."""
+    rows = torch.as_tensor(rows, device=device)
+    if rows.dtype == torch.bool:
+        if rows.shape[-1:] != (count,):
+            raise ValueError(f"a mask of fixed nodes must end in {count}, not have shape {tuple(rows.shape)}")
+        return rows
+    mask = torch.zeros(count, dtype=torch.bool, device=device)
+    mask[rows.long()] = True
+    return mask

@@ -1,0 +1,218 @@
+"""The least-squares problem behind `pose_graph_optimize`: its local models, its adjoint.
+
+An edge's error is e = log(E) with E = X S_ji^-1, X = S_j S_i^-1. Nodes moved by exp(xi) from the left move E to
+exp(xi_j) exp(-Ad(X) xi_i) E: to first order by eta = xi_j - Ad(X) xi_i, from the left too, so that the derivative of e
+is the inverse left Jacobian of the group. To second order the product adds half of a bracket. An edge's share in the
+normal equations therefore follows from its gradient and Hessian in eta alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.lie import (
+    sim3_adjoint,
+    sim3_exp,
+    sim3_inverse,
+    sim3_left_jacobian_inverse,
+    sim3_log,
+    skew,
+)
+from torchslam.geometry.robust import Kernel, Robustified, robustify
+from torchslam.optim.pose_graph.layout import Layout
+from torchslam.optim.pose_graph.sparse_cholesky import SparseFactor, factorize_sparse
+
+# A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
+_DAMPING_SHARE = 1e-4
+
+
+class Inputs(NamedTuple):
+    """All that gradients may flow to: S_cw (B, K, 4, 4), S_ji (B, E, 4, 4), information (B, E, D, D), scale."""
+
+    S_cw: Tensor
+    S_ji: Tensor
+    information: Tensor
+    scale: Tensor
+
+
+class Linearization(NamedTuple):
+    """Errors of the edges and how they change.
+
+    error:   (B, E, D); J: (B, E, D, D) d error / d eta; carry: (B, E, D, D) Ad(X), so that eta = xi_j - carry xi_i
+    pull:    (B, E, D) information @ error; squared: (B, E) error^T information error
+    kernel:  rho and its derivatives (B, E); zero where the edge does not count
+    sigma:   (B, E) the error in log scale, a constant where the scale is fixed
+    """
+
+    error: Tensor
+    J: Tensor
+    carry: Tensor
+    pull: Tensor
+    squared: Tensor
+    kernel: Robustified
+    sigma: Tensor
+
+    @property
+    def force(self) -> Tensor:
+        """(B, E, D) the gradient of the cost in eta."""
+        return (self.J.mT @ (self.kernel.weight[..., None] * self.pull)[..., None]).squeeze(-1)
+
+
+@dataclass(frozen=True)
+class PoseGraphModel:
+    """The local model of the cost (B,) at nodes S_cw (B, K, 4, 4).
+
+    gradient: (B, K, D); diagonal: (B, K, D, D), across: (B, P, D, D) the Hessian, the identity where nothing moves
+    """
+
+    S_cw: Tensor
+    cost: Tensor
+    gradient: Tensor
+    diagonal: Tensor
+    across: Tensor
+
+
+class PoseGraphProblem:
+    """A pose graph for `levenberg.minimize`, and what follows from its minimum."""
+
+    def __init__(self, layout: Layout, inputs: Inputs, kernel: Kernel) -> None:
+        self.layout, self.inputs, self.kernel = layout, inputs, kernel
+        self.dims = inputs.information.shape[-1]
+        self.solvable = layout.moving.any(-1)
+
+    def evaluate(self, S_cw: Tensor, near: Tensor) -> PoseGraphModel:
+        lin = self._linearize(S_cw)
+        # As in `residuals.pull`: the negative curvature along an outlier's error counts as flat close to the optimum.
+        flat = -lin.kernel.weight / torch.where(lin.squared > 0, lin.squared, 1.0)
+        bend = torch.maximum(2 * lin.kernel.curvature, flat) * near[:, None]
+        outer = lin.pull[..., :, None] * lin.pull[..., None, :]
+        curve = lin.kernel.weight[..., None, None] * self.inputs.information + bend[..., None, None] * outer
+        return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, twist=None)
+
+    def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:
+        damping = _DAMPING_SHARE * damping
+        factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
+        xi = factor.solve(model.gradient)
+        decrease = 0.5 * (xi * model.gradient).sum((-2, -1))
+        moved = torch.where(self.layout.moving[..., None, None], retract(model.S_cw, -xi), model.S_cw)
+        return moved, torch.where(factor.definite, decrease, torch.inf)
+
+    def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
+        if accept.all():
+            return new
+        names = PoseGraphModel.__dataclass_fields__
+        pairs = ((getattr(new, name), getattr(old, name)) for name in names)
+        return PoseGraphModel(*(torch.where(accept.view(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in pairs))
+
+    def factorized(self, model: PoseGraphModel) -> SparseFactor:
+        """The undamped equations of a model at a minimum, ready to be solved."""
+        return factorize_sparse(self.layout.structure, model.diagonal, model.across)
+
+    def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
+        """The model with the exact Hessian of the cost in the left perturbations."""
+        lin = self._linearize(S_cw)
+        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.force))
+
+    def _linearize(self, S_cw: Tensor) -> Linearization:
+        layout = self.layout
+        return linearize(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.kernel)
+
+    def _assemble(
+        self, S_cw: Tensor, lin: Linearization, hessian: Tensor, twist: Tensor | None
+    ) -> PoseGraphModel:
+        """The normal equations from edges' Hessians (B, E, D, D) in eta, and half the bracket's part of the Hessian."""
+        layout, carry = self.layout, lin.carry
+        force = lin.force
+        at_i = torch.cat((carry.mT @ hessian @ carry, -carry.mT @ force[..., None]), dim=-1)
+        ends = torch.cat((at_i, torch.cat((hessian, force[..., None]), dim=-1)), dim=1)
+        moving = layout.moving[..., None]
+        nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
+        eye = torch.eye(self.dims, dtype=S_cw.dtype, device=S_cw.device)
+        # Where an edge lost all its weight, its nodes stay solvable: their step is zero.
+        floor = torch.where(moving[..., None], torch.finfo(S_cw.dtype).tiny ** 0.5, 1.0) * eye
+
+        linking = layout.linking
+        both = (layout.moving[:, layout.i] & layout.moving[:, layout.j])[:, linking, None, None]
+        between = hessian if twist is None else hessian + twist
+        across = torch.where(both, -(between[:, linking] @ carry[:, linking]), 0.0)
+        across = torch.where(layout.turned[:, None, None], across.mT, across)
+        return PoseGraphModel(
+            S_cw,
+            0.5 * lin.kernel.rho.sum(-1),
+            nodes[..., -1],
+            nodes[..., :-1] + floor,
+            layout.by_pair.sum(across),
+        )
+
+    def _exact_hessian(self, lin: Linearization) -> Tensor:
+        """Exact Hessians (B, E, D, D) of the edges' costs in eta, in the chart of the exponential.
+
+        The derivative of the force J^T (rho' information error) by autograd, through the analytic Jacobian; its
+        symmetric part, because J itself turns with eta.
+        """
+        dims, information = self.dims, self.inputs.information.detach()
+        with torch.enable_grad():
+            # One copy of every edge per row.
+            error = lin.error.detach().expand(dims, *lin.error.shape).clone().requires_grad_()
+            sigma = lin.sigma.detach().expand(dims, *lin.sigma.shape)[..., None]
+            full = error if dims == 7 else torch.cat((error, sigma), dim=-1)
+            pull = (information @ error[..., None]).squeeze(-1)
+            slope = robustify((error * pull).sum(-1), self.kernel, self.inputs.scale.detach()).weight
+            J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
+            force = (J.mT @ (slope[..., None] * pull)[..., None]).squeeze(-1)
+            (rows,) = torch.autograd.grad(force.movedim(-1, 0).diagonal().sum(), error)
+        hessian = rows.movedim(0, -2) @ lin.J
+        return torch.where(self.layout.counted[..., None, None], 0.5 * (hessian + hessian.mT), 0.0)
+
+
+def linearize(
+    S_cw: Tensor, i: Tensor, j: Tensor, counted: Tensor, inputs: Inputs, kernel: Kernel
+) -> Linearization:
+    """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
+    dims = inputs.information.shape[-1]
+    relative = S_cw.index_select(1, j) @ sim3_inverse(S_cw).index_select(1, i)
+    full = sim3_log(relative @ sim3_inverse(inputs.S_ji))
+    error, sigma = full[..., :dims], full[..., 6]
+    pull = (inputs.information @ error[..., None]).squeeze(-1)
+    squared = (error * pull).sum(-1)
+    robust = robustify(squared, kernel, inputs.scale)
+    robust = Robustified(*(torch.where(counted, x, 0.0) for x in robust))
+    J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
+    carry = sim3_adjoint(relative)[..., :dims, :dims]
+    return Linearization(error, J, carry, pull, squared, robust, sigma)
+
+
+def retract(S: Tensor, xi: Tensor) -> Tensor:
+    """exp(xi) @ S, the scale kept where xi has no seventh number. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
+    return sim3_exp(torch.nn.functional.pad(xi, (0, 7 - xi.shape[-1]))) @ S
+
+
+def pull_back(S: Tensor, grad_S: Tensor) -> Tensor:
+    """The gradient with respect to xi (..., 7), at zero, of a loss with gradient `grad_S` at exp(xi) @ S."""
+    columns, grads = S[..., :3, :], grad_S[..., :3, :]
+    rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
+    return torch.cat((grads[..., 3], rotation, (columns * grads).sum((-2, -1))[..., None]), dim=-1)
+
+
+def push(S: Tensor, xi: Tensor) -> Tensor:
+    """The change of S, to first order, when it moves along xi. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
+    columns = S[..., :3, :]
+    turned = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
+    if xi.shape[-1] == 7:
+        turned = turned + xi[..., 6:, None] * columns
+    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    return torch.nn.functional.pad(changed, (0, 0, 0, 1))
+
+
+def _bracket(force: Tensor) -> Tensor:
+    """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors. (..., D) -> (..., D, D)."""
+    v, omega = skew(force[..., :3]), skew(force[..., 3:6])
+    M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
+    if force.shape[-1] == 7:
+        M = torch.nn.functional.pad(M, (0, 1, 0, 1))
+        M[..., 6, :3], M[..., :3, 6] = force[..., :3], -force[..., :3]
+    return 0.5 * M

@@ -1,0 +1,1 @@
+"""Worker processes: feature prefetching and bundle adjustment in the background."""

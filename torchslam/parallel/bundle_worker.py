@@ -1,0 +1,86 @@
+"""The adjustment around a keyframe in a process of its own, while this one tracks the next frames: the same bytes.
+
+What is adjusted and when its outcome counts is `mapping.adjusting`'s to say; here it is only computed elsewhere.
+"""
+
+from __future__ import annotations
+
+import pickle
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchslam.geometry import Camera
+from torchslam.mapping.async_bundle import Answer
+from torchslam.mapping.local_bundle import Adjusted, solve_around
+from torchslam.optim import BundleProblem
+from torchslam.optim.bundle.schur import Marginals
+from torchslam.parallel.worker import WithWorker, attempt, outcome, questions, reply, task
+
+SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
+"""What tells one problem around a keyframe from another of the same run."""
+
+
+class Beside(WithWorker):
+    """Solves with another process, see `mapping.adjusting.Solver`; here until it has started, or where it was ended.
+
+    There is a process while this is entered.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__(_work)
+        self._camera = camera
+        self._has_task = False
+        self._number = 0  # of the last problem that was sent
+
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+        number = self._send(problem, iterations, covariances)
+
+        def answer() -> Adjusted:
+            found = None if number is None else self._receive(number)
+            return solve_around(problem, iterations, covariances) if found is None else found
+
+        return answer
+
+    def _send(self, problem: BundleProblem, iterations: int, covariances: bool) -> int | None:
+        """The number under which an answer will come; None where there is nobody to answer."""
+        if not self._worker.is_there():
+            return None
+        if not self._has_task:
+            self._has_task = self._worker.send(task(self._camera))
+        self._number += 1
+        arrays = {name: getattr(problem, name).numpy() for name in SENT}
+        message = pickle.dumps((self._number, arrays, iterations, covariances))
+        return self._number if self._worker.send(message) else None
+
+    def _receive(self, number: int) -> Adjusted | None:
+        """The answer of a number; those before it were not wanted in the end. None where there is nobody to answer."""
+        while (answer := self._worker.receive()) is not None:
+            answered, found = answer
+            if answered == number:
+                return _adjusted(outcome(found))
+        return None
+
+
+def _adjusted(arrays: list[np.ndarray]) -> Adjusted:
+    """What `_arrays` packed."""
+    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
+    return Adjusted(T_cw, points_w, Marginals(*covariances) if covariances else None)
+
+
+def _arrays(adjusted: Adjusted) -> list[np.ndarray]:
+    """For the way between processes: tensors are slow to pickle."""
+    return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
+
+
+def _work(connection: Connection, camera: Camera) -> None:
+    """Solve the problems that come, each with its number."""
+
+    def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
+        columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
+        return _arrays(solve_around(BundleProblem(camera=camera, **columns), iterations, covariances))
+
+    for number, *problem in questions(connection):
+        reply(connection, (number, attempt("adjusts", solve, *problem)))

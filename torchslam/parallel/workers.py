@@ -1,0 +1,101 @@
+"""What other processes see to while this one tracks and maps: the same bytes with any number of them.
+
+Frames are read, and followed or looked at, ahead of their turn (`ahead`, `scouting`); the adjustment around a keyframe
+is found beside the frames that come after it (`beside`).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+from torchslam.data.sequence import Sequence
+from torchslam.mapping.async_bundle import solve_here
+from torchslam.parallel.bundle_worker import Beside
+from torchslam.parallel.live_prefetch import LiveAhead
+from torchslam.parallel.patch_worker import Scouting
+from torchslam.parallel.prefetch import Ahead
+from torchslam.parallel.worker import starts_at_once
+from torchslam.system.run import Frames
+
+if TYPE_CHECKING:
+    from torchslam.system.slam import SLAM
+
+WORTH, WORTH_AT_ONCE = 100, 10
+"""Frames of a run for which other processes are worth their start: one that has to import everything costs as much as
+some 40 frames; a copy of this process starts at once."""
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    known = getattr(os, "sched_getaffinity", None)  # not on every system
+    return os.cpu_count() or 1 if known is None else len(known(0))
+
+
+def best_number(sequence: Sequence, start: int) -> int:
+    """How many processes are best for a sequence from frame `start` on."""
+    length = sequence.known_length
+    frames = WORTH if length is None else length - start
+    if processors() == 1 or frames < (WORTH_AT_ONCE if starts_at_once() else WORTH):
+        return 1
+    return 3
+
+
+@contextmanager
+def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
+    """The frames of a sequence from `start` on, for a run that other processes help while this is entered.
+
+    processes: how many, this one included; None: what is best. With 2 one reads frames ahead, or adjusts where that
+               cannot be; with 3 one adjusts and the others read ahead.
+    """
+    wanted = best_number(sequence, start) if processes is None else processes
+    slam.warm_up()
+    if slam.camera.params.device.type != "cpu":
+        if processes is not None and processes > 1:
+            print(f"torchslam: one process: the {slam.camera.params.device} does it all", file=sys.stderr)
+        wanted = 1
+    with ExitStack() as others:
+        frames: Frames = sequence
+        ahead = reader(sequence, slam, wanted, is_asked_for=processes is not None)
+        if ahead is not None:
+            others.enter_context(ahead)
+            frames = ahead
+        if slam.mapping and wanted > (1 if ahead is None else 2):
+            slam.mapper.adjusting.solver = others.enter_context(Beside(slam.camera))
+            others.callback(setattr, slam.mapper.adjusting, "solver", solve_here)
+        if isinstance(ahead, Ahead):
+            ahead.begin(start)
+        slam.prepare()  # while others read
+        yield frames
+
+
+def reader(
+    sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
+) -> Ahead | Scouting | LiveAhead | None:
+    """What reads the frames of a sequence ahead; None where nothing can, or should."""
+    alone = why_alone(sequence, slam)
+    if processes == 1 or alone:
+        if processes > 1 and is_asked_for:
+            print(f"torchslam: frames are read here: {alone}", file=sys.stderr)
+        return None
+    if not len(sequence.timestamps):
+        return LiveAhead(sequence, slam.camera, slam.config, slam.clock)
+    if slam.config.patches.enabled:
+        return Scouting(sequence, slam)
+    return Ahead(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
+
+
+def why_alone(sequence: Sequence, slam: SLAM) -> str:
+    """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
+    if sequence.brings_features or slam.config.features.kind == "simulated":
+        return "simulated features need no images"
+    if slam.has_own_parts:
+        return "a front end or matcher of your own is here alone"
+    if not len(sequence.timestamps) and slam.config.patches.enabled:
+        return "the next frame of a live source is not there to be followed"
+    if slam.config.matching.matcher != "descriptors":
+        return "the matcher may want images"
+    return ""

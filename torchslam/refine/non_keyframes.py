@@ -1,0 +1,119 @@
+"""The frames between the keyframes of a finished map: followed from one keyframe to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.geometry import Camera, transform
+from torchslam.map.map import Map
+from torchslam.map.posed_frames import History, RunGraph
+from torchslam.map.submap import World
+from torchslam.tracking.correspondences import match_keyframe
+from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.pose_validation import why_doubt
+from torchslam.tracking.relocalization import alone
+from torchslam.tracking.tracker import Tracker
+from torchslam.types import State, StepResult, Tracked, View
+
+NEAREST = 3  # keyframes in time that a frame is compared with that was lost
+
+
+class Poser:
+    """Poses the views of a sequence in a map that has some of them as keyframes."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.tracker = Tracker(camera, config)
+        self.config = config
+
+    @torch.no_grad()
+    def pose(self, world: World, views: list[View], given_cw: Tensor) -> list[StepResult]:
+        """Fill the history of the world with the views, in their order; a result for each.
+
+        given_cw: (N, 4, 4), what the results say as the pose that was there before
+        """
+        row_of = {index: row for row, index in enumerate(world.map.keyframes["frame_index"].tolist())}
+        self.tracker.follow(world, 0)
+        results = []
+        for view, T_cw in zip(views, given_cw, strict=True):
+            keyframe = row_of.get(view.index)
+            if keyframe is not None:
+                result = self._pass(world, view, keyframe)
+            else:
+                result = self._track(world, view)
+            results.append(replace(result, T_cw=T_cw, world=world.number))
+        return results
+
+    def _pass(self, world: World, view: View, keyframe: int) -> StepResult:
+        """A keyframe: it is where the map has it."""
+        slam_map = world.map
+        self.tracker.follow(world, keyframe)
+        world.track.velocity = None
+        own = as_tracked(slam_map, keyframe)
+        world.history.add(view, own, world.track.T_cr, keyframe)
+        return StepResult(
+            view.index,
+            view.timestamp,
+            State.TRACKING,
+            None,
+            is_keyframe=True,
+            matches=own.matches,
+            inliers=own.inliers,
+        )
+
+    def _track(self, world: World, view: View) -> StepResult:
+        """A frame between keyframes: from the last one, or else by what the keyframes nearest in time saw."""
+        tracked = self.tracker.track(world, view)
+        if tracked is None:
+            tracked = self._find(world, view)
+        if tracked is None:
+            return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
+        doubt = why_doubt(tracked, None, alone(world.track, tracked), self.config.judge)
+        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        return StepResult(
+            view.index,
+            view.timestamp,
+            State.UNCERTAIN if doubt else State.TRACKING,
+            None,
+            covariance=tracked.covariance,
+            matches=tracked.matches,
+            inliers=tracked.inliers,
+            reason=doubt,
+        )
+
+    def _find(self, world: World, view: View) -> Tracked | None:
+        slam_map = world.map
+        away = (slam_map.keyframes["frame_index"] - view.index).abs()
+        nearest = torch.argsort(away, stable=True)[:NEAREST]
+        tracked = self.tracker.localizer.locate(
+            slam_map, view, self._candidates(slam_map, view, nearest), slam_map.points_seen_by(nearest)
+        )
+        if tracked is not None:
+            self.tracker.start_at(world, view, tracked)
+        return tracked
+
+    def _candidates(self, slam_map: Map, view: View, nearest: Tensor) -> Iterator[Pairs]:
+        for keyframe in nearest.tolist():
+            yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
+
+
+def as_tracked(slam_map: Map, keyframe: int) -> Tracked:
+    """A keyframe as a frame that sees what it sees."""
+    table = slam_map.keyframes["point_ids"][keyframe]
+    keypoints = torch.nonzero(table >= 0)[:, 0]
+    seen, T_cw = table[keypoints], slam_map.T_cw[keyframe]
+    depth = float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()) if len(seen) else 0.0
+    return Tracked(T_cw, seen, keypoints, len(seen), slam_map.keyframes["covariances"][keyframe], depth)
+
+
+def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
+    """What the keyframes of a map saw, without any frames between."""
+    history = History()
+    for keyframe in range(slam_map.num_keyframes):
+        T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
+        history.add(slam_map.view(keyframe), as_tracked(slam_map, keyframe), T_cr, keyframe)
+    return history.graph(slam_map, camera)

@@ -1,0 +1,252 @@
+"""Poses and a camera of another program, and the images: better poses, a map, a better camera, in the same frame.
+
+given poses -> keyframes -> pairs that match -> rotations, points, all adjusted -> camera, and again -> other frames
+            -> all of it once more as one graph, with covariances -> back to the frame and the unit of the given poses
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchslam.calibration.intrinsics import Refinement
+from torchslam.calibration.intrinsics import refine as refine_camera
+from torchslam.calibration.report import contradiction
+from torchslam.calibration.rounds import MOST_ROUNDS, SETTLED, SETTLED_SHARE
+from torchslam.config import Config
+from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
+from torchslam.data.sequence import Sequence
+from torchslam.errors import FrameError, TrajectoryError
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.map.map import Map
+from torchslam.map.submap import World
+from torchslam.optim.run_graph import solve
+from torchslam.refine.adjustment import map_of, turned
+from torchslam.refine.alignment import back_to_given
+from torchslam.refine.non_keyframes import Poser, graph_of
+from torchslam.refine.pairs import Pair, choose_keyframes, find_pairs
+from torchslam.refine.tracks import join_matches
+from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
+from torchslam.system.run import Run
+from torchslam.types import State, StepResult, Trajectory, View
+
+FEWEST = 2  # keyframes of a map
+
+
+class CameraChoice(Enum):
+    """What becomes of the given camera.
+
+    JUDGED: another focal length is taken where the images contradict the given one
+    FREE:   what the images say is taken wherever they determine it
+    FIXED:  it stays as it is
+    """
+
+    JUDGED = "judged"
+    FREE = "free"
+    FIXED = "fixed"
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What refining came to.
+
+    run:     as of a run: its worlds are in the frame and unit of the given poses, its camera the refined one, and the
+             poses "as they were given" those of the other program
+    given:   the poses it began with
+    rows:    (F,) which of them each frame of the sequence has, -1 where none
+    camera:  what the images say of the camera; None where it stayed fixed, or nothing came of it
+    rounds:  how many cameras a map was made with
+    """
+
+    run: Run
+    given: GivenPoses
+    rows: Tensor
+    camera: Refinement | None
+    rounds: int
+
+    @property
+    def without_image(self) -> int:
+        """How many poses are of no image."""
+        return len(self.given) - int((self.rows >= 0).sum())
+
+    @property
+    def without_pose(self) -> int:
+        """How many images have no pose, and were left out."""
+        return int((self.rows < 0).sum())
+
+
+def refine(
+    sequence: Sequence,
+    poses: GivenPoses | Trajectory | str | Path,
+    config: Config | None = None,
+    choice: CameraChoice = CameraChoice.JUDGED,
+    radial: int = 0,
+    device: torch.device | str = "cpu",
+    extractor: FrontEnd | None = None,
+    told: Callable[[str], None] | None = None,
+) -> Refined:
+    """Make somebody else's poses of the images of a sequence better.
+
+    poses:     as read, or what `read_poses` reads; the camera is that of the sequence
+    radial:    how many coefficients of the distortion may be fitted beside the focal length, where the images ask
+    extractor: front end, the configured one if None
+    told:      of every step, in words
+
+    Frames without a pose are left out, so are poses without an image. A run without a map says why (`Run.failure`).
+    Raises TrajectoryError where no pose is that of an image, CalibrationError where there is no camera.
+    """
+    config, say = config or Config(), told or (lambda words: None)
+    given = _as_given(poses)
+    rows = given.rows(sequence)
+    camera = sequence.camera.to(device).to(torch.float64)
+    looked = source(sequence, config, camera)
+    extract = None if looked.brings_features else image_extractor(config, device, extractor)
+    views, skipped = _look(looked, rows, camera, extract)
+    frames = torch.tensor([view.index for view in views], dtype=torch.int64)
+    T_cw = given.T_cw[rows[frames]].to(camera.params)
+    say(f"{len(views)} images with poses")
+    scaled = config.for_size(camera.size)  # what is told to the steps, as in a run
+    chosen, pairs, failure = _connected(views, T_cw, camera, scaled)
+    if failure:
+        return Refined(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
+    say(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
+    keyframes = [views[row] for row in chosen]
+    slam_map, camera, refined, rounds = _rounds(
+        keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, say
+    )
+    world = World.empty(0, camera.params)
+    world.map = slam_map
+    results = Poser(camera, scaled).pose(world, views, T_cw)
+    _conclude(world, camera, frames, T_cw)
+    run = _run((world,), camera, config, views, results, skipped, "")
+    return Refined(run, given, rows, refined, rounds)
+
+
+def _connected(
+    views: list[View], T_cw: Tensor, camera: Camera, config: Config
+) -> tuple[list[int], list[Pair], str]:
+    """The rows of the keyframes, the pairs of these that see the same, and why there are none, in words."""
+    if len(views) < FEWEST:
+        return [], [], f"no map: {len(views)} images with a pose are too few"
+    chosen = choose_keyframes(views, camera.width, config)
+    if len(chosen) < FEWEST:
+        return [], [], f"no map: nothing moves in the {len(views)} images"
+    pairs = find_pairs([views[row] for row in chosen], T_cw[chosen], camera, config)
+    if not pairs:
+        return [], [], f"no map: no two of {len(chosen)} keyframes see the same"
+    connected = largest_part(pairs, len(chosen))
+    return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
+
+
+def _conclude(world: World, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
+    """Everything once more as one graph, with covariances, and back to where the given poses T_cw of the frames are."""
+    graph = world.history.graph(world.map, camera)
+    world.history.take(solve(graph, backward="detached"), graph, world.map)
+    row_of = {index: row for row, index in enumerate(frames.tolist())}
+    posed = [row_of[index] for index in world.history.frames["frame_index"].tolist()]
+    world.move(back_to_given(world.history.T_cw(world.map), T_cw[posed]))
+
+
+def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
+    if isinstance(poses, Trajectory):
+        if len(poses) == 0:
+            raise TrajectoryError("a trajectory without poses")
+        return GivenPoses(TUM, Path(), se3_inverse(poses.T_wc), poses.timestamps)
+    return poses if isinstance(poses, GivenPoses) else read_poses(poses)
+
+
+def _look(
+    sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor | None
+) -> tuple[list[View], list[str]]:
+    """The views of the frames that have a pose, and those that could not be read, in words."""
+    views, skipped = [], []
+    for index in torch.nonzero(rows >= 0)[:, 0].tolist():
+        try:
+            frame = sequence[index]
+            check_size(frame, camera)
+        except FrameError as error:
+            warnings.warn(f"skipped a frame: {error}", stacklevel=3)
+            skipped.append(str(error))
+            continue
+        with torch.inference_mode():
+            features = frame.features if extractor is None else extractor(frame)
+            assert features is not None
+        views.append(View.of(frame, features, camera.params))
+    return views, skipped
+
+
+def _rounds(
+    keyframes: list[View],
+    T_cw: Tensor,
+    pairs: list[Pair],
+    camera: Camera,
+    config: Config,
+    choice: CameraChoice,
+    radial: int,
+    say: Callable[[str], None],
+) -> tuple[Map, Camera, Refinement | None, int]:
+    """A map with the camera as known, the camera from the map, and again: a wrong one chooses its matches wrongly."""
+    given, T_cw = camera, turned(T_cw, pairs)
+    tracks = join_matches(pairs, len(keyframes), len(keyframes[0].mask))
+    rounds, refined = 0, None
+    while True:
+        is_free = choice is not CameraChoice.FIXED and camera is not given
+        slam_map, camera = map_of(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
+        rounds += 1
+        T_cw = slam_map.T_cw.clone()
+        say(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
+        if choice is CameraChoice.FIXED:
+            return slam_map, camera, None, rounds
+        refined = refine_camera(graph_of(slam_map, camera), given, radial)
+        if not refined.is_determined or rounds == MOST_ROUNDS:
+            return slam_map, camera, refined, rounds
+        if choice is CameraChoice.JUDGED and not is_free and not contradiction(given, refined):
+            return slam_map, camera, refined, rounds
+        change = abs(math.log(float(refined.camera.focal) / float(camera.focal)))
+        if is_free and change < max(SETTLED, SETTLED_SHARE * refined.std):
+            return slam_map, camera, refined, rounds
+        camera = refined.camera
+
+
+def largest_part(pairs: list[Pair], count: int) -> list[int]:
+    """The largest set of keyframes, ascending, that pairs connect; of equals the one with the first keyframe."""
+    label = list(range(count))
+    for _ in range(count):
+        before = list(label)
+        for pair in pairs:
+            label[pair.first] = label[pair.second] = min(label[pair.first], label[pair.second])
+        if label == before:
+            break
+    best = max(set(label), key=lambda part: (label.count(part), -part), default=0)
+    return [row for row, part in enumerate(label) if part == best]
+
+
+def _renumbered(pairs: list[Pair], kept: list[int]) -> list[Pair]:
+    """The pairs among the keyframes that are kept, by their new rows."""
+    row_of = {old: new for new, old in enumerate(kept)}
+    return [
+        replace(pair, first=row_of[pair.first], second=row_of[pair.second])
+        for pair in pairs
+        if pair.first in row_of and pair.second in row_of
+    ]
+
+
+def _run(
+    worlds: tuple[World, ...],
+    camera: Camera,
+    config: Config,
+    views: list[View],
+    results: list[StepResult],
+    skipped: list[str],
+    failure: str,
+) -> Run:
+    if failure:
+        results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=failure) for view in views]
+    return Run(worlds, camera, config, results, skipped, False, failure)

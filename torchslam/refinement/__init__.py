@@ -1,5 +1,0 @@
-"""Poses and a camera of another program, made better by the images: matched, triangulated, adjusted, calibrated."""
-
-from torchslam.refinement.refine import CameraChoice, Refined, refine
-
-__all__ = ["CameraChoice", "Refined", "refine"]

@@ -1,0 +1,220 @@
+"""The state of a run between two frames, in one file: after a power cut the run goes on from there.
+
+It is a map file with more in it: the results so far, where the camera is, and which pixels stay in place. What is not
+in it: frames that still wait for a pose, which stay without one, and the frame that the next one would be compared
+with in search of pixels that stay. A world that is hardly begun, held-back frames and the search for a start are not in
+it either, since no checkpoint is taken while there are any (`SLAM.is_settled`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import astuple, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchslam.config import Config, to_toml
+from torchslam.data.sequence import Sequence
+from torchslam.errors import ResultsError
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.map.file import Saved, pack, read_tensors, unpack, write_tensors
+from torchslam.map.tracking_state import Track
+from torchslam.system.front_end import FrontEnd
+from torchslam.system.run import Progressed
+from torchslam.system.session import Session
+from torchslam.system.slam import SLAM
+from torchslam.types import State, StepResult
+
+STATES = tuple(State)
+TRACK = "run.track."
+UNKNOWN = "not a whole checkpoint"
+
+
+def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence: Sequence) -> None:
+    """Write the state after a frame, whole or not at all. The system must be settled (`SLAM.is_settled`)."""
+    world = slam.world
+    if world is None or not slam.is_settled:
+        raise ValueError("a checkpoint needs a world that is followed and nothing that is held back")
+    tensors, about = pack(slam.worlds, slam.camera, slam.session.count, slam.worlds.begun)
+    whole = {column.name: getattr(world.track, column.name) for column in fields(Track)}
+    track = {TRACK + name: value for name, value in whole.items() if isinstance(value, Tensor)}
+    results, reasons, stages = _packed(so_far.results)
+    about["run"] = {
+        "sequence": fingerprint(sequence),
+        "config": fingerprint(slam.config),
+        "next": so_far.next,
+        "skipped": so_far.skipped,
+        "reasons": reasons,
+        "stages": stages,
+        "last_frame": slam.last_frame,
+        "world": world.number,
+        "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
+        "asked": [each.asked for each in slam.worlds],
+        "adjusting": bool(slam.mapper.adjusting),
+        "due": slam.mapper.adjusting.due,
+        "looks_known": slam.memory.looks_known,
+        "recalls": [astuple(recall) for recall in slam.memory.recalls],
+    }
+    write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
+
+
+def read_checkpoint(
+    path: str | Path,
+    sequence: Sequence,
+    config: Config,
+    device: torch.device | str = "cpu",
+    extractor: FrontEnd | None = None,
+) -> tuple[SLAM, Progressed]:
+    """The system and what it had done when the checkpoint was taken.
+
+    Raises ResultsError for a file that is missing or damaged, or of a run over another sequence or with another
+    configuration.
+    """
+    tensors, about = read_tensors(path)
+    run = about.pop("run", None)
+    if not isinstance(run, dict):
+        raise ResultsError(f"{path}: a map, but not a checkpoint")
+    for what, mine in (("sequence", sequence), ("config", config)):
+        if run.get(what) != fingerprint(mine):
+            word = "configuration" if what == "config" else what
+            raise ResultsError(f"{path}: a checkpoint of a run with another {word}")
+    own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("run.")}
+    saved = unpack(path, tensors, about, device)
+    slam = SLAM(saved.camera, config, extractor)
+    try:
+        so_far = Progressed(run["next"], _results(own, run, device), run["skipped"])
+        _go_on(slam, saved, own, run, device)
+    except (
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        OverflowError,
+        RuntimeError,
+    ) as error:
+        raise ResultsError(f"{path}: {UNKNOWN}: {error}") from None
+    return slam, so_far
+
+
+def fingerprint(of: Sequence | Config) -> str:
+    """What tells one sequence, or one configuration, from another."""
+    if isinstance(of, Config):
+        return hashlib.sha256(to_toml(of).encode()).hexdigest()
+    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.known_length])
+    return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
+
+
+def _go_on(
+    slam: SLAM, saved: Saved, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str
+) -> None:
+    """Put the system to where it was."""
+    (world,) = (world for world in saved.worlds if world.number == run["world"])
+    columns: dict[str, Any] = {
+        name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
+    }
+    world.track = track = Track(**run["track"], **columns)
+    _check_track(track)
+    for rows, count in (
+        (track.seen_last, len(world.map.points)),
+        (track.local_points, len(world.map.points)),
+        (track.local_keyframes, world.map.num_keyframes),
+        (track.local_keyframes.new_tensor([track.reference]), world.map.num_keyframes),
+    ):
+        if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+            raise ValueError(f"where the camera was names rows beyond {count}")
+    for each, asked in zip(saved.worlds, run["asked"], strict=True):
+        each.asked = int(asked)
+    index, timestamp = run["last_frame"]
+    session = Session(saved.camera, saved.worlds, saved.sessions - 1)
+    slam.enter(session, world, (int(index), float(timestamp)))
+    slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
+    slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
+    if run["adjusting"]:  # of the newest keyframe, around which the map is as it was then
+        due = None if run["due"] is None else int(run["due"])
+        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, due)
+    if run["looks_known"] is not None:
+        key, looks_known = run["looks_known"]
+        slam.memory.looks_known = int(key), bool(looks_known)
+
+
+def _check_track(track: Track) -> None:
+    """Raises ValueError, or TypeError for what is no tensor, where it is not the way of a camera."""
+    for T in (track.T_cr, track.velocity):
+        if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
+            raise ValueError("where the camera was is no pose")
+    for rows in (track.seen_last, track.local_keyframes, track.local_points):
+        if rows.ndim != 1 or rows.dtype != torch.int64:
+            raise ValueError("where the camera was does not name rows")
+    counts, shares = (track.reference, track.reference_size), (track.error, track.explained)
+    if not all(type(count) is int for count in counts) or not all(map(math.isfinite, shares)):
+        raise ValueError(f"where the camera was: {counts}, {shares}")
+
+
+def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:
+    """Results as columns, their reasons, and the names of their stages; NaN for what a frame does not have."""
+    stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
+    nan = float("nan")
+    no_pose, no_covariance = torch.full((4, 4), nan), torch.full((6, 6), nan)
+    poses = [no_pose if result.T_cw is None else result.T_cw for result in results]
+    covariances = [no_covariance if result.covariance is None else result.covariance for result in results]
+    counts = [
+        (
+            result.index,
+            STATES.index(result.state),
+            -1 if result.world is None else result.world,
+            int(result.is_keyframe),
+            result.matches,
+            result.inliers,
+        )
+        for result in results
+    ]
+    times = [[result.stage_ms.get(stage, nan) for stage in stages] for result in results]
+    columns: dict[str, Any] = {
+        "run.counts": torch.tensor(counts, dtype=torch.int64).reshape(-1, 6),
+        "run.timestamps": torch.tensor([result.timestamp for result in results], dtype=torch.float64),
+        "run.T_cw": _stack(poses, 4),
+        "run.covariances": _stack(covariances, 6),
+        "run.stage_ms": torch.tensor(times, dtype=torch.float64).reshape(-1, len(stages)),
+    }
+    return columns, [result.reason for result in results], stages
+
+
+def _stack(matrices: list[Tensor], size: int) -> Tensor:
+    if not matrices:
+        return torch.zeros(0, size, size, dtype=torch.float64)
+    return torch.stack([matrix.detach().double().cpu() for matrix in matrices])
+
+
+def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> list[StepResult]:
+    """What `_packed` packed."""
+    counts, times = tensors["run.counts"].tolist(), tensors["run.stage_ms"].tolist()
+    timestamps, stages = tensors["run.timestamps"].tolist(), run["stages"]
+    T_cw, covariances = tensors["run.T_cw"].to(device), tensors["run.covariances"].to(device)
+    results = []
+    for row, (index, state, world, is_keyframe, matches, inliers) in enumerate(counts):
+        results.append(
+            StepResult(
+                index=index,
+                timestamp=timestamps[row],
+                state=STATES[state],
+                T_cw=None if bool(T_cw[row].isnan().any()) else T_cw[row],
+                world=None if world < 0 else world,
+                covariance=None if bool(covariances[row].isnan().any()) else covariances[row],
+                is_keyframe=bool(is_keyframe),
+                matches=matches,
+                inliers=inliers,
+                reason=run["reasons"][row],
+                stage_ms={
+                    stage: time
+                    for stage, time in zip(stages, times[row], strict=True)
+                    if time == time  # NaN is not itself
+                },
+            )
+        )
+    return results

@@ -1,0 +1,202 @@
+"""From a frame to its features: by a front end, or by the sequence itself, as simulated ones are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from inspect import signature
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence, Transformed
+from torchslam.errors import ConfigError, FrameError
+from torchslam.features import SimulatedFeatures
+from torchslam.features.contract import check_features
+from torchslam.features.masking import only_where
+from torchslam.geometry import Camera
+from torchslam.plugins import load_front_end
+from torchslam.types import Features, Frame
+
+FrontEnd = Callable[..., Features]
+"""Images (B, 1, H, W), floats in [0, 1], to the features of each: `ORB()`, `XFeat(weights)`, any module or function.
+
+It may take a second argument: (B, 1, H, W) bool, where keypoints are wanted. The same object serves `SLAM`, `ClipSLAM`
+and, by its name, the command line.
+"""
+
+Extractor = Callable[[Frame], Features]
+"""What a system does with a front end: from a frame to its features."""
+
+
+def image_extractor(
+    config: Config, device: torch.device | str = "cpu", front_end: FrontEnd | None = None
+) -> Extractor:
+    """The features of frames by a front end, the configured one if None; under a frame's mask it finds nothing.
+
+    Much larger images than configured it reduces first, and its keypoints and their scales grow back. What the front
+    end returns is checked, see `check_features`.
+    """
+    settings = config.features
+    if front_end is None:
+        front_end = load_front_end(settings.kind, settings.num_keypoints, settings.weights or None)
+    name = settings.kind if ":" in settings.kind else type(front_end).__name__
+    if isinstance(front_end, nn.Module):
+        front_end = front_end.to(device)
+    takes_mask = _takes_two(front_end)
+
+    def extract(frame: Frame) -> Features:
+        image = frame.image.to(device)
+        wanted = None if frame.mask is None else frame.mask.to(device)
+        height, width = image.shape[-2:]
+        factor = settings.reduction((width, height))
+        small, wanted_there = reduced(image, wanted, factor)
+        features = front_end(small, wanted_there) if takes_mask else front_end(small)
+        check_features(features, small, name)
+        if factor > 1:
+            ratio = width / small.shape[-1], height / small.shape[-2]
+            features = _enlarged(features, ratio, factor)
+        # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
+        return features if wanted is None else only_where(features, wanted)
+
+    return extract
+
+
+def _takes_two(front_end: FrontEnd) -> bool:
+    """Whether a front end takes a mask beside the images."""
+    called = front_end.forward if isinstance(front_end, nn.Module) else front_end
+    try:
+        signature(called).bind(None, None)
+    except TypeError:
+        return False
+    except ValueError:  # a builtin without a signature
+        return False
+    return True
+
+
+def reduced(image: Tensor, wanted: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
+    """An image and the mask of it, less wide and high by a factor."""
+    height, width = image.shape[-2:]
+    size = max(1, round(height / factor)), max(1, round(width / factor))
+    if image.shape[-2:] == size:
+        return image, wanted
+    if wanted is not None:
+        wanted = F.interpolate(wanted.float(), size, mode="nearest-exact") > 0
+    # Bilinear reduction blurs: the corners of a reduced image would be others than those of a small one.
+    return F.interpolate(image, size, mode="bicubic", antialias=True).clamp(0, 1), wanted
+
+
+def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> Features:
+    """Features in pixels of an image that is wider and higher by a ratio."""
+    size = features.keypoints.new_tensor(ratio)
+    keypoints, information = (features.keypoints + 0.5) * size - 0.5, features.information
+    if information is not None:
+        is_matrix = information.ndim == 4
+        information = information / (size[:, None] * size if is_matrix else size.prod())
+    return replace(features, keypoints=keypoints, scales=factor * features.scales, information=information)
+
+
+def check_size(frame: Frame, camera: Camera) -> None:
+    """Raises FrameError where the image has not the size that the camera has."""
+    height, width = frame.image.shape[-2:]
+    if (width, height) != camera.size:
+        raise FrameError(
+            f"{_name(frame)} has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
+        )
+    if frame.mask is not None and frame.mask.shape != frame.image.shape:
+        raise FrameError(f"{_name(frame)} has a mask of another shape, {tuple(frame.mask.shape)}")
+
+
+def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
+    """Raises FrameError where a frame does not come after the last one, by index and timestamp, or has no time."""
+    if not math.isfinite(frame.timestamp):
+        raise FrameError(f"{_name(frame)} has the time {frame.timestamp}")
+    if last is not None and (frame.index <= last[0] or frame.timestamp <= last[1]):
+        raise FrameError(
+            f"{_name(frame)}, frame {frame.index} at {frame.timestamp} s, does not come after "
+            f"frame {last[0]} at {last[1]} s"
+        )
+
+
+def _name(frame: Frame) -> str:
+    return frame.name or f"frame {frame.index}"
+
+
+class Simulated:
+    """Simulated features as a source of their own: sequences whose frames bring the features of a made-up scene.
+
+    T_cw_groundtruth: (F, 4, 4) true poses, around which the scene lies
+    """
+
+    def __init__(self, config: Config, camera: Camera, T_cw_groundtruth: Tensor) -> None:
+        settings = config.simulated
+        self._scene = SimulatedFeatures(
+            T_cw_groundtruth,
+            camera,
+            num_keypoints=config.features.num_keypoints,
+            points_per_view=settings.points_per_view,
+            depth_near=settings.depth_near,
+            depth_far=settings.depth_far,
+            noise_px=settings.noise_px,
+            outliers=settings.outliers,
+            dropout=settings.dropout,
+            scales=settings.scales,
+            seed=config.seed,
+        )
+
+    def __call__(self, frame: Frame) -> Features:
+        """What a frame shows of the scene. Raises ConfigError where its true pose is not known."""
+        if frame.T_cw_groundtruth is None:
+            raise ConfigError(f"simulated features need the true pose of every frame; {frame.name} has none")
+        return self._scene(frame.T_cw_groundtruth, frame.index)
+
+    def of(self, sequence: Sequence) -> Sequence:
+        """The same frames, with features."""
+        return WithFeatures(sequence, self)
+
+
+class WithFeatures(Transformed):
+    """A sequence whose frames bring their features, found when they are asked for.
+
+    extract: from a frame of the sequence to its features
+    """
+
+    def __init__(self, whole: Sequence, extract: Extractor) -> None:
+        super().__init__(whole)
+        self._extract = extract
+
+    @property
+    def brings_features(self) -> bool:
+        return True
+
+    def features(self, index: int) -> Features | None:
+        return self._extract(self._whole[index])
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self._whole[index]
+        return replace(frame, features=self._extract(frame))
+
+
+def source(sequence: Sequence, config: Config, camera: Camera) -> Sequence:
+    """The sequence as a run takes it: with simulated features where these are configured, else as it is.
+
+    camera: that of the run, on its device. Raises ConfigError for simulated features without true poses.
+    """
+    if config.features.kind != "simulated" or sequence.brings_features:
+        return sequence
+    return Simulated(config, camera, true_poses(sequence)).of(sequence)
+
+
+def true_poses(sequence: Sequence) -> Tensor:
+    """(F, 4, 4) the true poses, world to camera, of the frames that have one. Raises ConfigError where none has."""
+    frames = len(sequence) if sequence.groundtruth is not None else 0
+    known = (sequence.pose(index) for index in range(frames))
+    poses = [pose for pose in known if pose is not None]
+    if not poses:
+        raise ConfigError(
+            f"{sequence.name} has no ground truth: simulated features need it; use --features orb"
+        )
+    return torch.stack(poses).to(torch.float64)

@@ -1,0 +1,277 @@
+"""A whole sequence through the system, and what it leaves behind."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+
+from torchslam.config import Config
+from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.errors import FrameError, InitializationError, TorchslamError
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.loop_closing.loop_closer import Memory
+from torchslam.loop_closing.loop_detector import Recall
+from torchslam.map.atlas import main_of
+from torchslam.map.map import Map
+from torchslam.map.posed_frames import History, RunGraph
+from torchslam.map.submap import World
+from torchslam.mapping.local_bundle import adjust_all
+from torchslam.optim.core.levenberg_marquardt import Progress
+from torchslam.optim.run_graph import join, solve
+from torchslam.system.front_end import source
+from torchslam.system.session import Session
+from torchslam.types import Frame, State, StepResult, Trajectory
+
+
+class System(Protocol):
+    """What a run needs of what it feeds its frames to: of `torchslam.system.slam.SLAM`."""
+
+    camera: Camera
+    config: Config
+    session: Session
+    memory: Memory
+    last_frame: tuple[int, float] | None
+
+    def step(self, frame: Frame) -> StepResult: ...
+
+    def conclude(self) -> None: ...
+
+
+class Frames(Protocol):
+    """Where a run takes its frames from, each once, in the order of its index: a sequence, or `ahead.Ahead`."""
+
+    def __getitem__(self, index: int) -> Frame: ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """The result of a run.
+
+    worlds:      what was built, in the order in which it began; mostly one
+    results:     one per processed frame
+    skipped:     the frames that could not be read, in words
+    interrupted: whether the run was stopped by the user
+    failure:     why no frame has a pose; empty when some have
+    recalls:     the places that were recognised, which may have joined worlds
+    session:     number of the run among those over the same map; frames and trajectories are those of this session
+    sessions:    how many sessions the map has; one that was only localised is none of them
+    """
+
+    worlds: tuple[World, ...]
+    camera: Camera
+    config: Config
+    results: list[StepResult]
+    skipped: list[str]
+    interrupted: bool
+    failure: str
+    recalls: tuple[Recall, ...] = ()
+    session: int = 0
+    sessions: int = 1
+
+    @property
+    def main(self) -> World | None:
+        """The world in which most frames of the run are posed; None where there is no map."""
+        return main_of(self.worlds, self.session)
+
+    @property
+    def map(self) -> Map:
+        """Of the main world; empty where there is none."""
+        return Map() if self.main is None else self.main.map
+
+    @property
+    def history(self) -> History:
+        """Poses and observations of the frames of the main world."""
+        return History() if self.main is None else self.main.history
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every posed frame of the main world, after everything that was learned later."""
+        return Trajectory.empty() if self.main is None else self.main.trajectory(self.session)
+
+    @property
+    def keyframes(self) -> Trajectory:
+        """The keyframes of the main world alone."""
+        return keyframe_trajectory(self.map, self.session)
+
+    @property
+    def online(self) -> Trajectory:
+        """The poses as they were given, frame by frame, in the main world."""
+        return Trajectory.empty() if self.main is None else self._given_in(self.main.number)
+
+    @property
+    def online_parts(self) -> list[Trajectory]:
+        """The poses as they were given: in the main world, and in each world that became a part of it, each in its own.
+
+        What was given in worlds that were taken back, or that are still beside the main one, is not among them.
+        """
+        if self.main is None:
+            return []
+        numbers = [self.main.number]
+        joined = {frozenset((recall.world, recall.other)) for recall in self.recalls}
+        for number in numbers:
+            numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
+        return [part for number in numbers if len(part := self._given_in(number))]
+
+    def _given_in(self, number: int) -> Trajectory:
+        """The poses as they were given in the world of a number."""
+        given = [result for result in self.results if result.T_cw is not None and result.world == number]
+        if not given:
+            return Trajectory.empty()
+        T_cw = torch.stack([result.T_cw for result in given if result.T_cw is not None])
+        times = torch.tensor([result.timestamp for result in given], dtype=torch.float64)
+        return Trajectory(times, se3_inverse(T_cw))
+
+    @property
+    def graph(self) -> RunGraph:
+        """Everything the worlds know, as one differentiable problem: `torchslam.solve(run.graph)` gives all poses.
+
+        Where there are several worlds, `graph.world` says whose poses can be compared with each other.
+
+        Raises InitializationError where there is no map.
+        """
+        if not self.worlds:
+            raise InitializationError(self.failure)
+        return join([world.history.graph(world.map, self.camera, world.number) for world in self.worlds])
+
+
+@dataclass
+class Progressed:
+    """How far a run has come.
+
+    next:    index of the frame that comes next
+    results: one per processed frame; skipped: the frames that could not be read, in words
+    """
+
+    next: int = 0
+    results: list[StepResult] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+
+def run_sequence(
+    slam: System,
+    sequence: Sequence,
+    progress: Callable[[StepResult], None] | None = None,
+    so_far: Progressed | None = None,
+    adjusting: Progress | None = None,
+    frames: Frames | None = None,
+) -> Run:
+    """Feed every frame of a sequence to the system.
+
+    A frame that cannot be read, or that does not fit the camera or the order of time, is skipped with a warning and
+    counted; an interrupt ends the run, or its final adjustment, and keeps what there is.
+
+    so_far:    where to go on, and what is kept up to date after every frame
+    adjusting: told before each iteration of the final adjustments its number and how many there are at most
+    frames:    those of the sequence, from elsewhere than from itself
+
+    Raises TorchslamError where the system has processed frames that `so_far` does not know of.
+    """
+    if slam.last_frame is not None and (so_far is None or not so_far.next):
+        raise TorchslamError(
+            "this SLAM has processed frames already: call reset() to begin anew, "
+            "or save() its worlds and SLAM.load() them to go on there"
+        )
+    so_far = Progressed() if so_far is None else so_far
+    sequence = source(sequence, slam.config, slam.camera)
+    frames = sequence if frames is None else frames
+    interrupted = False
+    try:
+        for index in sequence.indices(so_far.next):
+            try:
+                so_far.results.append(slam.step(frames[index]))
+            except EndOfSequence:
+                break
+            except FrameError as error:
+                warnings.warn(f"skipped a frame: {error}", stacklevel=2)
+                so_far.skipped.append(str(error))
+                so_far.next = index + 1
+                continue
+            so_far.next = index + 1
+            if progress is not None:
+                progress(so_far.results[-1])
+    except KeyboardInterrupt:
+        interrupted = True
+    return finish(slam, so_far.results, so_far.skipped, interrupted, adjusting)
+
+
+def finish(
+    slam: System,
+    results: list[StepResult],
+    skipped: list[str],
+    interrupted: bool,
+    adjusting: Progress | None = None,
+) -> Run:
+    """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
+    with torch.inference_mode():
+        slam.conclude()
+    try:
+        for world in slam.session.worlds:
+            if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
+                adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
+                world.history.forget_strays(world.map, slam.camera)
+                graph = world.history.graph(world.map, slam.camera)
+                world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
+    except KeyboardInterrupt:
+        interrupted = True
+    return Run(
+        tuple(slam.session.worlds),
+        slam.camera,
+        slam.config,
+        results,
+        skipped,
+        interrupted,
+        why_no_pose(slam, results, skipped),
+        tuple(slam.memory.recalls),
+        slam.session.number,
+        slam.session.count,
+    )
+
+
+def keyframe_rows(slam_map: Map, session: int) -> torch.Tensor:
+    """(k,) the keyframes of one session, in order of time."""
+    if slam_map.num_keyframes == 0:
+        return torch.zeros(0, dtype=torch.int64)
+    rows = torch.nonzero(slam_map.keyframes["session"] == session)[:, 0]
+    return rows[torch.argsort(slam_map.keyframes["timestamp"][rows], stable=True)]
+
+
+def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
+    """The keyframes of one session, camera to world, in order of time."""
+    rows = keyframe_rows(slam_map, session)
+    if len(rows) == 0:
+        return Trajectory.empty()
+    return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
+
+
+def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> str:
+    """Why no frame of the session has a pose, in one sentence; empty where some have."""
+    if len(slam.session.worlds) == 0:
+        return why_no_map(results, skipped)
+    if any(world.history.count(slam.session.number) for world in slam.session.worlds):
+        return ""
+    return f"none of {len(results)} frames was recognised in the map"
+
+
+def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
+    """One sentence for the user: how many frames were tried, what kept them from starting a map, the last attempt."""
+    if not results:
+        return (
+            f"no frame could be read; {len(skipped)} were skipped, the first because {skipped[0]}"
+            if skipped
+            else "the sequence has no frames"
+        )
+    attempts = [
+        result.reason
+        for result in results
+        if result.state is State.INITIALIZING and "reference" not in result.reason
+    ]
+    if not attempts:
+        return f"no map was initialised: {len(results)} frames are too few, two with parallax are needed"
+    kind, _ = Counter(reason.split(":")[0] for reason in attempts).most_common(1)[0]
+    last = next(reason for reason in reversed(attempts) if reason.split(":")[0] == kind)
+    return f"no map was initialised in {len(results)} frames: {last}"

@@ -1,0 +1,76 @@
+"""Frames whose poses are not believed yet: what is built on them is on trial until the frames after them confirm it."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.map.tracking_state import Track
+from torchslam.types import Tracked, View
+
+Held = tuple[View, Tracked, Tensor, int]
+"""A frame, what was found in it, and its pose T_cr (4, 4) relative to a keyframe."""
+
+
+MOST = 1000
+"""Frames held back at a time: none can wait for ever."""
+
+
+class Probation:
+    """Holds frames back from the first doubtful one until enough certain ones have followed in a row."""
+
+    def __init__(self, config: Config) -> None:
+        self._after_doubt = config.judge.confirmations
+        self._after_return = config.relocalization.confirmations
+        self._held: list[Held] = []
+        self._needed = 0
+        self._doubtful = 0  # frames since the last certain one that is believed
+        self.came_back = False
+
+    def __bool__(self) -> bool:
+        """Whether anything is held back."""
+        return self._needed > 0
+
+    @property
+    def reason(self) -> str:
+        """What is waited for."""
+        return f"to be confirmed by {self._needed} more frames"
+
+    def come_back(self, view: View, tracked: Tracked, track: Track) -> None:
+        """Begin with a frame that was relocalised."""
+        self._held = [(view, tracked, track.T_cr, track.reference)]
+        self._needed, self.came_back = self._after_return, True
+
+    def hold(self, view: View, tracked: Tracked, track: Track, doubt: str, is_mapped: bool = False) -> None:
+        """Hold a frame back; one without a doubt counts as a confirmation.
+
+        is_mapped: the map grew by what is held back and agrees with it for that reason alone: it takes as many certain
+                   frames as there were doubtful ones
+        """
+        self._held.append((view, tracked, track.T_cr, track.reference))
+        self._doubtful += bool(doubt)
+        if doubt:
+            self._needed = self._after_return if self.came_back else self._after_doubt
+            if is_mapped:
+                self._needed = max(self._needed, self._doubtful)
+        else:
+            self._needed -= 1
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no more frames can be held back."""
+        return len(self._held) >= MOST
+
+    def views(self) -> list[View]:
+        """The frames that are held back, in order."""
+        return [held[0] for held in self._held]
+
+    def release(self) -> list[Held]:
+        """What was held back and is believed now; nothing is held any more."""
+        self._needed, self._doubtful, self.came_back = 0, 0, False
+        return self.hand_over()
+
+    def hand_over(self) -> list[Held]:
+        """What is held back, believed or not; frames that come later still have to confirm the camera's place."""
+        held, self._held = self._held, []
+        return held
