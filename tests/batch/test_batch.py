@@ -13,9 +13,9 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.test_cli import write_tum_folder
 
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
+from tests.cli.test_cli import write_tum_folder
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import table as tables
 from torchslam.batch.fingerprints import of_files

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.test_cli import write_tum_folder
 
 from tests.batch.conftest import table, task
+from tests.cli.test_cli import write_tum_folder
 from torchslam.batch import Row, Task, run_row
 from torchslam.batch.result_store import ERRORS, RUNS, keep
 from torchslam.data import read_trajectory, write_trajectory

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.test_cli import FAST, write_tum_folder
 
+from tests.cli.test_cli import FAST, write_tum_folder
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.formats.calibration_files import read_calibration

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.test_cli import FAST, write_tum_folder
 from torch import Tensor
 
+from tests.cli.test_cli import FAST, write_tum_folder
 from tests.refine.test_refine import disturbed
 from torchslam.cli.main import main
 from torchslam.data import open_sequence, read_trajectory

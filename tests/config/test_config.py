@@ -111,14 +111,14 @@ def test_a_missing_and_a_broken_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "file", sorted((Path(__file__).parents[1] / "configs").glob("*.toml")), ids=lambda f: f.stem
+    "file", sorted((Path(__file__).parents[2] / "configs").glob("*.toml")), ids=lambda f: f.stem
 )
 def test_every_configuration_file_of_the_repository_loads(file: Path) -> None:
     assert isinstance(load_config(file), Config)
 
 
 def test_default_toml_is_the_default() -> None:
-    assert load_config(Path(__file__).parents[1] / "configs" / "default.toml") == Config()
+    assert load_config(Path(__file__).parents[2] / "configs" / "default.toml") == Config()
 
 
 def test_every_section_is_written_out() -> None:

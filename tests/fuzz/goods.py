@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from tests.data.mp4 import write_mp4
-from tests.data.test_bag import STAMPS, Recording
+from tests.data.readers.test_bag import STAMPS, Recording
+from tests.data.readers.test_euroc import SENSOR
 from tests.data.test_datasets import CAM_TO_CAM
-from tests.data.test_euroc import SENSOR
 from tests.fuzz.mutators import Files
 
 SIZE = (64, 48)

@@ -6,10 +6,10 @@ import copy
 
 import pytest
 import torch
-from tests.map.test_observers import check
 from torch import Tensor
 
 from tests.map.simulated import CAMERA, path, reprojection_errors, simulated_world, view_of
+from tests.map.test_observation_index import check
 from torchslam.map import compaction
 from torchslam.map.compaction import compact, drop_dead_points, remove_keyframes
 from torchslam.map.posed_frames import RunGraph

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.optim.test_graph import simulated
-from tests.optim.test_pose_graph import make_scene
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import jacfwd, jacrev, jvp, vmap
 
+from tests.optim.pose_graph.test_pose_graph import make_scene
+from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
 from torchslam.optim import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
 from torchslam.optim.run_graph import solve

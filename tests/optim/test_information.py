@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.optim.test_graph import aligned_error, simulated
 
+from tests.optim.test_run_graph import aligned_error, simulated
 from torchslam.errors import TorchslamError
 from torchslam.optim import bundle_adjust, refine_pose
 from torchslam.optim.run_graph import ObservationGraph, solve

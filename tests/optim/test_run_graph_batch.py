@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.optim.test_graph import aligned_error, simulated, two_worlds
 from torch import Tensor
 
+from tests.optim.test_run_graph import aligned_error, simulated, two_worlds
 from torchslam.geometry import Camera
 from torchslam.optim import run_graph_batch as many_graphs
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve

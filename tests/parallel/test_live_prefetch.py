@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from tests.test_ahead import PATIENCE, SIZE, picture
 
+from tests.parallel.test_prefetch import PATIENCE, SIZE, picture
 from torchslam import Features, Frame, load_config
 from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import EndOfSequence

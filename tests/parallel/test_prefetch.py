@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.test_cli import write_tum_folder
 
+from tests.cli.test_cli import write_tum_folder
 from tests.data.mp4 import write_mp4
 from torchslam import Features, Frame, load_config
 from torchslam.cli.main import main
@@ -228,7 +228,7 @@ def test_videos_and_archives_travel(tmp_path: Path, sequence: Sequence) -> None:
 
 ORPHAN = """
 import os, signal
-from tests.test_ahead import PATIENCE, ahead
+from tests.parallel.test_prefetch import PATIENCE, ahead
 from torchslam.data import open_sequence
 
 if __name__ == "__main__":

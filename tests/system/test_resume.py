@@ -417,7 +417,7 @@ CHILD = """
 import sys, time
 import torch
 torch.set_num_threads(1)
-from tests.test_resume import PATH
+from tests.system.test_resume import PATH
 from tests.walks import Walk
 from torchslam.cli.main import main
 from torchslam.cli import arguments

@@ -16,8 +16,8 @@ from torchslam.config import load_config
 from torchslam.data import EndOfSequence, open_sequence
 from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.formats.transforms import Resized, cut, thin
-from torchslam.data.readers.live import CaptureClock, LiveSequence
 from torchslam.data.readers import live
+from torchslam.data.readers.live import CaptureClock, LiveSequence
 from torchslam.errors import FrameError, SequenceError
 
 RATE = 50.0
