@@ -1,8 +1,8 @@
-# The two commands a newcomer needs are `make demo` and `make test`; both make their own environment first.
-#   VENV=path      use (or create) another virtual environment than .venv
+# Start with `make demo` and `make test`; both create their own environment first.
+#   VENV=path      virtual environment to use or create (default: .venv)
 #   PYTHON=python  the interpreter that creates it
-#   SAMPLE=200 SEED=0  how many changes `make mutation` tries, and which; SAMPLE=0 tries all: hours
-#   RESULTS=path   the folder of results that `make profile` reads
+#   SAMPLE=200 SEED=0  number and seed of the mutants of `make mutation`; SAMPLE=0 tries all of them (hours)
+#   RESULTS=path   results folder that `make profile` reads
 #   REPORT_ARGS="..."  arguments for experiments.report.run, e.g. REPORT_ARGS="shelf_bin --accept 'a stricter gate'"
 #   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
 
@@ -16,10 +16,10 @@ RESULTS ?= results/demo
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --constraint constraints.txt
 
-# From the sources here, wherever another checkout is installed. The theme's word about its own future is none of ours.
+# PYTHONPATH: document the sources here, even if another checkout is installed. The variable silences a notice of the theme.
 MKDOCS := NO_MKDOCS_2_WARNING=1 PYTHONPATH=. $(BIN)/mkdocs
 
-# Stamps: an environment is made again only when what it is made from has changed.
+# Stamps: an environment is rebuilt only when its inputs have changed.
 INSTALLED := $(VENV)/.torchslam-installed
 INSTALLED_DEV := $(VENV)/.torchslam-installed-dev
 INSTALLED_DOCS := $(VENV)/.torchslam-installed-docs
@@ -41,13 +41,13 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## run all that the documentation says can be run: every tutorial
+test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## execute the code blocks of the documentation, all tutorials included
 	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
 
-fuzz: $(INSTALLED_DEV)  ## 30,000 wrong inputs to everything that reads: each is read or refused, in 10 s and 1 GB
+fuzz: $(INSTALLED_DEV)  ## feed tens of thousands of invalid inputs to every reader: each must be read or refused within 10 s and 1 GB
 	$(BIN)/python -m tests.fuzz
 
-mutation: $(INSTALLED_MUTATION)  ## small changes to the system layer: how many of them do the tests notice?
+mutation: $(INSTALLED_MUTATION)  ## mutation testing of the system layer: how many mutants do the tests detect?
 	$(BIN)/python -m tests.mutation --sample $(SAMPLE) --seed $(SEED)
 
 lint: $(INSTALLED_DEV) types  ## ruff and mypy
@@ -57,20 +57,20 @@ lint: $(INSTALLED_DEV) types  ## ruff and mypy
 types: $(INSTALLED_DEV)  ## mypy alone
 	$(BIN)/mypy
 
-pythons: $(INSTALLED_DEV)  ## mypy for every Python that the package promises
+pythons: $(INSTALLED_DEV)  ## mypy for every supported Python version
 	for version in $(PYTHONS); do $(BIN)/mypy --python-version $$version || exit 1; done
 
-format: $(INSTALLED_DEV)  ## rewrite the sources in the house style
+format: $(INSTALLED_DEV)  ## format the sources
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: $(INSTALLED_DOCS)  ## the documentation, as pages in site/
+docs: $(INSTALLED_DOCS)  ## build the documentation in site/
 	$(MKDOCS) build --strict
 
-docs-serve: $(INSTALLED_DOCS)  ## the documentation on http://127.0.0.1:8000, made again whenever it changes
+docs-serve: $(INSTALLED_DOCS)  ## serve the documentation on http://127.0.0.1:8000 and rebuild it on changes
 	$(MKDOCS) serve --strict
 
-benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against the peers
+benchmarks: $(INSTALLED_BENCHMARKS)  ## timing and accuracy tables against other libraries
 	$(BIN)/python -m experiments.benchmarks.features
 	$(BIN)/python -m experiments.benchmarks.geometry
 	$(BIN)/python -m experiments.benchmarks.solvers
@@ -80,26 +80,28 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## the timing and accuracy tables against t
 	$(BIN)/python -m experiments.benchmarks.mapping
 	$(BIN)/python -m experiments.benchmarks.clips
 
-profile: $(INSTALLED)  ## milliseconds by stage of the run in RESULTS (results/demo)
+profile: $(INSTALLED)  ## milliseconds per stage of the run in RESULTS (results/demo)
 	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)
 
-report: $(INSTALLED_BENCHMARKS)  ## all sequences and the quick benchmarks: one line more in docs/figures/history.jsonl, drawn
+report: $(INSTALLED_BENCHMARKS)  ## run all sequences and the quick benchmarks, append to docs/figures/history.jsonl and redraw it
 	$(BIN)/python -m experiments.report.run $(REPORT_ARGS)
 
-wheel: $(INSTALLED_RELEASE)  ## wheel and source distribution, in dist/
+wheel: $(INSTALLED_RELEASE)  ## build wheel and source distribution in dist/ and check them
+	rm -rf build dist/torchslam-*
 	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*.whl dist/*.tar.gz
 
-lock: $(INSTALLED_RELEASE)  ## requirements-test.lock anew: what the tests need, by version and hash, but torch
+lock: $(INSTALLED_RELEASE)  ## rewrite requirements-test.lock: versions and hashes of the test dependencies, without torch
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade --config-file requirements-test.toml \
 		--constraints constraints.txt --no-emit-package torch --custom-compile-command 'make lock' \
 		--group pyproject.toml:test --group pyproject.toml:lint pyproject.toml --output-file requirements-test.lock
 
-sbom: $(INSTALLED_RELEASE)  ## dist/torchslam.cdx.json: all that is installed, with versions and licences (CycloneDX)
+sbom: $(INSTALLED_RELEASE)  ## write dist/torchslam.cdx.json: installed packages with versions and licenses (CycloneDX)
 	mkdir -p dist
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --output-file dist/torchslam.cdx.json $(BIN)/python
 
-# Strict: a package that could not be looked up would otherwise pass as one without fault.
-audit: $(INSTALLED_RELEASE)  ## known vulnerabilities in what the lock file and constraints.txt name
+# Strict: otherwise a package that could not be looked up would pass.
+audit: $(INSTALLED_RELEASE)  ## list known vulnerabilities of the packages in the lock file and constraints.txt
 	mkdir -p dist
 	grep -hE '^[a-z0-9.-]+==' requirements-test.lock constraints.txt | sed 's/ *\\$$//' | sort -u > dist/audited.txt
 	$(BIN)/pip-audit --strict --disable-pip --no-deps --progress-spinner off --requirement dist/audited.txt
@@ -112,39 +114,39 @@ distclean: clean  ## remove the environment too
 	rm -rf .venv *.egg-info
 
 $(BIN)/python:
-	@echo 'making the environment $(VENV)'
+	@echo 'creating the environment $(VENV)'
 	@$(PYTHON) -m venv $(VENV)
 
 # torch comes first, alone: the build named in constraints.txt then satisfies everything that depends on it.
-# pip learned --group in 25.1.
+# --group needs pip 25.1.
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
-	@echo 'installing torch, torchslam and what they need into $(VENV): some minutes, once'
+	@echo 'installing torch, torchslam and their dependencies into $(VENV): a few minutes, once'
 	@$(PIP) --upgrade 'pip>=25.1'
 	@$(PIP) torch
 	@$(PIP) --editable .
 	@touch $@
 
 $(INSTALLED_DEV): $(INSTALLED)
-	@echo 'installing the tools for tests and lint into $(VENV): a minute, once'
+	@echo 'installing the test and lint tools into $(VENV): a minute, once'
 	@$(PIP) --group test --group lint
 	@touch $@
 
 $(INSTALLED_MUTATION): $(INSTALLED_DEV)
-	@echo 'installing the tool for mutation testing into $(VENV): a minute, once'
+	@echo 'installing the mutation testing tool into $(VENV): a minute, once'
 	@$(PIP) --group mutation
 	@touch $@
 
 $(INSTALLED_DOCS): $(INSTALLED)
-	@echo 'installing the tools for the documentation into $(VENV): a minute, once'
+	@echo 'installing the documentation tools into $(VENV): a minute, once'
 	@$(PIP) --editable '.[docs]'
 	@touch $@
 
 $(INSTALLED_BENCHMARKS): $(INSTALLED)
-	@echo 'installing the peers for the benchmarks into $(VENV): a minute, once'
+	@echo 'installing the benchmark dependencies into $(VENV): a minute, once'
 	@$(PIP) --group benchmarks
 	@touch $@
 
 $(INSTALLED_RELEASE): $(INSTALLED)
-	@echo 'installing the tools for releases into $(VENV): a minute, once'
+	@echo 'installing the release tools into $(VENV): a minute, once'
 	@$(PIP) --group release
 	@touch $@

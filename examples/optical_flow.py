@@ -1,4 +1,4 @@
-"""Optical flow, or any dense matcher, in place of descriptors: its own samples are the keypoints.
+"""Optical flow, or any dense matcher, in place of descriptors: its samples are the keypoints.
 
 torchslam run IMAGES -o results --features examples.optical_flow:Samples --matcher examples.optical_flow:same
 """
@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 
 from torchslam import Features, Matches
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
-APART, LEAST, EDGE = 8, 0.005, 8  # pixels between samples; share of the best corner; pixels to the edge
-RETURNS = 0.5  # pixels: to the next image and back, a sample is where it was
+APART, LEAST, EDGE = 8, 0.005, 8  # pixels between samples; fraction of the best corner; pixels to the edge
+RETURNS = 0.5  # pixels: limit of the forward-backward error
 
 
 class Samples(torch.nn.Module):
-    """Images (B, 1, H, W) in [0, 1], in their order, to Features: samples that the flow carries from image to image,
-    and new ones where it lost some. What stands for descriptors are the samples' names."""
+    """Images (B, 1, H, W) in [0, 1], in temporal order, to Features: samples that the flow carries from image to image,
+    and new ones for those it lost. The descriptor of a sample is its identifier."""
 
     def __init__(self, num_keypoints: int = 800) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Samples(torch.nn.Module):
         self.at, self.names = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
 
     def carried(self, at: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Where pixels (n, 2) of one image are in another. Here goes a dense matcher of your own."""
+        """Positions of pixels (n, 2) of the first image in the second. Replace it by your own dense matcher."""
         field = self.flow.calc(first, second, np.zeros((*first.shape, 2), np.float32))
         return at + np.asarray(cv2.remap(field, at[:, :1], at[:, 1:], cv2.INTER_LINEAR))[:, 0]
 
@@ -50,7 +50,7 @@ class Samples(torch.nn.Module):
         return Features(keypoints, ones * mask, ones, 0 * ones, names, mask)
 
     def sample(self, image: np.ndarray, count: int) -> None:
-        """New samples, where there are none near; named after what they are first seen in."""
+        """Add samples away from the others; identifiers are hashes of the first image and position."""
         free = np.full_like(image, 255)
         for x, y in self.at.round().astype(int).tolist():
             cv2.circle(free, (x, y), APART, 0, -1)
@@ -64,8 +64,8 @@ class Samples(torch.nn.Module):
             )
 
 
-def same(view_1: View, view_2: View, prior: object) -> Matches:
-    """The samples of the same names."""
+def same(view_1: FrameFeatures, view_2: FrameFeatures, prior: object) -> Matches:
+    """Match the samples with equal identifiers."""
     first, second = (view.descriptors.contiguous().view(torch.int64) for view in (view_1, view_2))
     equal = (first[:, None] == second).all(-1) & view_1.mask[:, None] & view_2.mask
     rows, column = torch.arange(len(first)), equal.int().argmax(1)

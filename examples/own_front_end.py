@@ -1,4 +1,4 @@
-"""A front end and a matcher of one's own, and a run with them:
+"""A custom front end and matcher:
 
 torchslam run IMAGES -o results --features examples.own_front_end:Patches --matcher examples.own_front_end:nearest
 """
@@ -8,11 +8,11 @@ from dataclasses import replace
 import torch
 
 from torchslam import ORB, Features, Matches
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 
 class Patches(torch.nn.Module):
-    """Images (B, 1, H, W) in [0, 1] to Features: ORB's corners, described by the grey values around them."""
+    """Images (B, 1, H, W) in [0, 1] to Features: ORB's corners, described by the gray values around them."""
 
     def __init__(self, num_keypoints: int = 1000) -> None:
         super().__init__()
@@ -26,11 +26,11 @@ class Patches(torch.nn.Module):
         described = torch.nn.functional.normalize(patches - patches.mean(-1, keepdim=True), dim=-1)
         return replace(
             found, descriptors=described, information=(0.6 * found.scales) ** -2
-        )  # right to 0.6 px
+        )  # accurate to 0.6 px
 
 
-def nearest(view_1: View, view_2: View, prior: object) -> Matches:
-    """Each other's most similar descriptors, wherever they are."""
+def nearest(view_1: FrameFeatures, view_2: FrameFeatures, prior: object) -> Matches:
+    """Mutual nearest neighbors of the descriptors, anywhere in the images."""
     similar = view_1.descriptors @ view_2.descriptors.mT
     similar = similar.masked_fill(~view_1.mask[:, None] | ~view_2.mask, -1.0)
     (best, column), rows = similar.max(1), torch.arange(len(similar))

@@ -1,9 +1,9 @@
-"""A loop of one's own: images from anywhere go in, one after the other; the pose of each comes back at once.
+"""Run SLAM in your own loop: pass images one by one and get the pose of each.
 
     python -m examples.own_loop 'photos/*.png' 525,525,319.5,239.5
 
-The poses are printed as they come; the trajectory by everything that was learned later goes to trajectory.txt, the map
-to map.safetensors, for `torchslam run --map` or `SLAM.load`.
+The online poses are printed. The final trajectory is written to trajectory.txt, and the map to map.safetensors for
+`torchslam run --map` or `SLAM.load`.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ import torch
 from torchslam import SLAM, TorchslamError
 from torchslam.data import parse_camera, write_trajectory
 
-RATE = 30.0  # images a second, where nobody says at what times they were taken
+RATE = 30.0  # images per second, for images without timestamps
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("images", help="quoted pattern of files; read in the order of their names")
     parser.add_argument(
-        "images", help="a pattern of files, in quotation marks; taken in the order of their names"
+        "camera", help="fx,fy,cx,cy in pixels, or any other value of `torchslam run --camera`"
     )
-    parser.add_argument("camera", help="fx,fy,cx,cy in pixels, or what else `torchslam run --camera` takes")
     parser.add_argument("--output", type=Path, default=Path("."), help="folder for trajectory and map")
     arguments = parser.parse_args()
 
-    torch.set_num_threads(1)  # a frame's tensors are small: threads cost more than they bring
+    torch.set_num_threads(1)  # a frame's tensors are small: more threads are slower
     slam = None
     for number, name in enumerate(sorted(glob.glob(arguments.images))):
         image = cv2.imread(name)  # (H, W, 3) uint8, blue first
@@ -40,7 +40,7 @@ def main() -> None:
             slam = SLAM(parse_camera(arguments.camera, (image.shape[1], image.shape[0])))
         try:
             result = slam.step_image(image, timestamp=number / RATE, channels="bgr")
-        except TorchslamError as error:  # another size than the images before
+        except TorchslamError as error:  # the size differs from that of the images before
             print(f"{name}: skipped: {error}")
             continue
         where = (
@@ -52,7 +52,7 @@ def main() -> None:
     if slam is None:
         raise SystemExit(f"no image at {arguments.images}")
 
-    slam.conclude()  # what is held back keeps its pose
+    slam.finalize()  # accept the pending frames with their poses
     arguments.output.mkdir(parents=True, exist_ok=True)
     write_trajectory(arguments.output / "trajectory.txt", slam.trajectory())  # camera to world
     slam.save(arguments.output / "map.safetensors")

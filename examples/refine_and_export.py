@@ -1,9 +1,9 @@
-"""Poses from somewhere else - a phone, a network, another SLAM -, made better by the images, and given to COLMAP.
+"""Refine the poses of another program (a phone, a network, another SLAM system) with the images, and export to COLMAP.
 
     python -m examples.refine_and_export photos/ poses.txt 525,525,319.5,239.5 --output refined
 
-poses.txt has lines `timestamp tx ty tz qx qy qz qw`, camera to world; a COLMAP model or a transforms.json will do as
-well. The result lies in the frame and the unit of the given poses, with a covariance for every keyframe.
+poses.txt has lines `timestamp tx ty tz qx qy qz qw`, camera to world; a COLMAP model or a transforms.json works as
+well. The result keeps the frame and the unit of the given poses, and has a covariance for every keyframe.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from torchslam import open_sequence
 from torchslam.data import write_trajectory
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.scene import scene_of
-from torchslam.refine import CameraChoice, refine
+from torchslam.refine import CameraChoice, refine_poses
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("images", help="what `torchslam run` reads")
+    parser.add_argument("images", help="any input of `torchslam run`")
     parser.add_argument("poses", help="TUM trajectory, folder of a COLMAP model, or transforms.json")
-    parser.add_argument("camera", nargs="?", help="unless the images come with a calibration")
+    parser.add_argument("camera", nargs="?", help="required unless the images have a calibration")
     parser.add_argument("--output", type=Path, default=Path("refined"))
     arguments = parser.parse_args()
 
-    torch.set_num_threads(1)  # a frame's tensors are small: threads cost more than they bring
+    torch.set_num_threads(1)  # a frame's tensors are small: more threads are slower
     sequence = open_sequence(arguments.images, arguments.camera)
-    refined = refine(sequence, arguments.poses, choice=CameraChoice.JUDGED, told=print)
+    refined = refine_poses(sequence, arguments.poses, choice=CameraChoice.IF_CONTRADICTED, on_progress=print)
     run = refined.run
     if run.main is None:
-        raise SystemExit(f"nothing came of it: {run.failure}")
+        raise SystemExit(f"the poses could not be refined: {run.failure}")
 
     arguments.output.mkdir(parents=True, exist_ok=True)
     write_trajectory(arguments.output / "trajectory.txt", run.trajectory)
@@ -46,7 +46,7 @@ def main() -> None:
         f"{len(run.trajectory)} poses, {run.map.num_points} points, focal length {float(run.camera.focal):.1f} px"
     )
     print(
-        f"moved by {float(moved.median()):.4f} in the median, the keyframes known to {float(deviations.median()):.4f}"
+        f"moved by {float(moved.median()):.4f} (median), keyframe standard deviation {float(deviations.median()):.4f}"
     )
     print(f"mean reprojection error {float(scene.point_errors().mean()):.2f} px")
 

@@ -1,10 +1,10 @@
-"""Learn from the poses of clips how much each keypoint counts.
+"""Learn the weight of each keypoint from the poses of clips.
 
     python -m examples.train_weights synthetic:room path/to/sequence --steps 300
-    torchrun --nproc-per-node 2 -m examples.train_weights ...            # half of every batch on each process
+    torchrun --nproc-per-node 2 -m examples.train_weights ...            # half of each batch per process
 
-Stopped and called again, it goes on, and ends with the same bytes. ORB finds and matches keypoints as ever; a small
-network sees the response of the detector and the level of the pyramid, and says what a keypoint counts beside others.
+An interrupted training continues from its checkpoint and ends with the same bytes. ORB detects and matches keypoints; a
+small network computes their weights from the detector response and the pyramid level.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from torchslam import ORB, ClipSLAM, Features, clip_loss, open_sequence
-from torchslam.learning import Batches, Clips, Log, Looking, Training, collate, relative_ate
+from torchslam.learning import Batches, Clips, GraphCache, Log, Training, collate, relative_ate
 
-FAILED = 0.1  # what a clip without poses costs, as a share of its path
+FAILED = 0.1  # loss of a clip without poses, as a fraction of its path
 
 
 class Weigh(nn.Module):
-    """Features to the weights (B, N) of their keypoints, 1 in the geometric mean; all alike before the training."""
+    """Features to the weights (B, N) of their keypoints, with geometric mean 1; equal before the training."""
 
     def __init__(self, width: int = 16) -> None:
         super().__init__()
@@ -42,18 +42,18 @@ class Weigh(nn.Module):
 def train(
     clips: Clips, steps: int, checkpoint: Path, batch: int = 4, save_every: int = 10, log: Log | None = None
 ) -> Training:
-    """Train from the checkpoint on, or from the beginning, on this process and those beside it."""
+    """Train from the checkpoint, if there is one, on all processes of the group."""
     rank, ranks = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
     torch.manual_seed(0)
     clip_slam = ClipSLAM(ORB(600), Weigh())
-    looking = Looking(clip_slam)
+    graphs = GraphCache(clip_slam)
     training = Training(clip_slam, torch.optim.Adam(clip_slam.parameters(), 3e-3), steps, log=log)
     training.resume(checkpoint)
     module = DistributedDataParallel(clip_slam) if ranks > 1 else clip_slam
     batches = Batches(len(clips), batch // ranks, first=training.step, rank=rank, ranks=ranks)
     loader = DataLoader(clips, batch_sampler=batches, collate_fn=collate)
     for step, clip in zip(training, loader, strict=False):
-        poses = module(clip.images, clip.camera, looking(clip))
+        poses = module(clip.images, clip.camera, graphs(clip))
         loss, failures = clip_loss(poses, clip.T_cw, relative_ate, on_failure=FAILED)
         training.descend(loss)
         if log is not None:
@@ -65,19 +65,19 @@ def train(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("sequences", nargs="+", help="with true poses, all of one size")
+    parser.add_argument("sequences", nargs="+", help="sequences with ground truth, all of one size")
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--clips", type=int, default=50, help="of each sequence")
+    parser.add_argument("--clips", type=int, default=50, help="number of clips per sequence")
     parser.add_argument(
-        "--checkpoint", type=Path, default=Path("weights.pt"), help="written, and gone on from"
+        "--checkpoint", type=Path, default=Path("weights.pt"), help="file to save to and to continue from"
     )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if "WORLD_SIZE" in os.environ:
         dist.init_process_group("gloo")
     clips = Clips([open_sequence(name) for name in arguments.sequences], per_sequence=arguments.clips)
-    talks = not dist.is_initialized() or dist.get_rank() == 0  # a SummaryWriter's `add_scalar` does as well
-    log = (lambda name, value, step: print(f"{step:5d} {name} {value:.4g}", flush=True)) if talks else None
+    is_main = not dist.is_initialized() or dist.get_rank() == 0  # a SummaryWriter's `add_scalar` does as well
+    log = (lambda name, value, step: print(f"{step:5d} {name} {value:.4g}", flush=True)) if is_main else None
     train(clips, arguments.steps, arguments.checkpoint, log=log)
     if dist.is_initialized():
         dist.destroy_process_group()

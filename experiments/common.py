@@ -11,7 +11,7 @@ from typing import Any
 
 from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
 from torchslam.batch.fingerprints import digest, of_files, program
-from torchslam.batch.result_store import RUNS, keep
+from torchslam.batch.result_store import RUNS, run_or_reuse
 from torchslam.batch.rows import short_name
 from torchslam.batch.table import read_times
 from torchslam.data import Sequence as Frames
@@ -76,7 +76,7 @@ def figures_of_all(rows: Sequence[Row], options: argparse.Namespace, pictures: b
     """
     output = options.output.absolute()
     tasks = [Task(row, str(output), overwrite=True, pictures=pictures) for row in rows]
-    check(run_batch(tasks, Engine(options.engine, options.workers), told=_tell))
+    check(run_batch(tasks, Engine(options.engine, options.workers), on_progress=_tell))
     folders = [output / RUNS / row.name for row in rows]
     return [read_metrics(folder) | read_times(folder) for folder in folders]
 
@@ -84,26 +84,26 @@ def figures_of_all(rows: Sequence[Row], options: argparse.Namespace, pictures: b
 def kept(
     name: str, label: str, settings: Iterable[str], work: Callable[[Path], Columns], output: str, code: Path
 ) -> Columns:
-    """The columns of a piece of an experiment that is no row of a batch, done unless it was done before: see `keep`.
+    """Run a piece of an experiment that is not a row of a batch, or reuse its stored columns: see `run_or_reuse`.
 
     name:  unique, as a part of the name of a folder; label: what it is called in the experiment
-    work:  as of `keep`; code: folder of the experiment, whose program counts as does that of torchslam and the data
+    work:  as of `run_or_reuse`; code: folder of the experiment, hashed together with torchslam and the data
     """
 
-    def marks() -> Columns:
+    def fingerprints_of() -> Columns:
         config = digest({"label": label, "settings": list(settings), "program": program()})
         return {"configuration": config, "input": of_files([f"{code}/*.py", str(DATA_DIR)])}
 
-    return keep(Path(output), name, marks, work, overwrite=True)
+    return run_or_reuse(Path(output), name, fingerprints_of, work, overwrite=True)
 
 
 def each_case(
     work: Callable[[Columns], Columns],
     cases: Sequence[Columns],
     options: argparse.Namespace,
-    told: Callable[[Columns], None],
+    on_progress: Callable[[Columns], None],
 ) -> list[Columns]:
-    """What a function that never raises, as by `kept`, makes of the cases; `told` each of them when it is done.
+    """What a function that never raises, as by `kept`, makes of the cases; `on_progress` each of them when it is done.
 
     Cases are what JSON can say. Raises SystemExit where a process died.
     """
@@ -112,7 +112,7 @@ def each_case(
         if columns is None:
             raise SystemExit(f"{cases[number]}: the process that ran it died")
         found[number] = columns
-        told(columns)
+        on_progress(columns)
     return [found[number] for number in range(len(cases))]
 
 

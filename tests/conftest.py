@@ -55,4 +55,4 @@ def data_dir() -> Path:
 @pytest.fixture
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """`torchslam run` draws nothing: that takes as long as a short run."""
-    monkeypatch.setattr("torchslam.cli.run.draw", lambda results, output: [])
+    monkeypatch.setattr("torchslam.io.write_run.draw", lambda results, output: [])

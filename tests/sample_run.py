@@ -12,10 +12,10 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
 from torchslam.system.run import Run
-from torchslam.types import State, StepResult, Tracked, Trajectory, View
+from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult, Trajectory
 
 KEYPOINTS = 40
 FRAMES = 30
@@ -50,26 +50,26 @@ def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
         if keyframe:
             made.observe(keyframe, torch.arange(20, 30), ids[:10] - 20)
     made.refresh(torch.arange(made.num_keyframes))
-    made.kill(torch.tensor([3]))
+    made.invalidate(torch.tensor([3]))
     return made
 
 
 @pytest.fixture
-def world(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> World:
+def world(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> Submap:
     """The map and the frames that are tracked, on the trajectory."""
-    made = World(0, Track.nowhere(trajectory.T_wc), slam_map)
+    made = Submap(0, TrackingState.nowhere(trajectory.T_wc), slam_map)
     nothing = torch.zeros(0, dtype=torch.int64)
     for result in results:
         if result.T_cw is not None:
             view = replace(slam_map.view(0), index=result.index, timestamp=result.timestamp)
             T_cw = se3_inverse(trajectory.T_wc[result.index])
-            seen = Tracked(T_cw, nothing, nothing, 0, torch.eye(6, dtype=torch.float64), 1.0)
+            seen = PoseEstimate(T_cw, nothing, nothing, 0, torch.eye(6, dtype=torch.float64), 1.0)
             made.history.add(view, seen, T_cw @ se3_inverse(slam_map.T_cw[0]), 0)
     return made
 
 
 @pytest.fixture
-def run(world: World, camera: Camera, results: list[StepResult]) -> Run:
+def run(world: Submap, camera: Camera, results: list[StepResult]) -> Run:
     """A run with one world."""
     return Run(
         worlds=(world,),
@@ -89,9 +89,9 @@ def results() -> list[StepResult]:
     return [_result(index, state) for index, state in enumerate(states)]
 
 
-def _view(index: int, trajectory: Trajectory, generator: torch.Generator) -> View:
+def _view(index: int, trajectory: Trajectory, generator: torch.Generator) -> FrameFeatures:
     size = torch.tensor([160.0, 120.0], dtype=torch.float64)
-    return View(
+    return FrameFeatures(
         index=index,
         timestamp=float(trajectory.timestamps[index]),
         keypoints=torch.rand(KEYPOINTS, 2, generator=generator, dtype=torch.float64) * size,

@@ -13,9 +13,9 @@ from torch import Tensor
 from tests.map.simulated import tracked_at
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 UNTOUCHED = torch.eye(4, dtype=torch.float64)
@@ -62,7 +62,7 @@ class Scene:
         """(P,) at which keypoint of a view each point is."""
         return torch.argsort(self.shows(index))
 
-    def view(self, index: int, T_cw: Tensor, *, noise: float = 0.0, session: int = 0) -> View:
+    def view(self, index: int, T_cw: Tensor, *, noise: float = 0.0, session: int = 0) -> FrameFeatures:
         """What a camera at T_cw (4, 4) sees: a keypoint for each point in the image, `noise` times its scale off."""
         order = self.shows(index)
         points_c = transform(T_cw, self.points_w[order])
@@ -71,7 +71,7 @@ class Scene:
         scales = self.sizes[order] * 200.0 / torch.linalg.vector_norm(points_c, dim=-1)
         generator = torch.Generator().manual_seed(2000 + index)
         error = noise * torch.randn(len(order), 2, generator=generator, dtype=torch.float64)
-        return View(
+        return FrameFeatures(
             index=index,
             timestamp=0.1 * index,
             keypoints=torch.where(mask[:, None], pixels + scales[:, None] * error, 0.0),
@@ -97,14 +97,14 @@ def world_in(
     number: int = 0,
     noise: float = 0.0,
     seen: Tensor | None = None,
-) -> World:
+) -> Submap:
     """A world of keyframes at T_cw (K, 4, 4) of the scene, frames first, first + 1, ..., that holds the scene's points.
 
     S_ws:  (4, 4) similarity from the scene to the world
     seen:  (P,) bool, points that the map has; all without it. Row r of the map is point argsort(rows_of)[r].
     The camera is followed from the last keyframe.
     """
-    world = World.empty(number, CAMERA.params)
+    world = Submap.empty(number, CAMERA.params)
     rows = rows_of(scene)
     known = torch.ones(len(scene), dtype=torch.bool) if seen is None else seen
     ids: Tensor | None = None
@@ -122,7 +122,7 @@ def world_in(
         world.history.add(view, tracked, UNTOUCHED, keyframe)
     world.map.refresh(torch.arange(len(T_cw)))
     lonely = torch.nonzero(world.map.points["times_observed"] == 0)[:, 0]
-    world.map.kill(lonely)
+    world.map.invalidate(lonely)
     Tracker(CAMERA, Config()).follow(world, len(T_cw) - 1)
     return world
 
@@ -139,5 +139,5 @@ def centre(T_cw: Tensor) -> Tensor:
     return se3_inverse(T_cw)[..., :3, 3]
 
 
-def with_scales(view: View, scales: Tensor) -> View:
+def with_scales(view: FrameFeatures, scales: Tensor) -> FrameFeatures:
     return replace(view, scales=scales)

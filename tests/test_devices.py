@@ -17,7 +17,7 @@ from torchslam.cli.main import main
 from torchslam.evaluation import ate
 
 CPU = torch.device("cpu")
-NOISY = ["features.kind=simulated", "simulated.noise_px=0.3", "simulated.outliers=0.1"]
+NOISY = ["features.kind=simulated", "simulated.noise_px=0.3", "simulated.outlier_ratio=0.1"]
 # Rounding differs between devices, and grows from keyframe to keyframe.
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
 

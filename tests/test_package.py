@@ -71,12 +71,12 @@ def test_configurations_are_found_by_name_outside_of_the_repository(unpacked: Pa
         environment = os.environ | {"PYTHONPATH": str(unpacked)}
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
-    fast = config("fast")
-    assert fast.returncode == 0, fast.stderr
-    assert tomllib.loads(fast.stdout)["patches"]["enabled"] is True
-    wrong = config("fastt")
+    paper = config("paper")
+    assert paper.returncode == 0, paper.stderr
+    assert tomllib.loads(paper.stdout)["scale"] == "groundtruth"
+    wrong = config("papper")
     assert wrong.returncode == 2
-    assert "there are default, fast, paper" in wrong.stderr
+    assert "there are default, paper" in wrong.stderr
 
 
 def test_a_checkout_has_no_copy_of_the_configurations() -> None:

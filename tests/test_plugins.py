@@ -18,8 +18,8 @@ from torchslam.cli.main import main
 from torchslam.errors import ConfigError
 from torchslam.system.front_end import image_extractor
 from torchslam.tracking.lightglue import LightGlue
-from torchslam.tracking.matcher import matcher_of
-from torchslam.types import Frame, View
+from torchslam.tracking.matcher import make_matcher
+from torchslam.types import Frame, FrameFeatures
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_front_end.py"
 ROOM = "synthetic:room?frames=14"
@@ -182,33 +182,33 @@ def lightglue_file(path: Path) -> Path:
     return path
 
 
-def view(dim: int, seed: int) -> View:
+def view(dim: int, seed: int) -> FrameFeatures:
     generator = torch.Generator().manual_seed(seed)
     described = torch.nn.functional.normalize(torch.randn(30, dim, generator=generator), dim=-1)
     keypoints = 100 * torch.rand(30, 2, generator=generator, dtype=torch.float64)
     ones = torch.ones(30, dtype=torch.float64)
-    return View(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
+    return FrameFeatures(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
 
 
 def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
     """With weights of chance: what it says is nothing, how it says it is what is tested."""
-    from torchslam.tracking.matcher import matched
+    from torchslam.tracking.matcher import run_matcher
 
     file = lightglue_file(tmp_path / "lightglue.safetensors")
-    matcher = matcher_of(
+    matcher = make_matcher(
         load_config(None, ["matching.matcher=lightglue", f'matching.weights="{file}"']).matching
     )
     assert isinstance(matcher, LightGlue)
     matcher.network.conf.filter_threshold = 0.0
     one = view(64, 1)
-    pairs = matched(matcher, one, one)
+    pairs = run_matcher(matcher, one, one)
     assert len(pairs.first) > 0
     assert pairs.weights is not None
     assert bool((pairs.weights > 0).all())
     with pytest.raises(ConfigError, match="its weights are for descriptors of 64 floats, these are 32"):
         matcher(view(32, 1), view(32, 2), None)
     with pytest.raises(ConfigError, match="needs a file of weights"):
-        matcher_of(load_config(None, ["matching.matcher=lightglue"]).matching)
+        make_matcher(load_config(None, ["matching.matcher=lightglue"]).matching)
     (tmp_path / "other.pt").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="cannot read the weights"):
         LightGlue(tmp_path / "other.pt")
@@ -229,7 +229,7 @@ def test_samples_keep_their_names_along_the_flow() -> None:
 
     room, samples = open_sequence(ROOM), Samples(300)
     one, other = (
-        View.of(room[index], samples(room.image(index)), torch.zeros(0).double()) for index in (0, 1)
+        FrameFeatures.of(room[index], samples(room.image(index)), torch.zeros(0).double()) for index in (0, 1)
     )
     found = same(one, other, None)
     assert int(found.mask.sum()) > 200

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from enum import Enum
+from enum import Enum, StrEnum
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchslam.geometry.gating import Noise, packed_information, unpacked_information
+from torchslam.geometry.gating import KeypointNoise, packed_information, unpacked_information
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,6 @@ class Frame:
                by scale from ground truth and by evaluation.
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
     features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
-    followed:  what following its image by patches gave, where that was tried already
     waiting:   frames of a live source that have come after it: so far behind its camera is who works on it
     """
 
@@ -39,7 +38,6 @@ class Frame:
     T_cw_groundtruth: Tensor | None = None
     mask: Tensor | None = None
     features: Features | None = None
-    followed: Followed | None = None
     waiting: int = 0
 
 
@@ -109,7 +107,7 @@ class Matches:
 
 
 @dataclass(frozen=True)
-class View:
+class FrameFeatures:
     """What the system sees of one frame: its keypoints as the geometry uses them, unbatched.
 
     keypoints:   (N, 2) pixels, in the dtype of the geometry (float64 unless configured)
@@ -118,7 +116,7 @@ class View:
     descriptors: (N, D)
     mask:        (N,) bool
     session:     which run over the same map saw it, from 0
-    information: (N, I) as in `Noise`: what the front end says of the keypoints' errors; nothing if left out
+    information: (N, I) as in `KeypointNoise`: what the front end says of the keypoints' errors; nothing if left out
     image:       (1, 1, H, W) grey, where a matcher wants it
     waiting:     frames that have come after it, as in `Frame`
     """
@@ -140,7 +138,7 @@ class View:
         _nothing_said(self)
 
     @classmethod
-    def of(cls, frame: Frame, features: Features, like: Tensor) -> View:
+    def of(cls, frame: Frame, features: Features, like: Tensor) -> FrameFeatures:
         """The first element of a batch of features, with the device and the floating-point dtype of `like`."""
         features, truth = features.to(like.device), frame.T_cw_groundtruth
         scales, information = features.scales[:1], features.information
@@ -159,21 +157,16 @@ class View:
         )
 
     @property
-    def noise(self) -> Noise:
+    def noise(self) -> KeypointNoise:
         """Of the keypoints (N,)."""
-        return Noise(self.scales, self.information)
+        return KeypointNoise(self.scales, self.information)
 
-    def weighed(self, keypoints: Tensor, weights: Tensor | None) -> View:
+    def weighed(self, keypoints: Tensor, weights: Tensor | None) -> FrameFeatures:
         """The same view, the information of keypoints (n,) multiplied with the weights (n,) of their matches."""
         if weights is None:
             return self
         factors = torch.ones_like(self.scales).index_put((keypoints,), weights)
         return replace(self, information=self.noise.stated().weighed(factors).information)
-
-    @property
-    def has_features(self) -> bool:
-        """Whether its keypoints are those of a front end; else they are where patches were followed to."""
-        return self.descriptors.shape[-1] > 0
 
     @property
     def scale_range(self) -> tuple[float, float]:
@@ -192,7 +185,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Start:
+class TwoViewMap:
     """A pair of views good enough to start a map.
 
     reference, view: the two views; the camera of the reference is the world
@@ -200,8 +193,8 @@ class Start:
     points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
     """
 
-    reference: View
-    view: View
+    reference: FrameFeatures
+    view: FrameFeatures
     T_cw: Tensor
     points_w: Tensor
     keypoints_1: Tensor
@@ -209,7 +202,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class PoseEstimate:
     """A frame that knows where it is.
 
     T_cw:        (4, 4)
@@ -241,62 +234,10 @@ class Tracked:
         return len(self.point_ids)
 
 
-@dataclass(frozen=True)
-class Anchor:
-    """A frame found by its features, from which the next ones can be followed without any: what its camera sees.
-
-    index:     of the frame
-    points_a:  (n, 3) in its camera; pixels: (n, 2) its keypoints there; scales: (n,) and information: (n, I) of these
-    senior:    (n,) bool, which points many frames have found
-    T_ka:      (k, 4, 4) to the keyframes around it
-    velocity:  (4, 4) last motion of the camera, T_a_previous
-    overlap:   share of the points of its reference keyframe that it sees
-    """
-
-    index: int
-    points_a: Tensor
-    pixels: Tensor
-    scales: Tensor
-    senior: Tensor
-    T_ka: Tensor
-    velocity: Tensor
-    overlap: float
-    information: Tensor = field(default_factory=lambda: torch.zeros(0))
-
-    def __post_init__(self) -> None:
-        _nothing_said(self)
-
-    @property
-    def noise(self) -> Noise:
-        """Of its keypoints (n,)."""
-        return Noise(self.scales, self.information)
-
-
-def _nothing_said(seen: View | Anchor) -> None:
+def _nothing_said(seen: FrameFeatures) -> None:
     """Where no information was given there is none: (n, 0)."""
     if seen.information.ndim == 1:
         object.__setattr__(seen, "information", packed_information(None, seen.scales))
-
-
-@dataclass(frozen=True)
-class Followed:
-    """What following a frame from an anchor gave.
-
-    anchor:     index of the anchor's frame; -1 where there was none to follow from
-    why_not:    why the frame should be found by its features, in words; empty where this pose will do
-    T_ca:       (4, 4) pose of the frame in the anchor's camera; None where it was lost
-    rows:       (m,) points of the anchor that agree with the pose; pixels: (m, 2) where they are
-    expected:   how many points of the anchor should be in the image
-    covariance: (6, 6) of the left perturbation of T_ca
-    """
-
-    anchor: int
-    why_not: str
-    T_ca: Tensor | None = None
-    rows: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
-    pixels: Tensor = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.float64))
-    expected: int = 0
-    covariance: Tensor = field(default_factory=lambda: torch.zeros(6, 6, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -304,7 +245,7 @@ class Observations:
     """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
 
     keyframe_index, keypoint_index, point_index: (O,) int64
-    pixels: (O, 2); scales: (O,) pixels; information: (O, I) as in `Noise`
+    pixels: (O, 2); scales: (O,) pixels; information: (O, I) as in `KeypointNoise`
     """
 
     keyframe_index: Tensor
@@ -315,8 +256,8 @@ class Observations:
     information: Tensor
 
     @property
-    def noise(self) -> Noise:
-        return Noise(self.scales, self.information)
+    def noise(self) -> KeypointNoise:
+        return KeypointNoise(self.scales, self.information)
 
     def __len__(self) -> int:
         return len(self.point_index)
@@ -345,6 +286,18 @@ class Trajectory:
     def positions_w(self) -> Tensor:
         """(N, 3) camera centres."""
         return self.T_wc[:, :3, 3]
+
+
+class Reason(StrEnum):
+    """What a frame did to the state of the system, as `StepResult.reason` says it; some reasons carry figures instead."""
+
+    NEW_REFERENCE = "took a reference frame"
+    STARTED = "started the map"
+    STARTED_ANEW = "later frames contradict the start: started the map anew"
+    FOUND_AGAIN = "found again"
+    LOST = "lost"
+    LOST_AT_START = "lost right after the start: starting anew"
+    STATIC_OVERLAY = "some of the image does not move with the scene and is left out"
 
 
 class State(Enum):

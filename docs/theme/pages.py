@@ -113,7 +113,7 @@ def _map_file() -> str:
         "tables, and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by "
         "row, the columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a "
         "descriptor. Floats are float64 as a run writes them; a descriptor is bytes or floats.",
-        "`torchslam.map.file.read_worlds(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
+        "`torchslam.map.file.read_atlas(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
         "Any safetensors reader gets at the tensors.",
     ]
     for name in ("points", "keyframes", "frames", "observations"):

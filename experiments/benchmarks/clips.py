@@ -52,11 +52,11 @@ class Looked(NamedTuple):
     look_ms: float
 
 
-def look(clip_slam: ClipSLAM, clip: Clip) -> Looked:
+def build_graph(clip_slam: ClipSLAM, clip: Clip) -> Looked:
     with torch.no_grad():
         features, extract_ms = timed(lambda: clip_slam.extract(clip.images))
     assert isinstance(features, Features)
-    graph, look_ms = timed(lambda: clip_slam.look(clip.images, clip.camera, features))
+    graph, look_ms = timed(lambda: clip_slam.build_graph(clip.images, clip.camera, features))
     return Looked(clip, features, graph, extract_ms, look_ms)
 
 
@@ -124,10 +124,10 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
-    clip_slam = ClipSLAM(ORB(1000), weigh=lambda features: features.scores.clamp_min(1e-6).sqrt())
+    clip_slam = ClipSLAM(ORB(1000), keypoint_weight=lambda features: features.scores.clamp_min(1e-6).sqrt())
     for sequence in sequences(NAMES):
         clips = Clips([sequence], per_sequence=CLIPS)
-        looked = [look(clip_slam, clips[number]) for number in range(len(clips))]
+        looked = [build_graph(clip_slam, clips[number]) for number in range(len(clips))]
         found = [each for each in looked if each.graph.runs[0] is not None]
         runs = [each.graph.runs[0] for each in found]
         counts = [[float(run.is_keyframe.sum()), float(len(run.pixels))] for run in runs if run is not None]
@@ -150,7 +150,14 @@ def main() -> None:
             ]
         )
         print(rows[-1], flush=True)
-    header = ["sequence", "clips with a map", "keyframes, observations", "front end, ms", "look", "pose"]
+    header = [
+        "sequence",
+        "clips with a map",
+        "keyframes, observations",
+        "front end, ms",
+        "build_graph",
+        "pose",
+    ]
     header += ["backward", "step", "slowest step", "step, all clips in one call", "times faster"]
     header += ["gradients differ by"]
     text = (

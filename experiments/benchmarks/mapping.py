@@ -20,11 +20,11 @@ from torch import Tensor
 from experiments.common import parser_of, table
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
-from torchslam.loop_closing.loop_closer import Memory
-from torchslam.map.atlas import Worlds
+from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.map.atlas import Atlas
 from torchslam.mapping.mapper import Mapper
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 from torchslam.utils.timing import Stopwatch
 
 HERE = Path(__file__).parent
@@ -48,7 +48,7 @@ class Walk:
         self.descriptors = torch.randint(0, 256, (count, 32), generator=g, dtype=torch.uint8)
         self.scales = 1.2 ** torch.randint(0, LEVELS, (count,), generator=g).double()
         self.rows = torch.full((count,), -1)  # of the points in the map
-        self.worlds = Worlds(CAMERA.params)
+        self.worlds = Atlas(CAMERA.params)
         self.world = self.worlds.begin()
         self.tracker = Tracker(CAMERA, Config())
         self.mapper = Mapper(CAMERA, Config(), Stopwatch())
@@ -58,9 +58,9 @@ class Walk:
         for some in torch.arange(keyframes).split(100):
             slam_map.refresh(some)
         self.world.asked = keyframes
-        self.memory = Memory(CAMERA, Config(), self.worlds)
+        self.memory = LoopCloser(CAMERA, Config(), self.worlds)
 
-    def look(self, index: int) -> tuple[View, Tensor]:
+    def look(self, index: int) -> tuple[FrameFeatures, Tensor]:
         """What the camera sees at a step of its way, and which points of the wall these are."""
         T_cw = torch.eye(4, dtype=torch.float64)
         T_cw[0, 3] = -index * STEP
@@ -74,7 +74,7 @@ class Walk:
         def padded(values: Tensor) -> Tensor:
             return torch.cat([values, values.new_zeros(missing, *values.shape[1:])])
 
-        view = View(
+        view = FrameFeatures(
             index,
             float(index),
             padded(pixels[inside] + noise),
@@ -105,10 +105,10 @@ class Walk:
         assert view.T_cw_groundtruth is not None
         known = self.rows[seen] >= 0
         ids = slam_map.resolve(self.rows[seen[known]])  # of merged points the heirs
-        alive = slam_map.points["alive"][ids]
+        alive = slam_map.points["is_valid"][ids]
         at, ids = torch.nonzero(known)[alive, 0], ids[alive]
         eye = torch.eye(6, dtype=torch.float64)
-        tracked = Tracked(view.T_cw_groundtruth, ids, at, len(ids), 1e-6 * eye, DEPTH)
+        tracked = PoseEstimate(view.T_cw_groundtruth, ids, at, len(ids), 1e-6 * eye, DEPTH)
         spent: dict[str, float] = {}
 
         def timed(stage: str, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from torchslam.config import MatchingConfig
 from torchslam.features import match
-from torchslam.tracking.matcher import DescriptorMatcher, Prior, max_distance
-from torchslam.types import Matches, View
+from torchslam.tracking.matcher import DescriptorMatcher, MatchPrior, max_distance
+from torchslam.types import FrameFeatures, Matches
 
 
 class Mutual:
@@ -20,7 +20,7 @@ class Mutual:
         self.settings = MatchingConfig()
         self.own = DescriptorMatcher(self.settings)
 
-    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+    def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         limit = max_distance(view_2.descriptors, self.settings)
         if prior is None:
             return match(view_1.features, view_2.features, ratio=None, mutual=True, max_distance=limit)

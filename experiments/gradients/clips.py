@@ -18,7 +18,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.clips import MOVE_PX, Looked, look
+from experiments.benchmarks.clips import MOVE_PX, Looked, build_graph
 from experiments.common import parser_of, sequences, table
 from torchslam import ORB, ClipGraph, ClipPoses, ClipSLAM, Features
 from torchslam.learning import clip as clips
@@ -188,12 +188,12 @@ def main() -> None:
     parser = parser_of(__doc__, HERE / "clips.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    clip_slam = ClipSLAM(ORB(1000), weigh=lambda features: features.scores.clamp_min(1e-6).sqrt())
+    clip_slam = ClipSLAM(ORB(1000), keypoint_weight=lambda features: features.scores.clamp_min(1e-6).sqrt())
     found: dict[tuple[int, float], list[Found]] = {limits: [] for limits in LIMITS}
     differences, count = [], 0
     for sequence in sequences(NAMES):
         chosen = Clips([sequence], per_sequence=CLIPS)
-        looked = [look(clip_slam, chosen[number]) for number in range(len(chosen))]
+        looked = [build_graph(clip_slam, chosen[number]) for number in range(len(chosen))]
         looked = [each for each in looked if each.graph.runs[0] is not None]
         count += len(looked)
         for seed in range(SEEDS):

@@ -8,13 +8,13 @@ from torch import Tensor
 from experiments.places.train import k_majority
 from torchslam.features import match, unpack_bits
 from torchslam.features.matching.hamming import sign_products
-from torchslam.loop_closing import Places
+from torchslam.loop_closing import KeyframeDatabase
 from torchslam.types import Features
 
 
 def places(features: Features, strongest: int, words: Tensor | None = None) -> Tensor:
     """torchslam.loop_closing, with so many descriptors of each image (at most the 400 it takes)."""
-    memory, mask = Places(words), features.mask.clone()
+    memory, mask = KeyframeDatabase(words), features.mask.clone()
     mask[:, strongest:] = False
     for key in range(len(mask)):
         memory.add(key, features.descriptors[key], mask[key])

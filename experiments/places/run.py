@@ -14,7 +14,7 @@ from experiments.places import alternatives
 from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
-from torchslam.loop_closing import Places
+from torchslam.loop_closing import KeyframeDatabase
 from torchslam.loop_closing.global_descriptor import rendered_words
 from torchslam.types import Features
 
@@ -125,7 +125,7 @@ def recall_at(scores: Tensor, true: Tensor, count: int) -> float:
 
 def costs(features: Features) -> str:
     """A table of processor time of the way that was taken, by the number of keyframes: images over and over, noisy."""
-    generator, memory, rows = torch.Generator().manual_seed(0), Places(), []
+    generator, memory, rows = torch.Generator().manual_seed(0), KeyframeDatabase(), []
     adding = []
     for key in range(max(SIZES)):
         image = key % len(features.mask)

@@ -14,7 +14,7 @@ from torch import Tensor
 from experiments.common import DATA_DIR, add_engine, check, each_case, kept, table, write_between
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
-from torchslam.calibration import FoundCamera, Round, calibrate, refine
+from torchslam.calibration import FoundCamera, Round, calibrate, estimate_intrinsics
 from torchslam.calibration.report import contradiction
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
@@ -120,7 +120,7 @@ def found(label: str, case: Case) -> list[str]:
     """Find the camera of a case, run with it and with the given one, and return the row of the table."""
     unknown, known, config = open_case(case)
     start = time.process_time()
-    result = calibrate(unknown, config, told=lambda done: tell(label, done))
+    result = calibrate(unknown, config, on_progress=lambda done: tell(label, done))
     seconds = time.process_time() - start
     run = SLAM(result.camera, config).run(unknown)
     given = None if known is None else SLAM(known.camera, config).run(known)
@@ -179,7 +179,7 @@ def warned(label: str, case: Case) -> None:
     for factor in (1 / WRONG, 1.0, WRONG):
         camera = scaled(known.camera.to(torch.float64), factor)
         run = SLAM(camera, config).run(known)
-        said = run.failure or contradiction(camera, refine(run.graph)) or "nothing"
+        said = run.failure or contradiction(camera, estimate_intrinsics(run.graph)) or "nothing"
         print(f"{label}, given {float(camera.focal):.1f} px: {said}", flush=True)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
 
-NOISY = ["simulated.noise_px=0.5", "simulated.outliers=0.1"]
+NOISY = ["simulated.noise_px=0.5", "simulated.outlier_ratio=0.1"]
 CASES = [
     ("redkitchen", "exact", []),
     ("kitti07", "exact", []),

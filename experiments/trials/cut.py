@@ -17,14 +17,14 @@ from torchslam.cli.run import CHECKPOINT_EVERY
 from torchslam.config import Config
 from torchslam.io.results import CHECKPOINT
 from torchslam.system.checkpoint import read_checkpoint
-from torchslam.system.run import Progressed, run_sequence
+from torchslam.system.run import RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 
 
 def after_the_cut(
     make: Callable[[], Edited], config: Config, share: float, every: int = CHECKPOINT_EVERY
-) -> tuple[SLAM, Progressed]:
+) -> tuple[SLAM, RunProgress]:
     """The system and its results by the last checkpoint of a run that was killed after a share of its frames.
 
     make: the sequence, by a function that can be pickled; every: keyframes from checkpoint to checkpoint
@@ -44,7 +44,7 @@ def _run_until_killed(
     make: Callable[[], Edited], config: Config, share: float, every: int, folder: Path
 ) -> None:
     torch.set_num_threads(1)
-    sequence, so_far = make(), Progressed()
+    sequence, so_far = make(), RunProgress()
     slam = SLAM(sequence.camera, config)
     checkpoints = Checkpoints(folder, every, slam, so_far, sequence)
 

@@ -22,8 +22,8 @@ from experiments.trials.trials import Trial
 from torchslam.config import Config, load_config
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import se3_inverse, so3_log
-from torchslam.loop_closing.loop_detector import Recall
-from torchslam.system.run import Progressed, Run, run_sequence
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import Frame, State, StepResult
 
@@ -57,7 +57,7 @@ class Outcome:
     extent: float
     misled: list[int]
     states: list[State]
-    recalls: list[Recall]
+    recalls: list[LoopClosureRecord]
     apart: tuple[float, float] | None
     seconds: float
     ms: float
@@ -95,13 +95,13 @@ def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
     return _outcome(run, sequence, seconds, taken), run
 
 
-def _begin(trial: Trial, sequence: Edited, config: Config) -> tuple[SLAM, Progressed]:
+def _begin(trial: Trial, sequence: Edited, config: Config) -> tuple[SLAM, RunProgress]:
     """The system before the first frame of the trial, or after the last one that was not lost with a cut."""
     if trial.cut_at is not None:
         return after_the_cut(trial.sequence, config, trial.cut_at)
     if trial.map_of is None:
-        return SLAM(sequence.camera, config), Progressed()
-    return _in_map(trial.map_of(), config), Progressed()
+        return SLAM(sequence.camera, config), RunProgress()
+    return _in_map(trial.map_of(), config), RunProgress()
 
 
 def _in_map(sequence: Edited, config: Config) -> SLAM:
@@ -183,7 +183,7 @@ def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
     return strays | {index for index, is_bad in zip(pairs, bad.tolist(), strict=True) if is_bad}
 
 
-def furthest(recalls: list[Recall], sequence: Edited) -> tuple[float, float] | None:
+def furthest(recalls: list[LoopClosureRecord], sequence: Edited) -> tuple[float, float] | None:
     """The largest distance, in metres, and the largest angle, in degrees, between a frame and the place it recalled."""
     metres, degrees = [], []
     for recall in recalls:

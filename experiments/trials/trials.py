@@ -149,16 +149,18 @@ TRIALS: dict[str, Trial] = {
     "loss/elsewhere": Trial(elsewhere),
     "loss/two_parts": Trial(partial(frames, "redkitchen", (0, 250), (720, 1000))),
     "loop/closed": Trial(partial(frames, HARD_LOOP)),
-    "loop/open": Trial(partial(frames, HARD_LOOP), ("loops.enabled=false",)),
+    "loop/open": Trial(partial(frames, HARD_LOOP), ("loop_closing.enabled=false",)),
     **{f"loop/closed_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}")) for seed in SEEDS},
     **{
-        f"loop/open_{seed}": Trial(partial(frames, f"{HARD_LOOP}&seed={seed}"), ("loops.enabled=false",))
+        f"loop/open_{seed}": Trial(
+            partial(frames, f"{HARD_LOOP}&seed={seed}"), ("loop_closing.enabled=false",)
+        )
         for seed in SEEDS
     },
     "loop/storey": Trial(partial(frames, STOREY)),
     "loop/storey_3": Trial(partial(frames, f"{STOREY}&seed=3")),
     "loop/storey_8": Trial(partial(frames, f"{STOREY}&seed=8")),
-    "loop/storey_open": Trial(partial(frames, STOREY), ("loops.enabled=false",)),
+    "loop/storey_open": Trial(partial(frames, STOREY), ("loop_closing.enabled=false",)),
     "loop/corridors": Trial(partial(frames, "synthetic:corridors")),
     "loop/lookalike": Trial(lookalike),
     **{

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from torchslam.batch import Row, Task
-from torchslam.batch.run_row import TIMES
 from torchslam.batch.table import TIMES_CSV
+from torchslam.batch.task import TIMES
 from torchslam.cli.main import main
 
 SETTINGS = (
     *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
     "simulated.noise_px=0.5",  # else the search for a better camera goes on for long
-    *("initialization.min_matches=40", "initialization.min_points=30", "initialization.min_frames=0"),
+    *("initialization.min_matches=40", "initialization.min_points=30", "initialization.provisional_frames=0"),
 )
 OPTIONS = ["--no-pictures", *(part for setting in SETTINGS for part in ("--set", setting))]
 ROOM = "synthetic:room?frames=10&blank=1"

@@ -244,7 +244,7 @@ def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
     status: int,
 ) -> None:
     shutil.copytree(whole / RUNS / "one", tmp_path / RUNS / "one")
-    monkeypatch.setattr("torchslam.batch.run_row._run", lambda todo, folder: os.kill(os.getpid(), number))
+    monkeypatch.setattr("torchslam.batch.task._run", lambda todo, folder: os.kill(os.getpid(), number))
     before = signal.getsignal(number)
     with pytest.raises(SystemExit, match=str(status)):
         batch(listed, tmp_path)

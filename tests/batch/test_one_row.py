@@ -14,7 +14,7 @@ import torch
 from tests.batch.conftest import table, task
 from tests.cli.test_cli import write_tum_folder
 from torchslam.batch import Row, Task, run_row
-from torchslam.batch.result_store import ERRORS, RUNS, keep
+from torchslam.batch.result_store import ERRORS, RUNS, run_or_reuse
 from torchslam.data import read_trajectory, write_trajectory
 
 
@@ -35,7 +35,7 @@ def test_a_row_computes_on_one_thread_and_leaves_the_threads_alone(tmp_path: Pat
     torch.set_num_threads(2)
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("torchslam.batch.run_row._run", lambda todo, folder: work(folder))
+            patch.setattr("torchslam.batch.task._run", lambda todo, folder: work(folder))
             run_row(task(tmp_path).as_dict())
         assert torch.get_num_threads() == 2
     finally:
@@ -48,7 +48,7 @@ def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
         (folder / "half").write_text("written")
         raise ZeroDivisionError("float division\nby zero")
 
-    columns = keep(tmp_path, "mine", dict, bug)
+    columns = run_or_reuse(tmp_path, "mine", dict, bug)
     assert columns["status"] == "error"
     assert columns["error"].startswith("ZeroDivisionError: float division by zero (test_one_row.py:")
     assert "Traceback" in json.loads((tmp_path / ERRORS / "mine.json").read_text())["traceback"]
@@ -57,7 +57,7 @@ def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        keep(tmp_path, "mine", dict, stop)
+        run_or_reuse(tmp_path, "mine", dict, stop)
     assert list((tmp_path / RUNS).iterdir()) == []
 
 
@@ -86,7 +86,7 @@ def test_corrupt_images_are_counted(tmp_path: Path) -> None:
 def test_results_are_those_of_the_content_of_the_weights(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchslam.batch.run_row._run", lambda todo, folder: {"status": "done"})
+    monkeypatch.setattr("torchslam.batch.task._run", lambda todo, folder: {"status": "done"})
     weights = tmp_path / "a.safetensors"
     row = Row("mine", "synthetic:room", overrides=(f'{setting}="{weights}"',))
     todo = Task(row, str(tmp_path / "batch"), pictures=False)

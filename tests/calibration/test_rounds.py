@@ -9,7 +9,7 @@ import torch
 
 from tests.walks import Walk, arc, turn
 from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
-from torchslam.calibration.report import contradiction, in_words
+from torchslam.calibration.report import contradiction, describe_camera
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.geometry import Camera
@@ -30,15 +30,15 @@ def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
 
 def test_the_focal_length_is_found_from_nothing() -> None:
     unknown, config = walk(arc(22, 2.2))
-    told: list[Round] = []
-    found = calibrate(unknown, config, told=told.append)
+    rounds: list[Round] = []
+    found = calibrate(unknown, config, on_progress=rounds.append)
     assert found.is_determined
     assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
-    assert found.rounds == told
-    assert [round(float(each.camera.focal) / 320, 3) for each in told[:2]] == [0.85, 0.6]
+    assert found.rounds == rounds
+    assert [round(float(each.camera.focal) / 320, 3) for each in rounds[:2]] == [0.85, 0.6]
     assert found.refined is not None
     assert abs(float(found.camera.focal) - 200.0) < 3 * found.refined.std * 200.0
-    assert in_words(found).startswith("focal length ")
+    assert describe_camera(found).startswith("focal length ")
     assert len(unknown) == 22  # and the sequence is as it was
     assert unknown.calibrated is Calibrated.GUESSED
 
@@ -56,7 +56,7 @@ def test_a_camera_that_only_turns_stays_unknown() -> None:
     found = calibrate(unknown, config)
     assert not found.is_determined
     assert found.camera is unknown.camera or float(found.camera.focal) == float(unknown.camera.focal)
-    assert "a guess, which may be wrong by a factor of two" in in_words(found)
+    assert "a guess, which may be wrong by a factor of two" in describe_camera(found)
 
 
 def refinement(focal: float, std: float, drop: float = 0.0) -> Refinement:
@@ -106,8 +106,8 @@ def test_words_for_what_is_not_determined() -> None:
     vague = refinement(200.0, 0.12)
     found = FoundCamera(vague.camera, vague, [])
     assert not found.is_determined
-    assert "may be wrong by 24 %" in in_words(found)
-    assert "a factor of two" in in_words(replace(found, refined=refinement(200.0, 0.7)))
+    assert "may be wrong by 24 %" in describe_camera(found)
+    assert "a factor of two" in describe_camera(replace(found, refined=refinement(200.0, 0.7)))
     far = refinement(2000.0, 0.01)  # beyond the bounds
     assert not far.is_determined
     bent = CAMERA.params.new_tensor([200.0, 200.0, 160.0, 120.0, -0.2, 0.05, 0, 0, 0])
@@ -117,4 +117,4 @@ def test_words_for_what_is_not_determined() -> None:
         num_radial=1,
         k_std=(0.01,),
     )
-    assert in_words(FoundCamera(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"
+    assert describe_camera(FoundCamera(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"

@@ -36,7 +36,7 @@ def test_images_without_a_calibration(
     results = tmp_path / "results"
     assert main(["run", str(folder), "-o", str(results), *FAST]) == 0
     captured = capsys.readouterr()
-    assert "no calibration here: as with --camera auto" in captured.err
+    assert "no calibration found; estimating intrinsics" in captured.err
     assert f"{FRAMES} frames with 544 px ask for" in captured.err
     said = json.loads((results / "metrics.json").read_text())["camera"]
     assert said in captured.out

@@ -14,7 +14,7 @@ import torch
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.geometry import squared_reprojection_errors, transform
-from torchslam.map.file import read_map, read_worlds, write_worlds
+from torchslam.map.file import read_map, read_atlas, write_atlas
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
@@ -158,17 +158,17 @@ def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.Capture
 
 
 def test_other_worlds(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    saved = read_worlds(copy / "map.safetensors")
+    saved = read_atlas(copy / "map.safetensors")
     (world,) = saved.worlds
     world.number = 2
-    write_worlds(copy / "map.safetensors", [world], saved.camera)
+    write_atlas(copy / "map.safetensors", [world], saved.camera)
     assert export(copy, "ply", tmp_path / "a.ply") == 2
     assert "no world 0: there are 2" in capsys.readouterr().err
     assert export(copy, "ply", tmp_path / "a.ply", "--world", "2") == 0
     shutil.copy(copy / "trajectory.txt", copy / "trajectory_2.txt")
     (copy / "trajectory.txt").unlink()
     assert export(copy, "tum", tmp_path / "a.txt", "--world", "2") == 0
-    write_worlds(copy / "map.safetensors", [], saved.camera)
+    write_atlas(copy / "map.safetensors", [], saved.camera)
     change(copy, world=None, failure="the camera stood still")
     assert export(copy, "colmap", tmp_path / "b") == 2
     assert "there is no map: the camera stood still" in capsys.readouterr().err

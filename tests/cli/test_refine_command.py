@@ -19,7 +19,7 @@ from torchslam.data.formats.trajectory_file import write_trajectory
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.conventions import opengl, quaternion_wxyz
 from torchslam.io.export.nerfstudio import nerfstudio_camera
-from torchslam.refine.alignment import back_to_given
+from torchslam.refine.alignment import align_to_input
 from torchslam.types import Trajectory
 
 FRAMES = 8
@@ -116,7 +116,7 @@ def test_poses_come_back_as_they_came(
 
 def shape_errors(T_cw: Tensor, truth: Tensor) -> float:
     """Root mean square of the distances of the centres, after a similarity."""
-    S = back_to_given(T_cw, truth)
+    S = align_to_input(T_cw, truth)
     centres = se3_inverse(T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
     return float((centres - se3_inverse(truth)[:, :3, 3]).square().sum(-1).mean().sqrt())
 

@@ -47,7 +47,7 @@ def test_info_without_a_camera(
     assert (
         main(["run", str(tmp_path), "-o", str(tmp_path / "results")]) == 3
     )  # the images decide, and these do not
-    assert "no calibration here: as with --camera auto" in capsys.readouterr().err
+    assert "no calibration found; estimating intrinsics" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -19,7 +19,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sequence = torchslam.open_sequence("synthetic:room", resize_to="320x240", stride=2, limit=40)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 15, sequence.size)
     for index in range(len(sequence)):
-        writer.write(np.ascontiguousarray(sequence.colour(index).numpy()[..., ::-1]))
+        writer.write(np.ascontiguousarray(sequence.color(index).numpy()[..., ::-1]))
     writer.release()
     return path
 

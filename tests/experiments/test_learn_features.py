@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from experiments.learn_features.clip_noise import Changed
-from experiments.learn_features.clips import FRAMES, STEP_S, clip_from, position_error
-from experiments.learn_features.front_end import NUM_INPUTS, RADIUS, REACH, Remembering, SubPixel, patches
-from experiments.learn_features.pairs import APART_S, Pair, PairErrors, pair_errors
-from experiments.learn_features.picture import draw
-from experiments.learn_features.report import Result, bootstrap, medians, ratios
-from experiments.learn_features.room import NOISES_PX, room
-from experiments.learn_features.run import Part, spread
+from experiments.learned_weights.features.clips import FRAMES, STEP_S, clip_from, position_error
+from experiments.learned_weights.features.front_end import (
+    NUM_INPUTS,
+    RADIUS,
+    REACH,
+    Remembering,
+    SubPixel,
+    patches,
+)
+from experiments.learned_weights.features.pairs import APART_S, Pair, PairErrors, pair_errors
+from experiments.learned_weights.features.report import Result, bootstrap, medians, ratios
+from experiments.learned_weights.features.run import Part, spread
 from tests.learning.test_clip import BentEyes
 from tests.walks import T_cw, Walk, arc, still
 from torchslam import ORB, ClipSLAM, Features
@@ -126,18 +129,6 @@ def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
     assert found.direction_halves[0] < 1e-3
 
 
-def test_less_noise_on_true_matches_means_less_error() -> None:
-    walk = Walk(arc(10, length=1.0))
-    apart_frames = frames_in(APART_S, walk)
-    pairs, rows = [Pair.of(walk, 2, CPU)], [2, 2 + apart_frames]
-    seen = [PairEyes(BentEyes(walk, bend=0.0, noise_px=noise), rows) for noise in (0.5, 1.0)]
-    lines = room(*seen, pairs).splitlines()
-    rotations = [float(line.split("|")[2]) for line in lines[2:]]
-    assert len(rotations) == 4 + len(NOISES_PX)
-    assert rotations[4] < 0.01
-    assert rotations[4] < rotations[5] < rotations[-1]
-
-
 def result(rotations: list[float], inliers: float, positions: list[float]) -> Result:
     rotation = torch.tensor(rotations)
     pairs = PairErrors(rotation, 10 * rotation, rotation, rotation, torch.full_like(rotation, inliers))
@@ -157,12 +148,6 @@ def test_the_report_compares_what_both_could_pose() -> None:
     assert "ATE" not in ratios(before, {"walk": replace(after["walk"], positions=torch.zeros(0))})
 
 
-def test_the_picture_is_drawn(tmp_path: Path) -> None:
-    before, after = ({"walk": result([0.002, rotation], 100, [])} for rotation in (0.004, 0.003))
-    draw(tmp_path / "learned.png", [[1.0] * 60, [2.0] * 60], before, after)
-    assert (tmp_path / "learned.png").stat().st_size > 0
-
-
 def test_the_interval_is_that_of_a_mean() -> None:
     logs = 0.5 * torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     low, high = bootstrap([logs[:100], logs[100:]], block=1)
@@ -174,12 +159,3 @@ def test_the_interval_is_that_of_a_mean() -> None:
     assert math.log(high_runs / low_runs) / 2 == pytest.approx(
         1.96 * float(logs[:80].std()) / math.sqrt(80), rel=0.15
     )
-
-
-def test_a_changed_front_end_shakes_and_rescales() -> None:
-    images, orb = noise_images(), ORB(100)
-    plain, changed = orb(images), Changed(orb, shake=0.1, scale=1.5)(images)
-    moves = (changed.keypoints - plain.keypoints).std()
-    assert float(moves) == pytest.approx(0.1, rel=0.3)
-    assert bool((changed.scales == 1.5).all())
-    assert torch.equal(Changed(orb)(images).keypoints, plain.keypoints)

@@ -8,9 +8,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from experiments.learn_features.front_end import NUM_INPUTS, SubPixel
-from experiments.learn_features.tracks import MIN_VIEWS, VIEWS_S, Tracks, residuals
-from experiments.learn_features.training import Settings, draw, localisation_errors, moved, train
+from experiments.learned_weights.features.front_end import NUM_INPUTS, SubPixel
+from experiments.learned_weights.features.tracks import MIN_VIEWS, VIEWS_S, Tracks
+from experiments.learned_weights.features.training import (
+    Settings,
+    draw,
+    localisation_errors,
+    pose_loss,
+    train,
+)
 from tests.learning.test_clip import BentEyes
 from tests.walks import Walk, arc
 from torchslam import Features
@@ -58,7 +64,6 @@ def test_tracks_of_an_exact_front_end_meet_in_points(tracks: Tracks) -> None:
     assert tracks.frames.shape == (8, len(VIEWS_S))
     assert int(tracks.seen.any(-1).sum(-1).min()) > 50
     assert bool((tracks.seen.sum(-1)[tracks.seen.any(-1)] >= MIN_VIEWS).all())
-    assert float(residuals(tracks, tracks.keypoints).max()) < 1e-6
 
 
 def test_what_is_drawn_is_seen_where_it_is_localised(tracks: Tracks) -> None:
@@ -87,16 +92,16 @@ def test_exact_tracks_have_no_pose_error_and_disturbed_ones_a_gradient(tracks: T
     assert float(gradient.abs().max()) > 0
 
 
-def test_training_through_poses_finds_the_true_keypoints(tracks: Tracks) -> None:
+def test_training_through_poses_lowers_the_pose_errors(tracks: Tracks) -> None:
     wrong = disturbed(tracks)
     front_end = SubPixel(nn.Identity(), width=16)
-    assert torch.equal(moved(front_end, wrong), wrong.keypoints)
-    before = residuals(wrong, wrong.keypoints).median()
+    fixed = draw(wrong, Settings(problems=8), torch.Generator().manual_seed(5))
+    before = float(pose_loss(front_end, wrong, fixed).detach())
     losses = train(front_end, wrong, Settings(steps=120, problems=8, learning_rate=1e-2))
-    after = residuals(wrong, moved(front_end, wrong)).median()
+    after = float(pose_loss(front_end, wrong, fixed).detach())
     assert len(losses) == 120
     assert sum(losses[-20:]) < 0.5 * sum(losses[:20])
-    assert float(after) < 0.3 * float(before)
+    assert after < 0.5 * before
 
 
 def test_the_same_seed_learns_the_same(tracks: Tracks) -> None:

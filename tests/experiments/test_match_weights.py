@@ -1,4 +1,4 @@
-"""Match weights: training through the solver learns, and does not depend on the number of processes."""
+"""Match weights: training through the solver lowers the errors of poses."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.distributed as dist
-import torch.multiprocessing as mp
 from torch import Tensor
 
-from experiments.match_weights import weighting
-from experiments.match_weights.evaluation import (
+from experiments.learned_weights.matches import weighting
+from experiments.learned_weights.matches.evaluation import (
     FixedKernel,
     Learned,
     Oracle,
@@ -20,11 +18,10 @@ from experiments.match_weights.evaluation import (
     choose,
     median_error,
 )
-from experiments.match_weights.problems import Cues, Problems, with_ransac
-from experiments.match_weights.report import PartResult, error_table
-from experiments.match_weights.run import split
-from experiments.match_weights.training import Settings, losses, train
-from experiments.match_weights.weighting import MatchWeights, describe, propagated_variances
+from experiments.learned_weights.matches.problems import Cues, Problems, with_ransac
+from experiments.learned_weights.matches.report import PartResult, error_table
+from experiments.learned_weights.matches.training import Settings, losses, train
+from experiments.learned_weights.matches.weighting import MatchWeights, describe, propagated_variances
 from torchslam.geometry import Camera, se3_exp, transform
 
 FOCAL = 500.0
@@ -135,12 +132,6 @@ def test_the_oracle_beats_ransac(problems: Problems) -> None:
     assert median_error(Oracle(), problems) < median_error(Ransac(6.0), problems)
 
 
-def test_the_parts_of_a_split_have_no_time_in_common(problems: Problems) -> None:
-    earlier, later = split({"all": problems})
-    assert earlier["all"].spans.max() < later["all"].spans.min()
-    assert len(problems) - len(earlier["all"]) - len(later["all"]) in (1, 2, 3)
-
-
 def test_the_table_tells_the_gain_against_the_best_competitor(problems: Problems) -> None:
     def at(centimetres: float) -> Tensor:
         T = problems.T_true.clone()
@@ -163,31 +154,3 @@ def test_problems_survive_saving(problems: Problems, tmp_path: Path) -> None:
     loaded = Problems.load(tmp_path / "folder" / "problems.pt")
     assert torch.equal(loaded.points, problems.points)
     assert torch.equal(loaded.cues.distances, problems.cues.distances)
-
-
-def _train_as(rank: int, ranks: int, store: str, out: str) -> None:
-    torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=ranks)
-    network = MatchWeights(width=8)
-    history = train(network, [simulated()], Settings(steps=3, batch=8, matches=40))
-    torch.save((history, network.state_dict()), f"{out}.{rank}")
-    dist.destroy_process_group()
-
-
-@pytest.mark.slow
-def test_one_and_two_processes_give_the_same_bytes(problems: Problems, tmp_path: Path) -> None:
-    network = MatchWeights(width=8)
-    history = train(network, [problems], Settings(steps=3, batch=8, matches=40))
-    mp.start_processes(
-        _train_as, (2, str(tmp_path / "store"), str(tmp_path / "out")), nprocs=2, start_method="spawn"
-    )
-    for rank in range(2):
-        other_history, other_state = torch.load(tmp_path / f"out.{rank}", weights_only=True)
-        assert other_history == history
-        for name, value in network.state_dict().items():
-            assert torch.equal(other_state[name], value), name
-
-
-def test_shards_must_divide_among_processes(problems: Problems) -> None:
-    with pytest.raises(ValueError, match="does not divide"):
-        train(MatchWeights(width=4), [problems], Settings(steps=1, batch=7))

@@ -7,13 +7,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from experiments.trials import edits, outcome, picture
+from experiments.trials import edits, outcome
 from experiments.trials.edited import Edited, Shot, fitted, shots, strangers
 from experiments.trials.faults import FAULTS, halved
 from experiments.trials.gradient import SETTINGS, Round
@@ -25,7 +24,7 @@ from tests.sample_run import *  # noqa: F403  fixtures of a run that tracked, lo
 from tests.walks import Walk, arc
 from torchslam.data import open_sequence
 from torchslam.geometry import rigid, se3_inverse, so3_exp, transform
-from torchslam.loop_closing.loop_detector import Recall
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
 
@@ -176,9 +175,12 @@ def test_how_far_away_recalled_places_are() -> None:
     T_wc[3, :3, :3] = so3_exp(torch.tensor([0.0, math.radians(20), 0.0], dtype=torch.float64))
     walk = Walk(T_wc)
     sequence = Edited("walk", walk.camera, [*shots(walk, range(4)), *strangers(walk, [0])])
-    found = furthest([Recall(2, 0, 0, 0), Recall(3, 1, 0, 0), Recall(4, 0, 1, 0)], sequence)
+    found = furthest(
+        [LoopClosureRecord(2, 0, 0, 0), LoopClosureRecord(3, 1, 0, 0), LoopClosureRecord(4, 0, 1, 0)],
+        sequence,
+    )
     assert found == pytest.approx((0.5, 20.0))
-    assert furthest([Recall(4, 0, 1, 0)], sequence) is None
+    assert furthest([LoopClosureRecord(4, 0, 1, 0)], sequence) is None
 
 
 # --- edits ---------------------------------------------------------------------------------------------------
@@ -382,11 +384,3 @@ def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pyte
     result, _ = outcome.perform(Trial(lambda: made))
     assert (result.ate, result.misled, result.recalls, result.posed, result.possible) == (None, [], [], 0, 3)
     assert "no map was initialised" in cells("x", result, "m")[3]
-
-
-def test_the_picture_of_the_faults_is_small() -> None:
-    path = Path(picture.__file__).with_name("faults.png")
-    drawn = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert drawn is not None
-    assert len(np.unique(drawn)) == picture.GREYS
-    assert path.stat().st_size < 300_000

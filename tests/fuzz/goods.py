@@ -54,8 +54,8 @@ def images() -> dict[str, Files]:
     }
     found |= {
         "ppm": encoded(colour, ".ppm"),
-        "colour.png": encoded(colour),
-        "colour.jpg": encoded(colour, ".jpg"),
+        "color.png": encoded(colour),
+        "color.jpg": encoded(colour, ".jpg"),
     }
     found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
     return {kind: {f"a.{kind}": content} for kind, content in found.items()}
@@ -263,7 +263,7 @@ FRAME_ARGUMENTS = [
 ]
 OVERRIDES = [
     "features.num_keypoints=2000",
-    "tracking.radius_px=12.5",
+    "tracking.search_radius_px=12.5",
     "seed=7",
     'features.weights="a.safetensors"',
 ]

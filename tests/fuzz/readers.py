@@ -21,8 +21,8 @@ from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
 from torchslam.batch import Row, Task, read_list
 from torchslam.batch.result_store import RUNS
-from torchslam.batch.run_row import configuration
 from torchslam.batch.table import gather, read_times
+from torchslam.batch.task import configuration
 from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
@@ -33,14 +33,14 @@ from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
 from torchslam.io.results import read_results
 from torchslam.io.viewer.page import page
-from torchslam.map.file import read_worlds, write_worlds
+from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.posed_frames import RunGraph
 from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import Simulated
 from torchslam.system.session import Session
 
 CAMERA = "60,61,31.5,23.5"
-IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "colour.png", "colour.jpg", "16.png")
+IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "16.png")
 WEIGHTS = {"a.b": torch.zeros(3), "c": torch.ones(2, 2)}
 RECORD_OF = "0123456789abcdef"
 FRAMES = 4
@@ -152,7 +152,7 @@ def _frames(sequence: Sequence) -> Sequence:
             assert frame.image.shape[2:] == sequence.size[::-1]
             assert bool(frame.image.isfinite().all())
             assert frame.T_cw_groundtruth is None or bool(frame.T_cw_groundtruth.isfinite().all())
-            assert sequence.colour(index).shape[:2] == sequence.size[::-1]
+            assert sequence.color(index).shape[:2] == sequence.size[::-1]
         except FrameError as error:
             failure = failure or error
     if failure is not None:
@@ -192,13 +192,13 @@ def _trajectory(root: Path) -> None:
 
 
 def _map(root: Path) -> None:
-    saved = read_worlds(root / "map.safetensors")
+    saved = read_atlas(root / "map.safetensors")
     for world in saved.worlds:
         assert bool(world.trajectory().T_wc.isfinite().all())
         world.history.graph(world.map, saved.camera)
     session = Session.load(root / "map.safetensors")
-    write_worlds(root / "again", session.worlds, session.camera, session.number)
-    read_worlds(root / "again")
+    write_atlas(root / "again", session.worlds, session.camera, session.number)
+    read_atlas(root / "again")
 
 
 def _checkpoint(root: Path) -> None:

@@ -18,13 +18,13 @@ from torchslam.io.export.scene import scene_of
 from torchslam.io.report import metrics
 from torchslam.io.results import write_results
 from torchslam.system.checkpoint import write_checkpoint
-from torchslam.system.run import Progressed, run_sequence
+from torchslam.system.run import RunProgress, run_sequence
 
 CONFIG = load_config(
     None,
     [
         *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
-        *("initialization.min_matches=40", "initialization.min_points=30", "initialization.min_frames=0"),
+        *("initialization.min_matches=40", "initialization.min_points=30", "initialization.provisional_frames=0"),
     ],
 )
 WALK = Walk(arc(30)[:14])
@@ -35,10 +35,10 @@ def sample_files() -> dict[str, Files]:
     """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        slam, so_far = SLAM(WALK.camera, CONFIG), Progressed()
+        slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
 
         def settled(result: object) -> None:
-            if slam.is_settled and not (root / "checkpoint").exists():
+            if slam.can_checkpoint and not (root / "checkpoint").exists():
                 (root / "checkpoint").mkdir()
                 write_checkpoint(root / "checkpoint" / "checkpoint.safetensors", slam, so_far, WALK)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchslam.geometry import (
     Camera,
-    Noise,
+    KeypointNoise,
     fits,
     innovation_covariances,
     mahalanobis_squared,
@@ -37,11 +37,11 @@ def test_certain_points_leave_the_noise_of_the_pixels() -> None:
     torch.testing.assert_close(mahalanobis_squared(errors, S), torch.tensor([1.0, 4.0]))
 
 
-def said(kind: str, sigmas: Tensor) -> Noise:
+def said(kind: str, sigmas: Tensor) -> KeypointNoise:
     """The same noise by scale, by a number, by a matrix."""
     matrix = sigmas[..., None, None] ** -2 * torch.eye(2, dtype=sigmas.dtype)
     information = {"scale": None, "number": sigmas**-2, "matrix": matrix}[kind]
-    return Noise.of(sigmas if kind == "scale" else torch.ones_like(sigmas), information)
+    return KeypointNoise.of(sigmas if kind == "scale" else torch.ones_like(sigmas), information)
 
 
 @pytest.mark.parametrize("kind", ["scale", "number", "matrix"])
@@ -70,7 +70,11 @@ def test_noise_is_the_same_however_it_is_said(kind: str, generator: torch.Genera
     worse = noise.worse(said(kind, sigmas.flip(0)))
     torch.testing.assert_close(worse.sigmas, torch.maximum(sigmas, sigmas.flip(0)))
     back = unpacked_information(noise.information)
-    assert (back is None) if kind == "scale" else torch.equal(Noise.of(sigmas, back).weights, noise.weights)
+    assert (
+        (back is None)
+        if kind == "scale"
+        else torch.equal(KeypointNoise.of(sigmas, back).weights, noise.weights)
+    )
 
 
 def test_the_gate_keeps_95_percent_of_noise_that_has_a_direction(generator: torch.Generator) -> None:
@@ -83,7 +87,7 @@ def test_the_gate_keeps_95_percent_of_noise_that_has_a_direction(generator: torc
         ..., 0
     ]
     information = axes @ torch.diag(lengths**-2) @ axes.mT
-    noise = Noise.of(torch.ones(count, dtype=torch.float64), information)
+    noise = KeypointNoise.of(torch.ones(count, dtype=torch.float64), information)
     assert abs(float(fits(noise.squared(MARGIN * errors)).double().mean()) - 0.95) < 0.01
     torch.testing.assert_close(noise.sigmas, torch.full_like(turn, math.sqrt(3.0 * 0.3)))
     torch.testing.assert_close(noise.spread, axes @ torch.diag(lengths**2) @ axes.mT)

@@ -24,7 +24,7 @@ FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001,
 
 
 @dataclass(frozen=True)
-class Pairs:
+class MatchIndices:
     """The arguments of `estimate_similarity`, the answer (1, 4, 4), and the right pairs (1, N)."""
 
     points_1: Tensor
@@ -47,7 +47,7 @@ def make_pairs(
     baseline: float = 0.8,
     camera_1: Camera = CAMERA,
     camera_2: Camera = CAMERA,
-) -> Pairs:
+) -> MatchIndices:
     """Points seen by two cameras whose maps differ in scale, their depths uncertain by `noise` per cent."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -73,7 +73,7 @@ def make_pairs(
     pixels_1, pixels_2 = pixels_1 + noise * normal(count, 2), pixels_2 + noise * normal(count, 2)
     points_1, points_2 = (x * (1 + 0.01 * noise * normal(count, 1)) for x in (points_1, points_2))
     tensors = (points_1, points_2, pixels_1, pixels_2, S_21, ~wrong)
-    return Pairs(*(x[None] for x in tensors))
+    return MatchIndices(*(x[None] for x in tensors))
 
 
 def check(S_21: Tensor, truth: Tensor, degrees: float = 0.3, length: float = 0.03) -> None:

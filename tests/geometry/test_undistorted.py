@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchslam.geometry import Camera, Noise, Undistorted, Undistortion
+from torchslam.geometry import Camera, KeypointNoise, UndistortedKeypoints, Undistortion
 
 CAMERAS = (
     Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480)),
@@ -19,7 +19,7 @@ def pixels(count: int = 50) -> torch.Tensor:
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
 def test_the_slope_is_that_of_pixels_in_undistorted_coordinates(camera):
-    undistorted, step = Undistorted.of(pixels(), camera), 1e-6
+    undistorted, step = UndistortedKeypoints.of(pixels(), camera), 1e-6
     ones = torch.ones(50, 1, dtype=torch.float64)
     torch.testing.assert_close(camera.project(torch.cat((undistorted.xy.mT, ones), 1))[0], pixels())
     for axis in (0, 1):
@@ -42,8 +42,8 @@ def test_whitened_slopes_give_errors_in_units_of_the_noise(kind):
     scales = 1 + torch.rand(50, generator=generator, dtype=torch.float64)
     root = torch.randn(50, 2, 2, generator=generator, dtype=torch.float64)
     information = {"scale": None, "variance": scales**-1, "covariance": root @ root.mT + torch.eye(2)}[kind]
-    noise = Noise.of(scales, information)
-    undistorted, error = Undistorted.of(pixels(), camera), torch.tensor([0.01, -0.02]).double()
+    noise = KeypointNoise.of(scales, information)
+    undistorted, error = UndistortedKeypoints.of(pixels(), camera), torch.tensor([0.01, -0.02]).double()
     white = (undistorted.whitened(noise) * error[:, None, None]).sum(0)
     off_px = (undistorted.slope * error[:, None, None]).sum(0).mT
     torch.testing.assert_close(white.square().sum(0), noise.squared(off_px) * noise.margin**2)
@@ -52,7 +52,7 @@ def test_whitened_slopes_give_errors_in_units_of_the_noise(kind):
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
 def test_the_table_is_right_to_a_hundredth_of_a_pixel_or_two(camera):
     inside = torch.cat((pixels(2000), torch.tensor([[-0.5, -0.5], [639.5, 479.5], [0.0, 479.5]]).double()))
-    exact, quick = Undistorted.of(inside, camera), Undistortion(camera)(inside)
+    exact, quick = UndistortedKeypoints.of(inside, camera), Undistortion(camera)(inside)
     ones = torch.ones(len(inside), 1, dtype=torch.float64)
     back = camera.project(torch.cat((quick.xy.mT, ones), 1))[0]
     assert (back - inside).norm(dim=1).max() < (0.02 if camera.model == "fisheye" else 0.01)
@@ -64,7 +64,7 @@ def test_the_table_is_right_to_a_hundredth_of_a_pixel_or_two(camera):
 def test_beyond_the_distortion_the_table_has_its_edge():
     camera = Camera.radial_tangential(300.0, 300.0, 320.0, 240.0, -0.4, 0.0, 0.0, 0.0, size=(640, 480))
     corner = torch.tensor([[1.0, 1.0], [320.0, 240.0]]).double()
-    exact, quick = Undistorted.of(corner, camera), Undistortion(camera)(corner)
+    exact, quick = UndistortedKeypoints.of(corner, camera), Undistortion(camera)(corner)
     assert float(exact.xy[:, 0].norm()) == pytest.approx(
         0.999 * float(camera.limit)
     )  # it does not reach there

@@ -8,10 +8,10 @@ import torch
 
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
-from torchslam.io.report import doubts, metrics, quality, summary, table
-from torchslam.map.submap import World
+from torchslam.io.report import result_warnings, metrics, quality, summary, table
+from torchslam.map.submap import Submap
 from torchslam.system.run import Run
-from torchslam.types import State, Tracked, Trajectory
+from torchslam.types import PoseEstimate, State, Trajectory
 
 
 def test_counts(run: Run) -> None:
@@ -54,19 +54,21 @@ def test_quality(run: Run) -> None:
     ("keyframes", "posed", "said"), [(12, 23, True), (11, 23, False), (9, 9, False), (5, 10, True)]
 )
 def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: int, said: bool) -> None:
-    found = doubts(metrics(run) | {"keyframes": keyframes, "posed": posed})
+    found = result_warnings(metrics(run) | {"keyframes": keyframes, "posed": posed})
     assert [text.partition(":")[0] for text in found] == [
         f"{keyframes} of {posed} posed frames are keyframes"
     ] * said
 
 
-def test_counts_of_several_worlds_and_sessions(run: Run, world: World) -> None:
+def test_counts_of_several_worlds_and_sessions(run: Run, world: Submap) -> None:
     """Frames 10 to 14 uncertain in world 0; from frame 22 in world 3, which has as many frames of another session."""
-    other = World(3, world.track)
+    other = Submap(3, world.track)
     other.map.add_keyframe(replace(world.map.view(0), session=2), world.map.T_cw[0])
     for index in range(30):
         view = replace(world.map.view(0), index=index, session=int(index < 22))
-        tracked = Tracked(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
+        tracked = PoseEstimate(
+            world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
+        )
         other.history.add(view, tracked, torch.eye(4, dtype=torch.float64), 0)
     results = [
         replace(

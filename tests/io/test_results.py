@@ -13,11 +13,11 @@ from torchslam.errors import ResultsError
 from torchslam.io.pictures import draw
 from torchslam.io.report import metrics
 from torchslam.io.results import read_results, results_in, write_results
-from torchslam.loop_closing.loop_detector import Recall
-from torchslam.map.file import read_worlds
-from torchslam.map.submap import World
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.map.file import read_atlas
+from torchslam.map.submap import Submap
 from torchslam.system.run import Run
-from torchslam.types import Tracked
+from torchslam.types import PoseEstimate
 
 WALK = Walk(arc(30))
 
@@ -27,13 +27,13 @@ def write(run: Run, directory: Path) -> None:
 
 
 @pytest.fixture
-def two(run: Run, world: World) -> Run:
+def two(run: Run, world: Submap) -> Run:
     """A second world with two frames."""
-    other = World(3, world.track)
+    other = Submap(3, world.track)
     other.map.add_keyframe(replace(world.map.view(0), index=18, timestamp=100.6), world.map.T_cw[0])
     for index in (18, 19):
         view = replace(world.map.view(0), index=index, timestamp=100 + index / 30)
-        seen = Tracked(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
+        seen = PoseEstimate(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
         other.history.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
     return replace(run, worlds=(other, world))
 
@@ -62,7 +62,12 @@ def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
     """Frames 3 to 9 given in world 5, 10 to 17 in 4; those became world 0. World 7, of 22 to 24, is another one."""
     worlds = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
     results = [replace(one, world=worlds.get(one.index, one.world)) for one in run.results]
-    recalls = (Recall(30, 9, 5, 4), Recall(40, 30, 0, 0), Recall(41, 20, 4, 0), Recall(42, 2, 7, 6))
+    recalls = (
+        LoopClosureRecord(30, 9, 5, 4),
+        LoopClosureRecord(40, 30, 0, 0),
+        LoopClosureRecord(41, 20, 4, 0),
+        LoopClosureRecord(42, 2, 7, 6),
+    )
     joined = replace(run, results=results, recalls=recalls)
     assert len(joined.online) == 5
     assert [len(part) for part in joined.online_parts] == [5, 8, 7]
@@ -78,7 +83,7 @@ def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == 23
     assert len(read_trajectory(tmp_path / "trajectory_3.txt")) == 2
     assert json.loads((tmp_path / "metrics.json").read_text())["world"] == 0
-    assert [world.number for world in read_worlds(tmp_path / "map.safetensors").worlds] == [3, 0]
+    assert [world.number for world in read_atlas(tmp_path / "map.safetensors").worlds] == [3, 0]
     assert read_results(tmp_path).map.num_keyframes == 6
     write(run, tmp_path)
     assert not (tmp_path / "trajectory_3.txt").exists()
@@ -101,11 +106,11 @@ def test_pictures_say_which_world_they_show(
     assert "world" not in titles["top_view"]
 
 
-def test_a_run_that_only_localised_is_drawn(tmp_path: Path, run: Run, world: World) -> None:
+def test_a_run_that_only_localised_is_drawn(tmp_path: Path, run: Run, world: Submap) -> None:
     world.history.frames["session"][:] = 1
     localised = replace(run, session=1, sessions=1)
     write(localised, tmp_path)
-    assert read_worlds(tmp_path / "map.safetensors").sessions == 1
+    assert read_atlas(tmp_path / "map.safetensors").sessions == 1
     results = read_results(tmp_path)
     assert len(results.keyframes) == 0
     assert len(results.trajectory) == 23

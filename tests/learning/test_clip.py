@@ -17,7 +17,7 @@ from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_exp
 
 FRAMES = 10
-CONFIG = load_config(None, ["bundle.final_iterations=30"])
+CONFIG = load_config(None, ["bundle_adjustment.global_iterations=30"])
 
 
 class BentEyes(nn.Module):
@@ -80,12 +80,12 @@ def test_the_gradient_to_weights_and_camera_is_that_of_finite_differences() -> N
     eyes = BentEyes(walk, bend=0.01)
 
     def loss(falloff: Tensor | float, focal: Tensor | float) -> Tensor:
-        def weigh(features: Features) -> Tensor:
+        def keypoint_weight(features: Features) -> Tensor:
             away = features.keypoints.detach() - features.keypoints.new_tensor([159.5, 119.5])
             return torch.exp(-falloff * (away / 200).square().sum(-1))
 
         camera = Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
-        poses = ClipSLAM(eyes, weigh, CONFIG)(images, camera)
+        poses = ClipSLAM(eyes, keypoint_weight, CONFIG)(images, camera)
         return ate(poses.T_cw, truth, poses.posed)
 
     falloff = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
@@ -198,7 +198,12 @@ def test_a_clip_that_falls_apart_has_the_poses_of_its_main_world() -> None:
     walk = Walk(poses)
     images, truth = clip_of(walk)
     config = load_config(
-        None, ["relocalization.patience=1", "initialization.min_frames=2", "bundle.final=false"]
+        None,
+        [
+            "relocalization.frames_before_new_submap=1",
+            "initialization.provisional_frames=2",
+            "bundle_adjustment.global_at_end=false",
+        ],
     )
     poses_found = ClipSLAM(BentEyes(walk, bend=0.0), config=config)(images, walk.camera)
     assert poses_found.posed.tolist() == [True] * 22 + [False] * 10

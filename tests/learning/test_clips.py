@@ -24,7 +24,7 @@ from torchslam.learning.clips import (
     Batches,
     Clip,
     Clips,
-    Looking,
+    GraphCache,
     collate,
     frames_in,
     parallax,
@@ -217,12 +217,12 @@ def test_clips_are_looked_at_once_and_by_who_looked_first() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     eyes = BentEyes(walk, bend=0.01)
     clip_slam = ClipSLAM(eyes)
-    looking = Looking(clip_slam)
+    looking = GraphCache(clip_slam)
     with torch.no_grad():
         eyes.bend.fill_(0.02)
     batch = collate([Clip.of(walk, 0, FRAMES, 1, number) for number in (3, 5)])
     graphs = looking(batch)
-    before = ClipSLAM(BentEyes(walk, bend=0.01)).look(batch.images[0], walk.camera)
+    before = ClipSLAM(BentEyes(walk, bend=0.01)).build_graph(batch.images[0], walk.camera)
     for run in graphs.runs:
         assert run is not None
         assert before.runs[0] is not None

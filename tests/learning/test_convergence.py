@@ -28,7 +28,7 @@ class Seen:
         with torch.no_grad():
             features = self.clip_slam.extract(images)
         assert isinstance(features, Features)
-        self.features, self.graph = features, self.clip_slam.look(images, walk.camera)
+        self.features, self.graph = features, self.clip_slam.build_graph(images, walk.camera)
 
     def moved(self, seed: int) -> Features:
         """The features with keypoints moved at random, which require a gradient."""

@@ -29,7 +29,7 @@ def test_a_call_is_looking_and_posing(walk: Walk) -> None:
     clip_slam = ClipSLAM(eyes)
 
     def graph() -> ClipGraph:
-        found = clip_slam.look(images, walk.camera)
+        found = clip_slam.build_graph(images, walk.camera)
         assert (found.frames, found.batched) == (FRAMES, False)
         return found
 
@@ -57,7 +57,7 @@ def test_a_graph_has_no_gradient_and_no_part_in_what_is_learned(walk: Walk) -> N
     images, _ = clip_of(walk)
     focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
     camera = camera_with(focal)
-    graph = ClipSLAM(BentEyes(walk, bend=0.01)).look(images, camera)
+    graph = ClipSLAM(BentEyes(walk, bend=0.01)).build_graph(images, camera)
     (run,) = graph.runs
     assert run is not None
     columns = [getattr(run, name) for name in run.columns()]
@@ -71,7 +71,7 @@ def test_the_gradient_of_what_was_looked_at_once_is_that_of_finite_differences(w
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)
     clip_slam = ClipSLAM(eyes, config=CONFIG)
-    graph = clip_slam.look(images, walk.camera)
+    graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(bend: float, focal: Tensor | float) -> Tensor:
         with torch.no_grad():
@@ -106,7 +106,7 @@ def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
 def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
-    graphs = [clip_slam.look(images, camera_with(focal)) for focal in (400.0, 410.0)]
+    graphs = [clip_slam.build_graph(images, camera_with(focal)) for focal in (400.0, 410.0)]
     features = clip_slam.extract(torch.stack([images, images]))
     poses = clip_slam.pose(ClipGraph.stack(graphs), features)
     one = clip_slam.pose(graphs[1], clip_slam.extract(images))
@@ -123,7 +123,7 @@ def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
 def test_keypoints_that_are_gone_do_not_count(walk: Walk) -> None:
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0, noise_px=0.0))
-    graph, features = clip_slam.look(images, walk.camera), clip_slam.extract(images)
+    graph, features = clip_slam.build_graph(images, walk.camera), clip_slam.extract(images)
     assert isinstance(features, Features)
     gone = torch.zeros_like(features.mask)
     gone[:, ::4] = True
@@ -141,7 +141,7 @@ def test_what_started_no_map_has_no_pose_later() -> None:
     walk = Walk(still(4))
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
-    graph = clip_slam.look(images, walk.camera)
+    graph = clip_slam.build_graph(images, walk.camera)
     assert graph.runs == (None,)
     poses = clip_slam.pose(graph, clip_slam.extract(images))
     assert graph.reasons == poses.reason
@@ -156,10 +156,10 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     eyes, idle = BentEyes(walk, bend=0.0), BentEyes(Walk(still(FRAMES)), bend=0.0)
     bent = Camera.radial_tangential(401.0, 402.0, 159.5, 119.5, 1e-3, 0.0, 0.0, 0.0, size=(320, 240))
     looked = [
-        ClipSLAM(front_end).look(images, camera)
+        ClipSLAM(front_end).build_graph(images, camera)
         for front_end, camera in ((eyes, walk.camera), (idle, walk.camera), (eyes, bent), (eyes, walk.camera))
     ]
-    clip_slam = ClipSLAM(eyes, weigh=lambda features: features.scores)
+    clip_slam = ClipSLAM(eyes, keypoint_weight=lambda features: features.scores)
     seen = eyes(images)
     keypoints, scores = seen.keypoints.clone().requires_grad_(), torch.ones_like(seen.scores).requires_grad_()
     good = replace(seen, keypoints=keypoints, scores=scores)

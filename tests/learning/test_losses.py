@@ -278,7 +278,7 @@ def test_a_clip_can_be_judged_by_its_own_observations() -> None:
     images, _ = clip_of(walk)
     eyes = BentEyes(walk, bend=0.02, noise_px=0.1)
     clip_slam = ClipSLAM(eyes)
-    graph = clip_slam.look(images, walk.camera)
+    graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(bend: float) -> Tensor:
         with torch.no_grad():

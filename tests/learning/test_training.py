@@ -150,7 +150,7 @@ def test_the_example_goes_on_to_the_same_bytes(clips: Clips, tmp_path: Path) -> 
     resumed = train(clips, 4, tmp_path / "part.pt", batch=2, save_every=2)
     assert resumed.losses == whole.losses
     assert (tmp_path / "part.pt").read_bytes() == (tmp_path / "whole.pt").read_bytes()
-    assert any((parameter != 0).any() for parameter in whole.module.weigh.last.parameters())
+    assert any((parameter != 0).any() for parameter in whole.module.keypoint_weight.last.parameters())
 
 
 def _train_as(rank: int, ranks: int, store: str, clips: Clips, folder: Path) -> None:

@@ -12,7 +12,7 @@ from tests.map.simulated import tracked_at
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import Config
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.tracking.tracker import Tracker
 
 KEYFRAMES = 30
@@ -38,10 +38,10 @@ def around(count: int = KEYFRAMES) -> Tensor:
     return se3_inverse(rigid(R_wc, R_wc @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)))
 
 
-def ring_world(scale: float = 1.0, twist: float = 0.0) -> World:
+def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
     """Once around in the frame of the first camera; per keyframe the unit shrinks by `scale` and the way bends."""
     scene, T_cw = ring(), around()
-    world = World.empty(0, CAMERA.params)
+    world = Submap.empty(0, CAMERA.params)
     rows: dict[tuple[int, bool], int] = {}
     early: set[int] = set()
     for keyframe, true in enumerate(T_cw):

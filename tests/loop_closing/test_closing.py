@@ -12,11 +12,11 @@ from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, sim3_inverse
 from torchslam.geometry.alignment import umeyama
 from torchslam.loop_closing.closing import close_loop, corrected, join, other_visits, sew, sew_on, weld
-from torchslam.loop_closing.loop_closer import Memory
-from torchslam.loop_closing.loop_detector import Recognition
-from torchslam.loop_closing.relative_sim3 import Relation, relate
-from torchslam.map.atlas import Worlds
-from torchslam.map.submap import World
+from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.loop_closing.loop_detector import LoopCandidate
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, relate
+from torchslam.map.atlas import Atlas
+from torchslam.map.submap import Submap
 from torchslam.tracking.tracker import Tracker
 
 CONFIG = Config()
@@ -25,17 +25,17 @@ ROWS = rows_of(SCENE)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
-def error(world: World) -> float:
+def error(world: Submap) -> float:
     """The root mean square error of the keyframes, aligned to the truth."""
     estimate, truth = centre(world.map.T_cw), centre(around())
     scale, R, t = umeyama(estimate, truth)
     return float((scale * estimate @ R.mT + t - truth).square().sum(-1).mean().sqrt())
 
 
-def loop(world: World) -> Recognition:
+def loop(world: Submap) -> LoopCandidate:
     relation = relate(world.map, END, world.map, 0, CAMERA, CONFIG)
     assert relation is not None
-    return Recognition(world, END, world, 0, relation)
+    return LoopCandidate(world, END, world, 0, relation)
 
 
 def test_a_way_that_drifted_comes_back() -> None:
@@ -79,7 +79,7 @@ def test_without_a_drift_nothing_moves() -> None:
 
 
 def test_the_final_adjustment_can_be_left_out() -> None:
-    for override in ("loops.adjust=false", "bundle.enabled=false"):
+    for override in ("loop_closing.global_bundle_adjustment=false", "bundle_adjustment.local=false"):
         world = ring_world(scale=1.01, twist=0.002)
         found = loop(world)
         T_cw = corrected(found)
@@ -95,9 +95,9 @@ def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
     older = world_in(SCENE, sideways(4), number=0)
     younger = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
     if asks == "younger":
-        found = Recognition(younger, 3, older, 2, Relation(sim3_inverse(S_21), 0, 0, 0))
+        found = LoopCandidate(younger, 3, older, 2, RelativeSim3(sim3_inverse(S_21), 0, 0, 0))
     else:
-        found = Recognition(older, 3, younger, 2, Relation(S_21, 0, 0, 0))
+        found = LoopCandidate(older, 3, younger, 2, RelativeSim3(S_21, 0, 0, 0))
     camera = younger if asks == "younger" else older
     last = moved(camera.T_cw, sim3_inverse(S_21)) if asks == "younger" else camera.T_cw.clone()
     world, keyframe = join(found, CAMERA, CONFIG)
@@ -108,7 +108,7 @@ def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
     torch.testing.assert_close(world.map.T_cw, torch.cat([sideways(4), OTHER]), atol=1e-5, rtol=0)
     torch.testing.assert_close(world.T_cw, last, atol=1e-5, rtol=0)
     torch.testing.assert_close(world.history.T_cw(world.map), world.map.T_cw, atol=1e-5, rtol=0)
-    once = {tuple(row) for row in world.map.points["descriptors"][world.map.living_points()].tolist()}
+    once = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
     assert len(once) == world.map.num_points  # every point of the scene is there once
     shared = world.map.observers(world.map.points_seen_by(torch.tensor([1])))
     assert int(shared[6]) > 100
@@ -120,7 +120,7 @@ def test_welding_merges_around_both_places(S_21: Tensor) -> None:
     count = world.map.num_points
     weld(world, 5, 1, CAMERA, CONFIG)
     assert world.map.num_points < 0.6 * count
-    looks = {tuple(row) for row in world.map.points["descriptors"][world.map.living_points()].tolist()}
+    looks = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
     assert len(looks) == world.map.num_points
 
 
@@ -129,7 +129,7 @@ def test_welding_merges_around_both_places(S_21: Tensor) -> None:
 VISIT = 4  # keyframes
 
 
-def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> World:
+def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     """A place seen by four keyframes, then something else, then by four others: of its points `tied` are tied."""
     world = world_in(SCENE, sideways(VISIT))
     if between:
@@ -174,8 +174,8 @@ def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> No
     assert after > 2 * before
     assert int(world.map.observers(seen)[early].min()) > 0.8 * after
     # the track looks for what is alive
-    assert bool(world.map.points["alive"][world.track.local_points].all())
-    assert bool(world.map.points["alive"][world.track.seen_last].all())
+    assert bool(world.map.points["is_valid"][world.track.local_points].all())
+    assert bool(world.map.points["is_valid"][world.track.seen_last].all())
     assert bool(torch.isin(seen, world.track.local_points).all())
 
 
@@ -202,11 +202,14 @@ def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
 def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) -> None:
     """The two sides lie 4 px apart: at first only coarse keypoints are near enough, adjusted all are."""
     counts = []
-    for override in ("loops.adjust=false", "loops.adjust=true"):
+    for override in (
+        "loop_closing.global_bundle_adjustment=false",
+        "loop_closing.global_bundle_adjustment=true",
+    ):
         world = world_in(SCENE, sideways(4))
         world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
         weld(world, 5, 1, CAMERA, load_config(None, [override]))
-        looks = {tuple(row) for row in world.map.points["descriptors"][world.map.living_points()].tolist()}
+        looks = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
         counts.append((world.map.num_points, len(looks)))
     (loose, _), (tied, different) = counts
     assert loose > 1.2 * different
@@ -215,9 +218,11 @@ def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) ->
 
 def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
     for enabled in (True, False):
-        world, worlds = two_visits(S_21), Worlds(CAMERA.params)
+        world, worlds = two_visits(S_21), Atlas(CAMERA.params)
         worlds._worlds = [world]
-        memory = Memory(CAMERA, load_config(None, [f"loops.enabled={str(enabled).lower()}"]), worlds)
+        memory = LoopCloser(
+            CAMERA, load_config(None, [f"loop_closing.enabled={str(enabled).lower()}"]), worlds
+        )
         last = world.map.num_keyframes - 1
         points = world.map.num_points
         assert memory.recognize(world, last) is None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchslam.data import open_sequence
 from torchslam.features import ORB, hamming, pack_bits, unpack_bits
-from torchslam.loop_closing import Places
+from torchslam.loop_closing import KeyframeDatabase
 from torchslam.loop_closing.global_descriptor import binary, likeness, rendered_words, words_and_codes
 
 
@@ -29,14 +29,14 @@ def blurred(descriptors: Tensor, share: float, seed: int = 0) -> Tensor:
     return descriptors ^ pack_bits(turned)
 
 
-def places_of(*keys: int) -> Places:
-    places = Places()
+def places_of(*keys: int) -> KeyframeDatabase:
+    places = KeyframeDatabase()
     for key in keys:
         places.add(key, *image(key))
     return places
 
 
-def answer_alike(left: Places, right: Places) -> bool:
+def answer_alike(left: KeyframeDatabase, right: KeyframeDatabase) -> bool:
     """Whether both know the same keyframes by the same words and codes."""
     answers = [[places.query(*image(key)) for key in range(5)] for places in (left, right)]
     return all(
@@ -101,7 +101,7 @@ def test_floats_become_bits_that_keep_their_angles(generator: torch.Generator) -
 def test_known_scores() -> None:
     # One word each: rare ones, of one image in two, weigh log(3)^2, the common one log(3 / 2)^2.
     words = noise(3, 32)
-    places = Places(words)
+    places = KeyframeDatabase(words)
     places.add(4, words[[0, 1]], torch.ones(2, dtype=torch.bool))
     places.add(2, words[[0, 2]], torch.ones(2, dtype=torch.bool))
     keys, scores = places.query(words[[0, 1]], torch.ones(2, dtype=torch.bool))
@@ -120,7 +120,7 @@ def test_an_image_is_like_itself_and_unlike_noise() -> None:
 def test_a_masked_row_does_not_count() -> None:
     descriptors, mask = image(1)
     mask[20:] = False
-    first, second = Places(), Places()
+    first, second = KeyframeDatabase(), KeyframeDatabase()
     first.add(0, descriptors, mask)
     second.add(0, descriptors[:20], mask[:20])
     descriptors[20:] = 0
@@ -130,17 +130,17 @@ def test_a_masked_row_does_not_count() -> None:
 
 def test_only_the_strongest_count() -> None:
     descriptors, mask = image(0, 700)
-    first, second = Places(), Places()
+    first, second = KeyframeDatabase(), KeyframeDatabase()
     first.add(0, descriptors, mask)
     second.add(0, descriptors[:400], mask[:400])
     assert answer_alike(first, second)
-    third = Places()
+    third = KeyframeDatabase()
     third.add(0, descriptors[:399], mask[:399])
     assert not answer_alike(first, third)
 
 
 def test_more_keyframes_than_the_first_room_and_equal_scores_by_key() -> None:
-    places = Places()
+    places = KeyframeDatabase()
     for key in reversed(range(200)):
         places.add(key, *image(key % 100))
     keys, scores = places.query(*image(42))
@@ -152,7 +152,7 @@ def test_more_keyframes_than_the_first_room_and_equal_scores_by_key() -> None:
 
 def test_nothing_to_ask_and_nothing_to_remember() -> None:
     nothing = torch.zeros(0, 32, dtype=torch.uint8), torch.zeros(0, dtype=torch.bool)
-    keys, scores = Places().query(*image(0))
+    keys, scores = KeyframeDatabase().query(*image(0))
     assert len(keys) == len(scores) == 0
     places = places_of(1)
     places.add(2, *nothing)
@@ -188,7 +188,7 @@ def test_a_key_must_be_new(key: int) -> None:
 def test_floats_choose_their_words_and_keep_them(generator: torch.Generator) -> None:
     floats = torch.nn.functional.normalize(torch.randn(6, 100, 64, generator=generator), dim=-1)
     mask = torch.ones(100, dtype=torch.bool)
-    places = Places()
+    places = KeyframeDatabase()
     places.add(0, floats[0, :63], mask[:63])  # too few to name the words
     assert places.query(floats[0], mask)[1].tolist() == [0.0]
     for key in range(1, 6):
@@ -204,7 +204,7 @@ def test_floats_choose_their_words_and_keep_them(generator: torch.Generator) -> 
 
 
 def test_on_any_device(device: torch.device) -> None:
-    places, expected = Places(), places_of(0, 1, 2)
+    places, expected = KeyframeDatabase(), places_of(0, 1, 2)
     for key in range(3):
         descriptors, mask = image(key)
         places.add(key, descriptors.to(device), mask.to(device))
@@ -222,7 +222,7 @@ def test_on_any_device(device: torch.device) -> None:
 
 def test_the_true_place_wins_among_rendered_ones() -> None:
     # Frames 160 on pass the places of the first round again, on another sway.
-    orb, places = ORB(500), Places()
+    orb, places = ORB(500), KeyframeDatabase()
     sequence = open_sequence("synthetic:room?frames=320")
     for index in range(0, 160, 3):
         features = orb(sequence[index].image)
@@ -238,7 +238,7 @@ def test_the_true_place_wins_among_rendered_ones() -> None:
 
 @pytest.mark.parametrize("floats", [False, True])
 def test_a_keyframe_that_is_there_asks_as_its_image_does(floats: bool) -> None:
-    places = Places()
+    places = KeyframeDatabase()
     for key in range(4):
         descriptors, mask = image(key % 3, count=100)
         if floats:

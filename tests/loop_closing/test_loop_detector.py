@@ -11,37 +11,37 @@ from torch import Tensor
 
 from tests.loop_closing.ring import END, KEYFRAMES, ring_world
 from tests.scene import CAMERA, Scene, centre, pose, sideways, world_in
-from torchslam.config import Config, LoopsConfig, load_config
+from torchslam.config import Config, LoopClosingConfig, load_config
 from torchslam.geometry import sim3_inverse
-from torchslam.loop_closing.keyframe_database import Places
+from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import (
-    Recall,
-    Recognition,
-    Recognizer,
+    LoopCandidate,
+    LoopClosureRecord,
+    LoopDetector,
     agree,
     may_have_drifted,
     two_steps_around,
 )
-from torchslam.loop_closing.relative_sim3 import Relation, rescaling
-from torchslam.map.atlas import Worlds
-from torchslam.map.submap import World
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, rescaling
+from torchslam.map.atlas import Atlas
+from torchslam.map.submap import Submap
 
 SCENE = Scene.of(300)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
-def recognizer(*held: World, overrides: tuple[str, ...] = ()) -> Recognizer:
+def recognizer(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetector:
     """One that knows all keyframes of these worlds."""
-    worlds, places = Worlds(CAMERA.params), Places()
+    worlds, places = Atlas(CAMERA.params), KeyframeDatabase()
     worlds._worlds = list(held)
     for world in held:
         for keyframe in range(world.map.num_keyframes):
             view = world.map.view(keyframe)
             places.add(world.map.key(keyframe), view.descriptors, view.mask)
-    return Recognizer(CAMERA, load_config(None, overrides), worlds, places)
+    return LoopDetector(CAMERA, load_config(None, overrides), worlds, places)
 
 
-def two_worlds(S_21: Tensor) -> tuple[World, World]:
+def two_worlds(S_21: Tensor) -> tuple[Submap, Submap]:
     return world_in(SCENE, sideways(4)), world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
 
 
@@ -55,7 +55,7 @@ def test_another_world_of_the_same_place_is_recognised(S_21: Tensor) -> None:
     assert (found.world, found.keyframe, found.other) == (other, 3, one)
     assert not found.is_loop
     torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
-    assert found.recall == Recall(frame=103, place=found.place, world=1, other=0)
+    assert found.recall == LoopClosureRecord(frame=103, place=found.place, world=1, other=0)
 
 
 def test_a_loop_that_drifted_is_recognised() -> None:
@@ -79,7 +79,7 @@ def test_a_place_that_looks_alike_elsewhere_is_no_loop() -> None:
     world = world_in(SCENE, sideways(4))
     world.absorb(world_in(SCENE, OTHER, first=50), pose(0, 0, 100.0))
     assert recognizer(world).recognize(world, 7) is None
-    found = recognizer(world, overrides=("loops.max_drift=1.1",)).recognize(world, 7)
+    found = recognizer(world, overrides=("loop_closing.max_drift=1.1",)).recognize(world, 7)
     assert found is not None
     torch.testing.assert_close(found.relation.S_21, pose(0, 0, -100.0), atol=1e-5, rtol=0)
 
@@ -88,12 +88,15 @@ def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
     one, other = two_worlds(S_21)
     other.map.keyframes["keypoints"][:3] += 40.0  # these see nothing where it should be
     assert recognizer(one, other).recognize(other, 3) is None
-    alone = recognizer(one, other, overrides=("loops.min_confirming=0",))
+    alone = recognizer(one, other, overrides=("loop_closing.min_confirming_keyframes=0",))
     assert alone.recognize(other, 3) is not None
     one, other = two_worlds(S_21)
     other.map.keyframes["keypoints"][:1] += 40.0
     assert recognizer(one, other).recognize(other, 3) is not None
-    assert recognizer(one, other, overrides=("loops.min_confirming=3",)).recognize(other, 3) is None
+    assert (
+        recognizer(one, other, overrides=("loop_closing.min_confirming_keyframes=3",)).recognize(other, 3)
+        is None
+    )
 
 
 def test_what_two_steps_reach() -> None:
@@ -111,16 +114,18 @@ def test_what_two_steps_reach() -> None:
 # --- how far a way may drift --------------------------------------------------------------------------------------
 
 
-def way() -> World:
+def way() -> Submap:
     """Eleven keyframes, a metre apart, of which the first and the last are compared: ten metres."""
     return world_in(Scene.of(50), sideways(11, step=1.0))
 
 
 def drifts(
-    S_21: Tensor, world: World | None = None, keyframe: int = 10, place: int = 0, **settings: float
+    S_21: Tensor, world: Submap | None = None, keyframe: int = 10, place: int = 0, **settings: float
 ) -> bool:
-    relation = Relation(S_21, 0, 0, 0)
-    return may_have_drifted(world or way(), keyframe, place, relation, replace(LoopsConfig(), **settings))
+    relation = RelativeSim3(S_21, 0, 0, 0)
+    return may_have_drifted(
+        world or way(), keyframe, place, relation, replace(LoopClosingConfig(), **settings)
+    )
 
 
 def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
@@ -170,8 +175,8 @@ def test_a_drift_of_scale_is_bounded(scale: float, may: bool) -> None:
 def answers(S_1: Tensor, S_2: Tensor, same: bool = True) -> bool:
     one, other = world_in(SCENE, sideways(4)), world_in(SCENE, sideways(4), number=1)
     third = other if same else world_in(SCENE, sideways(4), number=2)
-    first = Recognition(one, 2, other, 1, Relation(S_1, 0, 0, 0))
-    return agree(first, Recognition(one, 2, third, 1, Relation(S_2, 0, 0, 0)))
+    first = LoopCandidate(one, 2, other, 1, RelativeSim3(S_1, 0, 0, 0))
+    return agree(first, LoopCandidate(one, 2, third, 1, RelativeSim3(S_2, 0, 0, 0)))
 
 
 def about(S: Tensor) -> Tensor:
@@ -211,5 +216,5 @@ def test_two_places_that_both_might_be_it_are_none(S_21: Tensor) -> None:
     twin.absorb(world_in(SCENE, sideways(4), first=50), pose(100.0))
     one = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
     assert recognizer(twin, one).recognize(one, 3) is None
-    assert recognizer(twin, one, overrides=("loops.candidates=1",)).recognize(one, 3) is not None
-    assert Config().loops.candidates == 3
+    assert recognizer(twin, one, overrides=("loop_closing.max_candidates=1",)).recognize(one, 3) is not None
+    assert Config().loop_closing.max_candidates == 3

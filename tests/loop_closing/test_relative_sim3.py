@@ -13,7 +13,7 @@ from torchslam.config import Config, load_config
 from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, transform
 from torchslam.geometry.similarity import Similarity
 from torchslam.loop_closing.relative_sim3 import (
-    Relation,
+    RelativeSim3,
     agreeing,
     confirms,
     find,
@@ -37,7 +37,7 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
     return one.map, other.map
 
 
-def related(map_1: Map, map_2: Map, *overrides: str) -> Relation | None:
+def related(map_1: Map, map_2: Map, *overrides: str) -> RelativeSim3 | None:
     return relate(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
 
 
@@ -109,8 +109,8 @@ def test_points_that_look_alike_but_lie_elsewhere_are_not_related(S_21: Tensor) 
 
 def thinned(slam_map: Map, points: Tensor) -> Map:
     """Only these points are left."""
-    living = slam_map.living_points()
-    slam_map.kill(living[~torch.isin(living, points)])
+    living = slam_map.valid_points()
+    slam_map.invalidate(living[~torch.isin(living, points)])
     return slam_map
 
 
@@ -129,7 +129,7 @@ def test_enough_points_of_the_other_map_must_be_seen(S_21: Tensor) -> None:
         assert relation is None or relation.forward == 40
         map_1, map_2 = maps(S_21)
         thinned(map_2, in_both(map_1, map_2)[:count])
-        assert related(map_1, map_2, f"loops.min_matches={count}") is not None
+        assert related(map_1, map_2, f"loop_closing.min_matches={count}") is not None
 
 
 def test_enough_of_them_must_be_known_to_the_own_map(S_21: Tensor) -> None:
@@ -145,8 +145,8 @@ def test_half_as_many_must_be_seen_the_other_way(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     both = in_both(map_1, map_2)[:30]
     thinned(map_1, both)
-    assert related(map_1, map_2, "loops.min_matches=60") is not None
-    assert related(map_1, map_2, "loops.min_matches=62") is None
+    assert related(map_1, map_2, "loop_closing.min_matches=60") is not None
+    assert related(map_1, map_2, "loop_closing.min_matches=62") is None
 
 
 def test_the_unit_is_that_of_most_depths(S_21: Tensor) -> None:
@@ -164,14 +164,14 @@ def test_the_unit_is_that_of_most_depths(S_21: Tensor) -> None:
 def test_a_keyframe_confirms_what_it_sees_where_it_should_be(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
-    right = Relation(S_21, 0, 0, 0)
+    right = RelativeSim3(S_21, 0, 0, 0)
     assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
     for wrong in (
         pose(0.5) @ S_21,
         pose(0, 0, 0, 0, 0.1) @ S_21,
         rescaling(torch.tensor(1.3).double()) @ S_21,
     ):
-        assert not confirms(Relation(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
+        assert not confirms(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:20])
     assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:19])
@@ -184,8 +184,8 @@ def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees
     T_12 = moved(ONE[2], S_21)
     keypoints, scales = map_1.keyframes["keypoints"], map_1.keyframes["scales"]
     keypoints[2, :, 0] += offset * scales[2]
-    ids, _ = find(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
-    good, at = agreeing(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
+    ids, _ = find(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+    good, at = agreeing(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
     assert len(ids) > 100
     assert (len(good) > 100) is agrees
     assert len(good) > 100 or len(good) < 0.1 * len(ids)  # a stray one is near another's place
@@ -198,7 +198,7 @@ def test_points_are_looked_for_eight_pixels_around(S_21: Tensor) -> None:
         map_1, map_2 = maps(S_21)
         map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
         T_12 = moved(ONE[2], S_21)
-        ids, _ = find(map_2, map_2.living_points(), T_12, map_1, 2, CAMERA, Config())
+        ids, _ = find(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
         assert (len(ids) > 100) is found
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
-from torchslam.types import Tracked, View
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
+from torchslam.types import FrameFeatures, PoseEstimate
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 EVERY = 3  # frames from keyframe to keyframe
@@ -20,11 +20,13 @@ def path(frames: int) -> Tensor:
     return se3_exp(s * torch.tensor([[-0.4, 0.05, 0.1, 0.02, -0.1, 0.03]], dtype=torch.float64))
 
 
-def view_of(index: int, T_cw: Tensor, points_w: Tensor, generator: torch.Generator, session: int = 0) -> View:
+def view_of(
+    index: int, T_cw: Tensor, points_w: Tensor, generator: torch.Generator, session: int = 0
+) -> FrameFeatures:
     """A view that sees point i at keypoint i, with half a pixel of noise, at scales of 1 to 3 px."""
     pixels, _ = CAMERA.project(transform(T_cw, points_w))
     count = len(points_w)
-    return View(
+    return FrameFeatures(
         index=index,
         timestamp=10.0 * session + 0.1 * index,
         keypoints=pixels + 0.5 * torch.randn(count, 2, generator=generator, dtype=torch.float64),
@@ -43,7 +45,7 @@ def tracked_at(
     *,
     matches: int | None = None,
     **values: float | Tensor,
-) -> Tracked:
+) -> PoseEstimate:
     """A frame tracked at T_cw (4, 4), all of its matches inliers, without a doubt; `values` say otherwise."""
     certain: dict[str, float | Tensor] = {
         "covariance": 1e-6 * torch.eye(6, dtype=T_cw.dtype),
@@ -52,7 +54,7 @@ def tracked_at(
         "coverage": 1.0,
     }
     count = len(point_ids) if matches is None else matches
-    return Tracked(T_cw, point_ids, keypoints, count, **(certain | values))  # type: ignore[arg-type]
+    return PoseEstimate(T_cw, point_ids, keypoints, count, **(certain | values))  # type: ignore[arg-type]
 
 
 def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
@@ -63,13 +65,13 @@ def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
 
 def simulated_world(
     seed: int = 0, frames: int = 14, points: int = 40, number: int = 0, session: int = 0
-) -> World:
+) -> Submap:
     """Every third frame is a keyframe and sees most of the points; the frames between refer to the one before."""
     generator = torch.Generator().manual_seed(seed)
     cloud_w = torch.rand(points, 3, generator=generator, dtype=torch.float64) * 2 - 1
     cloud_w[:, 2] += 4.0
     T_cw = path(frames)
-    world = World.empty(number, CAMERA.params.double())
+    world = Submap.empty(number, CAMERA.params.double())
     slam_map = world.map
     ids = torch.full((points,), -1)
     for index in range(frames):
@@ -89,7 +91,7 @@ def simulated_world(
     slam_map.refresh(everyone)
     slam_map.keyframes["covariances"][:] = spreads(len(everyone), 6, generator)
     last = int(everyone[-1])
-    world.track = Track(
+    world.track = TrackingState(
         T_cr=T_cw[-1] @ se3_inverse(slam_map.T_cw[last]),
         reference=last,
         reference_size=10,
@@ -101,7 +103,7 @@ def simulated_world(
     return world
 
 
-def reprojection_errors(world: World) -> Tensor:
+def reprojection_errors(world: Submap) -> Tensor:
     """(O, 2) pixels, keyframe by keyframe, of all observations by the map."""
     seen = world.map.observations()
     points_c = transform(

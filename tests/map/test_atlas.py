@@ -7,14 +7,14 @@ import torch
 from tests.map.simulated import simulated_world
 from tests.scene import CAMERA, Scene, pose, sideways, world_in
 from torchslam.geometry import se3_inverse
-from torchslam.map.atlas import Worlds
-from torchslam.map.compaction import Renumbering, stand_in
+from torchslam.map.atlas import Atlas
+from torchslam.map.compaction import RowRemap, stand_in
 from torchslam.map.map import Map
-from torchslam.map.tracking_state import Track
+from torchslam.map.tracking_state import TrackingState
 
 
 def test_worlds_are_numbered_as_they_begin_and_numbers_are_not_used_again() -> None:
-    worlds = Worlds(CAMERA.params)
+    worlds = Atlas(CAMERA.params)
     assert worlds.main() is None
     begun = [worlds.begin() for _ in range(3)]
     assert [world.number for world in begun] == [0, 1, 2]
@@ -29,7 +29,7 @@ def test_worlds_are_numbered_as_they_begin_and_numbers_are_not_used_again() -> N
 
 def test_the_main_world_is_that_of_most_frames() -> None:
     held = [simulated_world(frames=frames, number=number) for number, frames in enumerate((9, 12, 12))]
-    worlds = Worlds(CAMERA.params)
+    worlds = Atlas(CAMERA.params)
     worlds._worlds = held
     assert worlds.main() is held[1]
     worlds.forget(held[1])
@@ -39,7 +39,7 @@ def test_the_main_world_is_that_of_most_frames() -> None:
 def test_a_keyframe_is_found_by_its_name_in_whichever_world_it_is() -> None:
     scene = Scene.of(30)
     held = [world_in(scene, sideways(3), first=first) for first in (0, 40)]
-    worlds = Worlds(CAMERA.params)
+    worlds = Atlas(CAMERA.params)
     empty = worlds.begin()
     worlds._worlds += held
     for world in held:
@@ -62,7 +62,7 @@ def test_a_second_camera_has_a_track_of_its_own() -> None:
     assert aside.map is world.map
     assert aside.history is world.history
     torch.testing.assert_close(world.T_cw, before)
-    aside.track = Track.nowhere(before)
+    aside.track = TrackingState.nowhere(before)
     torch.testing.assert_close(world.T_cw, before)
 
 
@@ -95,8 +95,8 @@ def test_of_many_only_those_that_share_most_stand_in() -> None:
 
 
 def test_two_renumberings_one_after_the_other() -> None:
-    one = Renumbering(torch.tensor([0, -1, 1]), torch.tensor([1, -1, 0, 2]), torch.tensor([0, 1, 1]))
-    two = Renumbering(torch.tensor([-1, 0]), torch.tensor([2, -1, 0]), torch.tensor([0, 0]))
+    one = RowRemap(torch.tensor([0, -1, 1]), torch.tensor([1, -1, 0, 2]), torch.tensor([0, 1, 1]))
+    two = RowRemap(torch.tensor([-1, 0]), torch.tensor([2, -1, 0]), torch.tensor([0, 0]))
     both = one.then(two)
     assert both.keyframes.tolist() == [-1, -1, 0]
     assert both.points.tolist() == [-1, -1, 2, 0]

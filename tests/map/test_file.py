@@ -7,53 +7,54 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map.file import read_map, read_worlds, write_worlds
+from torchslam.map.file import read_atlas, read_map, write_atlas
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.types import Tracked, View
+from torchslam.map.submap import Submap
+from torchslam.types import FrameFeatures, PoseEstimate
 from torchslam.utils.atomic_write import PART, write_whole
 
 
 @pytest.fixture
-def world(slam_map: Map) -> World:
+def world(slam_map: Map) -> Submap:
     """The small run's map, with a few frames between its keyframes, in two sessions."""
-    made = World.empty(0, slam_map.T_cw)
+    made = Submap.empty(0, slam_map.T_cw)
     made.map = slam_map
     for index, session in ((1, 0), (2, 0), (1, 1)):
         view = slam_map.view(0)
-        view = View(**{**view.__dict__, "index": index, "timestamp": 100.0 + index, "session": session})
+        view = FrameFeatures(
+            **{**view.__dict__, "index": index, "timestamp": 100.0 + index, "session": session}
+        )
         ids = torch.arange(4 + index)
-        seen = Tracked(slam_map.T_cw[0], ids, ids, 20, torch.eye(6, dtype=torch.float64), 1.0)
+        seen = PoseEstimate(slam_map.T_cw[0], ids, ids, 20, torch.eye(6, dtype=torch.float64), 1.0)
         made.history.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
     return made
 
 
 @pytest.fixture
-def worlds(world: World) -> list[World]:
+def worlds(world: Submap) -> list[Submap]:
     """Number 0 with something in it, number 2 without."""
-    return [world, World.empty(2, world.map.T_cw)]
+    return [world, Submap.empty(2, world.map.T_cw)]
 
 
 @pytest.fixture
-def path(tmp_path: Path, worlds: list[World], camera: Camera) -> Path:
-    write_worlds(tmp_path / "map.safetensors", worlds, camera, sessions=2)
+def path(tmp_path: Path, worlds: list[Submap], camera: Camera) -> Path:
+    write_atlas(tmp_path / "map.safetensors", worlds, camera, sessions=2)
     return tmp_path / "map.safetensors"
 
 
-def tables(world: World) -> list[dict[str, Tensor]]:
+def tables(world: Submap) -> list[dict[str, Tensor]]:
     history = world.history
     kept = (world.map.points, world.map.keyframes, history.frames, history.observations)
     return [table.columns() for table in kept]
 
 
-def test_worlds_and_camera_come_back_as_they_were(path: Path, worlds: list[World], camera: Camera) -> None:
-    saved = read_worlds(path)
+def test_worlds_and_camera_come_back_as_they_were(path: Path, worlds: list[Submap], camera: Camera) -> None:
+    saved = read_atlas(path)
     assert [world.number for world in saved.worlds] == [0, 2]
     assert saved.worlds.begun == 3
     assert saved.worlds.begin().number == 3
@@ -78,61 +79,33 @@ def test_a_loaded_map_can_grow(path: Path) -> None:
     assert loaded.num_points == before + 2
 
 
-def test_a_file_from_before_there_were_colours_is_read(path: Path, worlds: list[World]) -> None:
-    tensors = load_file(path)
-    with safe_open(path, framework="pt") as file:
-        about = json.loads(file.metadata()["torchslam"])
-    del tensors["worlds.0.points.colors"]
-    for name in [name for name in tensors if name.endswith(".information")]:
-        del tensors[name]
-    save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 3})})
-    loaded, _ = read_map(path)
-    assert torch.equal(loaded.positions_w, worlds[0].map.positions_w)
-    assert loaded.points["colors"].shape == (len(loaded.points), 3)
-    assert not loaded.points["colors"].any()
-    assert loaded.keyframes["information"].shape == (*loaded.keyframes["scales"].shape, 0)
-
-
-def test_a_file_from_before_there_was_information_is_read(path: Path, worlds: list[World]) -> None:
-    """As it was, and written anew to the same bytes as one of today."""
-    whole, tensors = path.read_bytes(), load_file(path)
-    with safe_open(path, framework="pt") as file:
-        about = json.loads(file.metadata()["torchslam"])
-    for name in [name for name in tensors if name.endswith(".information")]:
-        del tensors[name]
-    save_file(tensors, path, metadata={"torchslam": json.dumps(about | {"format": 4})})
-    saved = read_worlds(path)
-    write_worlds(path, saved.worlds, saved.camera, sessions=2)
-    assert path.read_bytes() == whole
-
-
-def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[World], camera: Camera) -> None:
-    write_worlds(path.with_name("two"), worlds, camera, sessions=2)
+def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[Submap], camera: Camera) -> None:
+    write_atlas(path.with_name("two"), worlds, camera, sessions=2)
     assert path.with_name("two").read_bytes() == path.read_bytes()
-    saved = read_worlds(path)
-    write_worlds(path.with_name("three"), saved.worlds, saved.camera, saved.sessions)
+    saved = read_atlas(path)
+    write_atlas(path.with_name("three"), saved.worlds, saved.camera, saved.sessions)
     assert path.with_name("three").read_bytes() == path.read_bytes()
 
 
-def test_frames_of_later_sessions_are_left_out(path: Path, worlds: list[World], camera: Camera) -> None:
-    write_worlds(path, worlds, camera, sessions=1)
-    world = next(iter(read_worlds(path).worlds))
+def test_frames_of_later_sessions_are_left_out(path: Path, worlds: list[Submap], camera: Camera) -> None:
+    write_atlas(path, worlds, camera, sessions=1)
+    world = next(iter(read_atlas(path).worlds))
     assert world.history.frames["session"].tolist() == [0, 0]
-    assert world.history.observations["row"].tolist() == [0] * 5 + [1] * 6
-    write_worlds(path, worlds, camera, sessions=0)
+    assert world.history.observations["frame_row"].tolist() == [0] * 5 + [1] * 6
+    write_atlas(path, worlds, camera, sessions=0)
     with pytest.raises(ResultsError, match="session from 0 to 0"):  # of keyframes: they are never left out
-        read_worlds(path)
+        read_atlas(path)
 
 
 def test_no_worlds_are_a_file_too(tmp_path: Path, camera: Camera) -> None:
-    write_worlds(tmp_path / "map.safetensors", [], camera)
+    write_atlas(tmp_path / "map.safetensors", [], camera)
     loaded, _ = read_map(tmp_path / "map.safetensors")
     assert loaded.num_keyframes == 0
     assert loaded.num_points == 0
 
 
 def test_the_device_is_that_asked_for(path: Path, device: torch.device) -> None:
-    saved = read_worlds(path, device)
+    saved = read_atlas(path, device)
     assert saved.camera.params.device.type == device.type
     for world in saved.worlds:
         assert world.track.T_cr.device.type == device.type
@@ -146,15 +119,15 @@ def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
     whole = path.read_bytes()
     path.unlink()
     with pytest.raises(ResultsError, match=r"map\.safetensors: no map file"):
-        read_worlds(path)
+        read_atlas(path)
     for content in (b"", b"not a map", whole[:-100], whole[:50], whole[:9]):
         path.write_bytes(content)
         with pytest.raises(ResultsError, match=r"map\.safetensors: not a readable"):
-            read_worlds(path)
+            read_atlas(path)
     path.unlink()
     path.mkdir()
     with pytest.raises(ResultsError, match=r"map\.safetensors: not a readable"):
-        read_worlds(path)
+        read_atlas(path)
 
 
 @pytest.mark.parametrize(
@@ -166,8 +139,8 @@ def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
         ({"torchslam": "format 4"}, "not a torchslam map"),
         ({"torchslam": "[3]"}, "not a torchslam map"),
         ({"torchslam": '{"size": 3}'}, "not a torchslam map"),
-        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 5"),
-        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 5"),
+        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 1"),
+        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 1"),
     ],
 )
 def test_other_programs_and_formats_are_refused(
@@ -175,7 +148,7 @@ def test_other_programs_and_formats_are_refused(
 ) -> None:
     save_file({"weights": torch.zeros(3)}, str(path), metadata=metadata)
     with pytest.raises(ResultsError, match=r"map\.safetensors: .*" + message):
-        read_worlds(path)
+        read_atlas(path)
 
 
 Tensors = dict[str, Tensor]
@@ -208,7 +181,7 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (without("camera.params"), "the camera's parameters are missing"),
         (change("camera.params", lambda rows: rows[:3]), "a pinhole camera has 4 parameters"),
         (put("camera.params", 0, float("nan")), "not a row of finite numbers"),
-        (without(P + "alive"), "world 0, points: missing alive"),
+        (without(P + "is_valid"), "world 0, points: missing is_valid"),
         (without(K + "mask"), "world 0, keyframes: missing mask"),
         (lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)), "points: foreign colour"),
         (
@@ -229,8 +202,8 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
             "positions_w: torch.float32 beside a camera in torch.float64",
         ),
         (change(K + "timestamp", Tensor.float), "timestamp: torch.float32"),
-        (change(P + "alive", Tensor.long), "alive: must be of kind bool"),
-        (change(P + "alive", lambda rows: rows[:-1]), "the columns have 119 to 120 rows"),
+        (change(P + "is_valid", Tensor.long), "is_valid: must be of kind bool"),
+        (change(P + "is_valid", lambda rows: rows[:-1]), "the columns have 119 to 120 rows"),
         (
             change(K + "angles", lambda rows: rows[:, 1:]),
             "angles: N is 39, elsewhere 40|N is 40, elsewhere 39",
@@ -239,8 +212,8 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (change(P + "descriptors", Tensor.double), "descriptors of several types"),
         (put(P + "positions_w", 0, float("inf")), "positions_w: not finite"),
         (put(F + "T_cr", 0, float("nan")), "T_cr: not finite"),
-        (put(P + "born", 5, 6), "born from 0 to 6, there are 0 to 5"),
-        (put(P + "born", 5, -1), "born from -1 to 5, there are 0 to 5"),
+        (put(P + "first_keyframe", 5, 6), "first_keyframe from 0 to 6, there are 0 to 5"),
+        (put(P + "first_keyframe", 5, -1), "first_keyframe from -1 to 5, there are 0 to 5"),
         (put(P + "replaced_by", 5, 120), "replaced_by from -1 to 120, there are -1 to 119"),
         (put(P + "replaced_by", 5, 5), "replaced_by goes in a circle"),
         (
@@ -253,10 +226,10 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (put(F + "session", 0, -1), "session from -1 to 1, there are 0 to 1"),
         (put(K + "frame_index", 1, 0), "two keyframes are of the same frame"),
         (put(K + "frame_index", 1, -1), "frame_index from -1 to 25, there are 0"),
-        (put(F + "reference", 0, 6), "reference from 0 to 6, there are 0 to 5"),
-        (put(O + "row", 0, 3), "row from 0 to 3, there are 0 to 2"),
+        (put(F + "reference_keyframe", 0, 6), "reference_keyframe from 0 to 6, there are 0 to 5"),
+        (put(O + "frame_row", 0, 3), "frame_row from 0 to 3, there are 0 to 2"),
         (put(O + "point_ids", 0, 120), "point_ids from 0 to 120, there are 0 to 119"),
-        (put(O + "keypoints", 0, -2), "keypoints from -2"),
+        (put(O + "keypoint_index", 0, -2), "keypoint_index from -2"),
     ],
 )
 def test_tables_that_do_not_fit_are_refused(
@@ -268,7 +241,7 @@ def test_tables_that_do_not_fit_are_refused(
     with pytest.raises(
         ResultsError, match=r"map\.safetensors: not a whole torchslam map: .*(" + message + ")"
     ):
-        read_worlds(path)
+        read_atlas(path)
 
 
 def test_a_long_line_of_heirs_is_no_circle(path: Path) -> None:
@@ -299,7 +272,7 @@ def test_descriptions_that_do_not_fit_are_refused(path: Path, changes: dict[str,
     about, tensors = described(path) | changes, load_file(str(path))
     save_file(tensors, str(path), metadata={"torchslam": json.dumps(about)})
     with pytest.raises(ResultsError, match=r"map\.safetensors: not a whole torchslam map: .*" + message):
-        read_worlds(path)
+        read_atlas(path)
 
 
 # --- whole or not at all -------------------------------------------------------------------------------------

@@ -11,13 +11,13 @@ from torch import Tensor
 from tests.scene import Scene, sideways, world_in
 from torchslam.map.map import NO_POINT, Map
 from torchslam.optim import Marginals
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 KEYPOINTS = 8
 
 
-def make_view(index: int, generator: torch.Generator) -> View:
-    return View(
+def make_view(index: int, generator: torch.Generator) -> FrameFeatures:
+    return FrameFeatures(
         index=index,
         timestamp=0.1 * index,
         keypoints=100 * torch.rand(KEYPOINTS, 2, generator=generator, dtype=torch.float64),
@@ -76,9 +76,9 @@ def test_who_sees_what(small_map: Map) -> None:
 
 
 def test_killed_points_are_observed_by_nobody_and_keep_their_ids(small_map: Map) -> None:
-    small_map.kill(torch.tensor([0, 4]))
+    small_map.invalidate(torch.tensor([0, 4]))
     assert small_map.num_points == 4
-    assert small_map.living_points().tolist() == [1, 2, 3, 5]
+    assert small_map.valid_points().tolist() == [1, 2, 3, 5]
     assert small_map.points_seen_by(torch.tensor([0, 1, 2])).tolist() == [1, 2, 3, 5]
 
 
@@ -89,7 +89,7 @@ def test_merging_moves_observations_and_leaves_one_per_keyframe(small_map: Map) 
         small_map.keyframes["point_ids"][1, 4] == NO_POINT
     )  # had seen both: the observation of 4 is dropped
     assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 2]
-    assert not small_map.points["alive"][4]
+    assert not small_map.points["is_valid"][4]
     assert small_map.points["times_found"][0] == 2
 
 
@@ -103,8 +103,8 @@ def test_refresh_takes_direction_scale_and_descriptor_from_the_newest_keyframe(s
     small_map.refresh(torch.tensor([1, 0]))
     ray = small_map.positions_w[2] - torch.tensor([1.0, 0.0, 0.0])
     distance = float(ray.norm())
-    assert torch.allclose(small_map.points["normals_w"][2], ray / distance)
-    assert math.isclose(float(small_map.points["reach"][2]), 1.2 * distance)
+    assert torch.allclose(small_map.points["view_directions_w"][2], ray / distance)
+    assert math.isclose(float(small_map.points["scale_distance"][2]), 1.2 * distance)
     assert torch.equal(small_map.points["descriptors"][2], small_map.keyframes["descriptors"][1, 2])
 
 
@@ -119,16 +119,16 @@ def test_a_view_comes_back_from_its_keyframe(small_map: Map, generator: torch.Ge
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from(["kill", "replace", "forget"]), st.integers(0, 5), st.integers(0, 5)),
+        st.tuples(st.sampled_from(["invalidate", "replace", "forget"]), st.integers(0, 5), st.integers(0, 5)),
         max_size=8,
     )
 )
 def test_the_count_of_observations_is_what_the_table_holds(changes: list[tuple[str, int, int]]) -> None:
     slam_map = make_map(torch.Generator().manual_seed(0))
     for change, one, other in changes:
-        alive = slam_map.points["alive"]
-        if change == "kill":
-            slam_map.kill(torch.tensor([one]))
+        alive = slam_map.points["is_valid"]
+        if change == "invalidate":
+            slam_map.invalidate(torch.tensor([one]))
         elif change == "replace" and one != other and alive[one] and alive[other]:
             slam_map.replace(torch.tensor([one]), torch.tensor([other]))
         elif change == "forget" and slam_map.keyframes["point_ids"][1, one] >= 0:

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.map.simulated import CAMERA
-from torchslam.map.file import read_map, write_worlds
+from torchslam.map.file import read_map, write_atlas
 from torchslam.map.map import NO_POINT, Map
-from torchslam.map.observation_index import Observers, first_of_each, most
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
-from torchslam.types import View
+from torchslam.map.observation_index import ObservationIndex, first_of_each, most
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
+from torchslam.types import FrameFeatures
 
 KEYPOINTS, DESCRIPTOR = 6, 4
 Change = tuple[str, int, list[int]]
 
 CHANGES = st.lists(
     st.tuples(
-        st.sampled_from(["keyframe", "points", "observe", "forget", "kill", "replace", "append"]),
+        st.sampled_from(["keyframe", "points", "observe", "forget", "invalidate", "replace", "append"]),
         st.integers(0, 10_000),
         st.lists(st.integers(0, 10_000), min_size=1, max_size=5),
     ),
@@ -36,7 +36,7 @@ def add_keyframe(slam_map: Map) -> int:
     scales = 1.0 + torch.arange(KEYPOINTS, dtype=torch.float64) + slam_map.num_keyframes
     descriptors = torch.zeros(KEYPOINTS, DESCRIPTOR, dtype=torch.uint8)
     mask = torch.ones(KEYPOINTS, dtype=torch.bool)
-    view = View(
+    view = FrameFeatures(
         slam_map.num_keyframes, 0.0, torch.zeros(KEYPOINTS, 2).double(), scales, zeros, descriptors, mask
     )
     return slam_map.add_keyframe(view, torch.eye(4, dtype=torch.float64))
@@ -59,7 +59,7 @@ def change_map(slam_map: Map, change: Change) -> None:
     """One change that the interface allows; which one exactly is up to the numbers."""
     kind, number, numbers = change
     table = slam_map.keyframes["point_ids"]
-    living = slam_map.living_points()
+    living = slam_map.valid_points()
     keyframe = number % slam_map.num_keyframes
     if kind == "keyframe":
         add_keyframe(slam_map)
@@ -76,8 +76,8 @@ def change_map(slam_map: Map, change: Change) -> None:
         if len(rows):
             which = torch.unique(torch.tensor(numbers) % len(rows))
             slam_map.forget(rows[which], columns[which])
-    elif kind == "kill" and len(living):
-        slam_map.kill(torch.unique(living[torch.tensor(numbers) % len(living)]))
+    elif kind == "invalidate" and len(living):
+        slam_map.invalidate(torch.unique(living[torch.tensor(numbers) % len(living)]))
     elif kind == "replace" and len(living) > 1:
         chosen = torch.unique(living[torch.tensor(numbers) % len(living)])
         heirs = living[~torch.isin(living, chosen)]
@@ -101,7 +101,7 @@ def check(slam_map: Map) -> None:
     assert torch.equal(points["times_observed"], counts)
     for row in table:
         assert len(torch.unique(row[row >= 0])) == int((row >= 0).sum())
-    assert not bool(((table >= 0) & ~points["alive"][table]).any())
+    assert not bool(((table >= 0) & ~points["is_valid"][table]).any())
     some = ids[::3]
     assert torch.equal(slam_map.observers(some), scanned(slam_map, some).sum(1))
     few = torch.arange(slam_map.num_keyframes).flip(0)[:2]
@@ -153,7 +153,7 @@ def test_merging_does_what_a_scan_of_the_table_does(changes: list[Change], heirs
     slam_map = make_map(points=12)
     for change in changes:
         change_map(slam_map, change)
-    living = slam_map.living_points()
+    living = slam_map.valid_points()
     if len(living) < 3 + len(heirs):
         return
     old, new = living[3 : 3 + len(heirs)], living[torch.tensor(heirs)]
@@ -168,12 +168,14 @@ def test_a_loaded_map_answers_the_same(tmp_path: Path) -> None:
     slam_map = make_map(3, 8)
     for keyframe, ids in ((0, [0, 1, 2]), (1, [1, 2, 3]), (2, [2, 7])):
         slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
-    write_worlds(
-        tmp_path / "map", [World(0, Track.nowhere(torch.zeros(0, dtype=torch.float64)), slam_map)], CAMERA
+    write_atlas(
+        tmp_path / "map",
+        [Submap(0, TrackingState.nowhere(torch.zeros(0, dtype=torch.float64)), slam_map)],
+        CAMERA,
     )
     loaded, _ = read_map(tmp_path / "map")
     check(loaded)
-    loaded.kill(torch.tensor([2]))
+    loaded.invalidate(torch.tensor([2]))
     check(loaded)
 
 
@@ -187,7 +189,7 @@ def test_a_point_may_have_more_observers_than_there_is_room_for_at_first() -> No
 
 
 def test_places_come_back_ordered_as_asked() -> None:
-    index = Observers(torch.tensor([[0, -1, 1], [1, 0, -1]]))
+    index = ObservationIndex(torch.tensor([[0, -1, 1], [1, 0, -1]]))
     which, places = index.of(torch.tensor([1, 0, 5]))
     assert sorted(zip(which.tolist(), places.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
     index.remove(torch.tensor([1]), torch.tensor([2]))
@@ -210,7 +212,7 @@ def test_the_first_of_each(values: list[int]) -> None:
 
 def test_an_index_that_grew_in_inference_mode_may_be_changed_outside() -> None:
     with torch.inference_mode():
-        index = Observers(torch.full((1, 4), -1))
+        index = ObservationIndex(torch.full((1, 4), -1))
         index.add(torch.arange(200), torch.arange(200))
     index.remove(torch.tensor([7]), torch.tensor([7]))
     index.clear(torch.tensor([8]))

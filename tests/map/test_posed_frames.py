@@ -10,21 +10,21 @@ import torch
 from tests.map.simulated import simulated_world, tracked_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.geometry import se3_inverse
-from torchslam.map.posed_frames import History
-from torchslam.map.submap import World
+from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.submap import Submap
 from torchslam.optim.run_graph import solve
 
 SCENE = Scene.of(150)
 
 
-def walked(noise: float = 0.0) -> World:
+def walked(noise: float = 0.0) -> Submap:
     """Two keyframes, and three frames that refer to the second."""
     world = world_in(SCENE, sideways(2, step=0.5), noise=noise)
     for index, T_cw in enumerate(sideways(3, start=0.6), start=10):
         view = SCENE.view(index, T_cw, noise=noise)
         at = torch.nonzero(view.mask)[:, 0]
         ids = rows_of(SCENE)[SCENE.shows(index)][at]
-        alive = world.map.points["alive"][ids]
+        alive = world.map.points["is_valid"][ids]
         T_cr = T_cw @ se3_inverse(world.map.T_cw[1])
         world.history.add(view, tracked_at(T_cw, ids[alive], at[alive]), T_cr, 1)
     return world
@@ -49,7 +49,7 @@ def test_a_trajectory_is_in_order_of_time() -> None:
     torch.testing.assert_close(trajectory.T_wc[2:], se3_inverse(sideways(3, start=0.6)))
     world.history.frames["timestamp"][:] = world.history.frames["timestamp"].flip(0)
     torch.testing.assert_close(world.trajectory().T_wc, trajectory.T_wc.flip(0))
-    assert len(History().trajectory(world.map)) == 0
+    assert len(PosedFrames().trajectory(world.map)) == 0
 
 
 def test_the_graph_of_a_run_holds_what_was_seen() -> None:
@@ -92,7 +92,9 @@ def test_frames_take_over_wherever_they_stand_in_the_history() -> None:
     order = torch.tensor([3, 0, 4, 1, 2])
     shuffled = copy.deepcopy(world)
     shuffled.history.frames.keep(order)
-    shuffled.history.observations["row"][:] = torch.argsort(order)[world.history.observations["row"]]
+    shuffled.history.observations["frame_row"][:] = torch.argsort(order)[
+        world.history.observations["frame_row"]
+    ]
     for one in (world, shuffled):
         graph = one.history.graph(one.map, CAMERA)
         one.history.take(solve(graph, backward="detached"), graph, one.map)
@@ -103,13 +105,18 @@ def test_frames_take_over_wherever_they_stand_in_the_history() -> None:
 
 def test_another_reference_moves_nobody() -> None:
     world = simulated_world()
-    before, references = world.history.T_cw(world.map).clone(), world.history.frames["reference"].clone()
+    before, references = (
+        world.history.T_cw(world.map).clone(),
+        world.history.frames["reference_keyframe"].clone(),
+    )
     heirs = torch.arange(world.map.num_keyframes)
     heirs[2] = 0
     world.history.refer(heirs, world.map)
     torch.testing.assert_close(world.history.T_cw(world.map), before)
-    assert (world.history.frames["reference"] != 2).all()
-    assert torch.equal(world.history.frames["reference"][references != 2], references[references != 2])
+    assert (world.history.frames["reference_keyframe"] != 2).all()
+    assert torch.equal(
+        world.history.frames["reference_keyframe"][references != 2], references[references != 2]
+    )
 
 
 def test_units_change_around_each_keyframe() -> None:
@@ -122,27 +129,27 @@ def test_units_change_around_each_keyframe() -> None:
     assert float(before[2:, :3, 3].norm()) == pytest.approx(float(after[2:, :3, 3].norm()) / 3)
 
 
-def stray(world: World, frame: int, count: int, shift: float = 60.0) -> None:
+def stray(world: Submap, frame: int, count: int, shift: float = 60.0) -> None:
     """The first `count` things that a frame saw were seen elsewhere, by pixels of their scales."""
     seen = world.history.observations
-    rows = torch.nonzero(seen["row"] == frame)[:count, 0]
+    rows = torch.nonzero(seen["frame_row"] == frame)[:count, 0]
     seen["pixels"][rows, 0] += shift * seen["scales"][rows]
 
 
-def of_frames(world: World) -> list[int]:
+def of_frames(world: Submap) -> list[int]:
     """How many observations each frame has."""
-    return torch.bincount(world.history.observations["row"]).tolist()
+    return torch.bincount(world.history.observations["frame_row"]).tolist()
 
 
 def test_what_is_far_astray_is_forgotten() -> None:
     world = walked()
     before, ids = of_frames(world), world.history.observations["point_ids"].clone()
-    at = torch.nonzero(world.history.observations["row"] == 3)[:, 0]
+    at = torch.nonzero(world.history.observations["frame_row"] == 3)[:, 0]
     stray(world, 3, 5)
     world.history.forget_strays(world.map, CAMERA)
     assert [was - now for was, now in zip(before, of_frames(world), strict=True)] == [0, 0, 0, 5, 0]
     seen = world.history.observations
-    assert torch.equal(seen["point_ids"][seen["row"] == 3], ids[at[5:]])
+    assert torch.equal(seen["point_ids"][seen["frame_row"] == 3], ids[at[5:]])
 
 
 @pytest.mark.parametrize(("off", "forgotten"), [(4.85, 0), (4.95, 5)])

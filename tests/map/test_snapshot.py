@@ -8,7 +8,7 @@ from torch import Tensor
 from tests.map.simulated import simulated_world, view_of
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
-from torchslam.map.snapshot import Bookmark
+from torchslam.map.snapshot import MapSnapshot
 
 
 def columns(slam_map: Map) -> list[Tensor]:
@@ -31,9 +31,9 @@ def disturb(slam_map: Map, keyframes: int, points: int) -> None:
     slam_map.keyframes["covariances"][:] *= 2.0
     slam_map.points["positions_w"][:] += 1.0
     slam_map.points["times_found"][:] += 3
-    living = slam_map.living_points()
+    living = slam_map.valid_points()
     slam_map.replace(living[:4], living[-4:])
-    slam_map.kill(living[5:9])
+    slam_map.invalidate(living[5:9])
     seen = slam_map.observations(slam_map.ids(0))
     slam_map.forget(seen.keyframe_index[:2], seen.keypoint_index[:2])
     slam_map.refresh(torch.arange(slam_map.num_keyframes))
@@ -43,7 +43,7 @@ def test_a_map_is_what_it_was() -> None:
     slam_map, asked = simulated_world().map, torch.arange(10)
     slam_map.images[slam_map.key(0)] = torch.ones(1)
     before, observers = columns(slam_map), slam_map.observers(asked)
-    bookmark = Bookmark.of(slam_map)
+    bookmark = MapSnapshot.of(slam_map)
     assert bookmark.num_keyframes == slam_map.num_keyframes
     for _ in range(2):  # a bookmark can be returned to as often as one likes
         disturb(slam_map, keyframes=70, points=40)  # more than there is room for
@@ -56,7 +56,7 @@ def test_a_map_is_what_it_was() -> None:
 
 def test_a_bookmark_is_a_copy() -> None:
     slam_map = simulated_world().map
-    bookmark = Bookmark.of(slam_map)
+    bookmark = MapSnapshot.of(slam_map)
     positions = slam_map.positions_w.clone()
     slam_map.positions_w[:] = 0.0
     assert torch.equal(bookmark.points["positions_w"], positions)

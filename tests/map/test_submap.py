@@ -11,14 +11,14 @@ from torch import Tensor
 
 from tests.map.simulated import reprojection_errors, simulated_world
 from torchslam.geometry import se3_inverse, sim3_exp, sim3_inverse, sim3_scale, transform
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 
 SCALE = 1.7
 SIMILARITY = torch.tensor([0.4, -0.3, 0.2, 0.5, -0.2, 0.3, math.log(SCALE)], dtype=torch.float64)
 
 
 @pytest.fixture
-def world() -> World:
+def world() -> Submap:
     return simulated_world()
 
 
@@ -37,7 +37,7 @@ def moved_poses(T_cw: Tensor, S_ba: Tensor) -> Tensor:
     return moved
 
 
-def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them(world: World) -> None:
+def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them(world: Submap) -> None:
     before = copy.deepcopy(world)
     world.move(similarity())
     torch.testing.assert_close(world.map.positions_w, transform(similarity(), before.map.positions_w))
@@ -48,7 +48,7 @@ def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them
     torch.testing.assert_close(world.T_cw, moved_poses(before.T_cw[None], similarity())[0])
 
 
-def test_a_moved_world_is_as_certain_as_before(world: World) -> None:
+def test_a_moved_world_is_as_certain_as_before(world: Submap) -> None:
     """Covariances of points turn and grow; those of poses live in the cameras: their unit alone grows."""
     before = copy.deepcopy(world)
     world.move(similarity())
@@ -64,25 +64,29 @@ def test_a_moved_world_is_as_certain_as_before(world: World) -> None:
     torch.testing.assert_close(world.map.centre_covariances_w(), linear @ centres @ linear.T)
 
 
-def test_directions_and_reach_are_those_that_a_refresh_would_find(world: World) -> None:
+def test_directions_and_reach_are_those_that_a_refresh_would_find(world: Submap) -> None:
     before = copy.deepcopy(world)
     world.move(similarity())
-    torch.testing.assert_close(world.map.points["normals_w"], before.map.points["normals_w"] @ rotation().T)
-    torch.testing.assert_close(world.map.points["reach"], SCALE * before.map.points["reach"])
+    torch.testing.assert_close(
+        world.map.points["view_directions_w"], before.map.points["view_directions_w"] @ rotation().T
+    )
+    torch.testing.assert_close(
+        world.map.points["scale_distance"], SCALE * before.map.points["scale_distance"]
+    )
     refreshed = copy.deepcopy(world)
     refreshed.map.refresh(torch.arange(world.map.num_keyframes))
-    for name in ("normals_w", "reach"):
+    for name in ("view_directions_w", "scale_distance"):
         torch.testing.assert_close(world.map.points[name], refreshed.map.points[name])
 
 
-def test_a_move_changes_no_reprojection(world: World) -> None:
+def test_a_move_changes_no_reprojection(world: Submap) -> None:
     before = reprojection_errors(world)
     assert float(before.norm(dim=-1).max()) > 0.5
     world.move(similarity())
     torch.testing.assert_close(reprojection_errors(world), before)
 
 
-def test_the_track_goes_on_after_a_move(world: World) -> None:
+def test_the_track_goes_on_after_a_move(world: Submap) -> None:
     before = copy.deepcopy(world)
     world.move(similarity())
     assert before.track.velocity is not None
@@ -93,7 +97,7 @@ def test_the_track_goes_on_after_a_move(world: World) -> None:
     )
 
 
-def test_there_and_back(world: World) -> None:
+def test_there_and_back(world: Submap) -> None:
     before = copy.deepcopy(world)
     world.move(similarity())
     world.move(sim3_inverse(similarity()))
@@ -103,23 +107,23 @@ def test_there_and_back(world: World) -> None:
     torch.testing.assert_close(world.history.frames["T_cr"], before.history.frames["T_cr"])
 
 
-def corrections(world: World) -> Tensor:
+def corrections(world: Submap) -> Tensor:
     """S_cw (K, 4, 4): every keyframe drifted by another similarity, in its own frame."""
     generator = torch.Generator().manual_seed(7)
     xi = 0.2 * torch.randn(world.map.num_keyframes, 7, generator=generator, dtype=torch.float64)
     return sim3_exp(xi) @ world.map.T_cw
 
 
-def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(world: World) -> None:
+def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(world: Submap) -> None:
     before, seen = reprojection_errors(world), world.map.observations()
     world.correct(corrections(world))
-    own = world.map.points["born"][seen.point_index] == seen.keyframe_index
+    own = world.map.points["first_keyframe"][seen.point_index] == seen.keyframe_index
     assert int(own.sum()) > 20
     torch.testing.assert_close(reprojection_errors(world)[own], before[own])
     assert float((reprojection_errors(world) - before)[~own].abs().max()) > 1.0
 
 
-def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(world: World) -> None:
+def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(world: Submap) -> None:
     S_cw = corrections(world)
     world.correct(S_cw)
     torch.testing.assert_close(se3_inverse(world.map.T_cw)[:, :3, 3], sim3_inverse(S_cw)[:, :3, 3])
@@ -127,16 +131,16 @@ def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(world: Wor
     torch.testing.assert_close(gram, torch.eye(3, dtype=torch.float64).expand_as(gram))
 
 
-def test_corrected_frames_see_what_their_keyframe_made_as_before(world: World) -> None:
+def test_corrected_frames_see_what_their_keyframe_made_as_before(world: Submap) -> None:
     """A frame stays where it was among the points of its reference keyframe, in that keyframe's unit."""
     before = copy.deepcopy(world)
     S_cw = corrections(world)
     scale = sim3_scale(S_cw)
     world.correct(S_cw)
-    reference = world.history.frames["reference"]
+    reference = world.history.frames["reference_keyframe"]
     T_cw, old = world.history.T_cw(world.map), before.history.T_cw(before.map)
     for frame in range(len(world.history)):
-        made = world.map.points["born"] == reference[frame]
+        made = world.map.points["first_keyframe"] == reference[frame]
         points_c = transform(T_cw[frame], world.map.positions_w[made])
         expected = transform(old[frame], before.map.positions_w[made]) / scale[reference[frame]]
         torch.testing.assert_close(points_c, expected)
@@ -147,28 +151,30 @@ def test_corrected_frames_see_what_their_keyframe_made_as_before(world: World) -
     torch.testing.assert_close(world.track.velocity[:3, 3], before.track.velocity[:3, 3] / around)
 
 
-def test_corrected_uncertainty_keeps_its_size_in_pixels(world: World) -> None:
+def test_corrected_uncertainty_keeps_its_size_in_pixels(world: Submap) -> None:
     """Seen from the keyframe that made it, a point is as uncertain in shares of its depth as it was."""
     before = copy.deepcopy(world)
     S_cw = corrections(world)
     world.correct(S_cw)
-    born = world.map.points["born"]
+    born = world.map.points["first_keyframe"]
     scale = sim3_scale(S_cw)[born][:, None, None]
 
-    def in_camera(of: World) -> Tensor:
+    def in_camera(of: Submap) -> Tensor:
         R_cw = of.map.T_cw[born][:, :3, :3]
         return R_cw @ of.map.points["covariances_w"] @ R_cw.mT
 
     torch.testing.assert_close(in_camera(world) * scale**2, in_camera(before))
     normals = [
-        (of.map.T_cw[born][:, :3, :3] @ of.map.points["normals_w"][..., None])[..., 0]
+        (of.map.T_cw[born][:, :3, :3] @ of.map.points["view_directions_w"][..., None])[..., 0]
         for of in (world, before)
     ]
     torch.testing.assert_close(*normals)
-    torch.testing.assert_close(world.map.points["reach"] * sim3_scale(S_cw)[born], before.map.points["reach"])
+    torch.testing.assert_close(
+        world.map.points["scale_distance"] * sim3_scale(S_cw)[born], before.map.points["scale_distance"]
+    )
 
 
-def test_an_absorbed_world_lies_beside_what_was_there(world: World) -> None:
+def test_an_absorbed_world_lies_beside_what_was_there(world: Submap) -> None:
     other = simulated_world(seed=3, number=1, session=1)
     mine, theirs = copy.deepcopy(world), copy.deepcopy(other)
     world.absorb(other, similarity())
@@ -185,7 +191,9 @@ def test_an_absorbed_world_lies_beside_what_was_there(world: World) -> None:
         world.history.T_cw(world.map),
         torch.cat([mine.history.T_cw(mine.map), theirs.history.T_cw(theirs.map)]),
     )
-    assert torch.equal(world.map.points["born"][points:], theirs.map.points["born"] + keyframes)
+    assert torch.equal(
+        world.map.points["first_keyframe"][points:], theirs.map.points["first_keyframe"] + keyframes
+    )
     torch.testing.assert_close(world.T_cw, theirs.T_cw)
     assert world.track.reference == theirs.track.reference + keyframes
     for name, moved_by in (("seen_last", points), ("local_points", points), ("local_keyframes", keyframes)):
@@ -194,11 +202,11 @@ def test_an_absorbed_world_lies_beside_what_was_there(world: World) -> None:
     assert (other.map.num_keyframes, len(other.map.points), len(other.history)) == (0, 0, 0)
 
 
-def test_merged_points_keep_their_heirs_in_an_absorbed_world(world: World) -> None:
+def test_merged_points_keep_their_heirs_in_an_absorbed_world(world: Submap) -> None:
     other = simulated_world(seed=3)
     other.map.replace(torch.tensor([5]), torch.tensor([2]))
     count = len(world.map.points)
     world.absorb(other, torch.eye(4, dtype=torch.float64))
     assert world.map.resolve(torch.tensor([count + 5, 5])).tolist() == [count + 2, 5]
-    graph_rows = world.history.observations["row"]
+    graph_rows = world.history.observations["frame_row"]
     assert int(graph_rows.max()) == len(world.history) - 1

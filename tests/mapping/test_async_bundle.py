@@ -15,14 +15,14 @@ from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
-from torchslam.mapping.async_bundle import Adjusting, Answer, solve_here
+from torchslam.mapping.async_bundle import Answer, AsyncBundleAdjustment, solve_here
 from torchslam.mapping.local_bundle import adjust
 from torchslam.optim import BundleProblem
-from torchslam.parallel.bundle_worker import Beside
+from torchslam.parallel.bundle_worker import BundleWorker
 
 SCENE = Scene.of(150)
 ROWS = rows_of(SCENE)
-SETTINGS = load_config(None, ["bundle.window=3"]).bundle
+SETTINGS = load_config(None, ["bundle_adjustment.local_window=3"]).bundle_adjustment
 PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
 
 
@@ -42,7 +42,7 @@ def columns(slam_map: Map) -> list[Tensor]:
     return [kept["T_cw"], kept["covariances"], kept["point_ids"], *(points[name] for name in CHANGED)]
 
 
-CHANGED = ("positions_w", "covariances_w", "normals_w", "alive", "times_observed")
+CHANGED = ("positions_w", "covariances_w", "view_directions_w", "is_valid", "times_observed")
 
 
 def check_same(mine: Map, other: Map) -> None:
@@ -57,7 +57,7 @@ def adjusted(seed: int = 0) -> Map:
 
 
 def test_nothing_happens_before_it_is_taken_over() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     assert not adjusting
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -74,7 +74,7 @@ def test_nothing_happens_before_it_is_taken_over() -> None:
 
 
 def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     begun: list[BundleProblem] = []
 
     def solver(problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
@@ -105,11 +105,11 @@ def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
 
 
 def test_it_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
-    adjusting.hurry(3)
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting.set_deadline(3)
     assert not adjusting
     adjusting.ask(slam_map, 4, due=12)
-    adjusting.hurry(9)
+    adjusting.set_deadline(9)
     assert adjusting.due == 9
     adjusting.drop()
     adjusting.take_over(slam_map)
@@ -117,24 +117,24 @@ def test_it_can_be_hurried_or_dropped() -> None:
 
 
 def test_it_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
-    assert not adjusting.is_due_first
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    assert not adjusting.due_before_next_frame
     adjusting.ask(slam_map, 4, due=12)
-    assert not adjusting.is_due_first
+    assert not adjusting.due_before_next_frame
     adjusting.drop()
     adjusting.ask(slam_map, 4, due=None)
     assert adjusting
-    assert adjusting.is_due_first
+    assert adjusting.due_before_next_frame
     assert adjusting.due is None
     assert adjusting.is_due(0)  # after whatever frame, at the latest
     check_same(slam_map, shaken())
     adjusting.take_over(slam_map)
     check_same(slam_map, adjusted())
-    assert not adjusting.is_due_first
+    assert not adjusting.due_before_next_frame
 
 
 def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.ask(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -145,21 +145,21 @@ def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
 
 
 @pytest.fixture(scope="module", params=["copied", "begun anew"])
-def beside(request: pytest.FixtureRequest) -> Iterator[Beside]:
+def beside(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
     """A process that has started, however it was."""
     is_copied = request.param == "copied"
     if is_copied and sys.platform != "linux":
         pytest.skip("processes are copied on Linux alone")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torchslam.parallel.worker.starts_at_once", lambda: is_copied)
-        with Beside(CAMERA) as solver:
+        with BundleWorker(CAMERA) as solver:
             assert solver._worker._ours.poll(PATIENCE)
             yield solver
 
 
-def test_another_process_finds_the_same(beside: Beside, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_process_finds_the_same(beside: BundleWorker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_around", None)  # here nothing is solved
-    adjusting = Adjusting(CAMERA, SETTINGS, covariances=True)
+    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True)
     adjusting.solver = beside
     for seed in (0, 1):
         expected = adjusted(seed)
@@ -175,8 +175,12 @@ def test_another_process_finds_the_same(beside: Beside, monkeypatch: pytest.Monk
     check_same(slam_map, adjusted(3))
 
 
-def test_without_covariances(beside: Beside) -> None:
-    adjusting, slam_map, expected = Adjusting(CAMERA, SETTINGS, covariances=False), shaken(), shaken()
+def test_without_covariances(beside: BundleWorker) -> None:
+    adjusting, slam_map, expected = (
+        AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False),
+        shaken(),
+        shaken(),
+    )
     adjusting.solver = beside
     adjusting.ask(slam_map, 4, due=12)
     adjusting.take_over(slam_map)
@@ -184,9 +188,9 @@ def test_without_covariances(beside: Beside) -> None:
     check_same(slam_map, expected)
 
 
-def test_what_goes_wrong_there_is_raised_here(beside: Beside) -> None:
+def test_what_goes_wrong_there_is_raised_here(beside: BundleWorker) -> None:
     slam_map = shaken()
-    adjusting = Adjusting(CAMERA, SETTINGS, covariances=False)
+    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False)
 
     def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
         problem.frame_index[0] = 99
@@ -200,8 +204,8 @@ def test_what_goes_wrong_there_is_raised_here(beside: Beside) -> None:
 
 
 def test_a_process_that_is_killed_is_done_without() -> None:
-    adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
-    with Beside(CAMERA) as solver:
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    with BundleWorker(CAMERA) as solver:
         assert solver._worker._ours.poll(PATIENCE)
         adjusting.solver = solver
         adjusting.ask(slam_map, 4, due=12)
@@ -219,9 +223,9 @@ def test_a_process_that_is_killed_is_done_without() -> None:
 
 def test_a_process_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
-    with Beside(CAMERA) as solver:
+    with BundleWorker(CAMERA) as solver:
         monkeypatch.setattr(solver._worker, "receive", None)
-        adjusting, slam_map = Adjusting(CAMERA, SETTINGS, covariances=True), shaken()
+        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
         adjusting.solver = solver
         adjusting.ask(slam_map, 4, due=12)
         adjusting.take_over(slam_map)

@@ -11,11 +11,11 @@ from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.map import compaction
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
 from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
 from torchslam.mapping.mapper import Mapper
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 from torchslam.utils.timing import Stopwatch
 
 SETTINGS = KeyframesConfig()
@@ -27,14 +27,14 @@ def cloud() -> Tensor:
     return torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
 
 
-def view_at(index: int, T_cw: Tensor, scale: float = 1.0) -> View:
+def view_at(index: int, T_cw: Tensor, scale: float = 1.0) -> FrameFeatures:
     view = view_of(index, T_cw, cloud(), torch.Generator().manual_seed(index))
-    return View(**{**view.__dict__, "scales": torch.full((POINTS,), scale, dtype=torch.float64)})
+    return FrameFeatures(**{**view.__dict__, "scales": torch.full((POINTS,), scale, dtype=torch.float64)})
 
 
-def world_of(T_cw: Tensor, scales: list[float] | None = None) -> World:
+def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
     """Keyframes at T_cw (K, 4, 4) that all see all points, the last one followed."""
-    world = World.empty(0, CAMERA.params.double())
+    world = Submap.empty(0, CAMERA.params.double())
     slam_map, everyone = world.map, torch.arange(POINTS)
     for index, pose in enumerate(T_cw):
         view = view_at(index, pose, scales[index] if scales else 1.0)
@@ -46,7 +46,7 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> World:
         world.history.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)
-    world.track = Track(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
+    world.track = TrackingState(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
     return world
 
 
@@ -54,7 +54,7 @@ def standing(count: int) -> Tensor:
     return torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
 
 
-def which(world: World, *candidates: int) -> list[int]:
+def which(world: Submap, *candidates: int) -> list[int]:
     return torch.nonzero(redundant(world, torch.tensor(candidates), SETTINGS))[:, 0].tolist()
 
 
@@ -116,7 +116,7 @@ def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(compaction, "_PRICE", 1000)
     world = world_of(standing(30))
     descriptors = world.map.points["descriptors"][:1].repeat(40, 1)
-    world.map.kill(world.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
+    world.map.invalidate(world.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
     before, left = world.map.keyframes["frame_index"].clone(), world.map.positions_w[:21].clone()
     went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
     assert went is not None

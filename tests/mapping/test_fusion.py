@@ -12,14 +12,14 @@ from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.mapping.fusion import find_in, fuse, merge
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)
 
 
-def world(count: int = 3) -> World:
+def world(count: int = 3) -> Submap:
     return world_in(SCENE, sideways(count))
 
 
@@ -101,7 +101,7 @@ def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, 
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is agrees
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
     if not agrees:
-        wide = load_config(None, ["measurement.chi_square=7.0"])
+        wide = load_config(None, ["measurement.max_chi_square=7.0"])
         find_in(here.map, torch.tensor([2]), points, CAMERA, wide)
         assert (here.map.keyframes["point_ids"][2, at] == points).all()
 
@@ -121,7 +121,7 @@ def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) ->
     middle = (here.map.keyframes["scales"][2, at] - 1.7).abs() < 0.15  # far from the ends of the scales
     points, at = points[middle], at[middle]
     assert len(at) > 3
-    here.map.points["reach"][points] *= factor
+    here.map.points["scale_distance"][points] *= factor
     find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is found
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not found
@@ -135,7 +135,7 @@ def test_doubles_are_found_from_either_side(asks: int) -> None:
     others = torch.tensor([keyframe for keyframe in range(3) if keyframe != asks])
     fuse(here.map, asks, others, CAMERA, Config())
     assert torch.equal(here.map.resolve(doubles), points)
-    assert not here.map.points["alive"][doubles].any()
+    assert not here.map.points["is_valid"][doubles].any()
     assert (here.map.points["times_observed"][points] == 3).all()
 
 
@@ -184,5 +184,5 @@ def test_nothing_to_merge_changes_nothing() -> None:
     slam_map = observed(2, 3)
     merge(slam_map, torch.arange(0), torch.arange(0))
     merge(slam_map, torch.tensor([1]), torch.tensor([1]))
-    assert slam_map.points["alive"].all()
+    assert slam_map.points["is_valid"].all()
     assert math.isclose(float(slam_map.points["times_observed"].sum()), 5)

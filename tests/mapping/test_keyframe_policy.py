@@ -13,7 +13,7 @@ from tests.map.simulated import tracked_at
 from tests.scene import Scene, pose, sideways, world_in
 from torchslam.config import KeyframesConfig, load_config
 from torchslam.geometry.motion import apart
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.mapping.keyframe_policy import why_keyframe
 
 SCENE = Scene.of(100)
@@ -21,7 +21,7 @@ SETTINGS = KeyframesConfig()
 
 
 def why(
-    world: World, T_cw: Tensor, *, index: int = 50, share: float = 1.0, waiting: int = 0, **changes: int
+    world: Submap, T_cw: Tensor, *, index: int = 50, share: float = 1.0, waiting: int = 0, **changes: int
 ) -> str:
     """Of a frame at T_cw that sees the points of keyframe 0, `share` of what its reference has."""
     settings = load_config(None, [f"keyframes.{name}={value}" for name, value in changes.items()]).keyframes
@@ -32,7 +32,7 @@ def why(
     return why_keyframe(view, tracked, world, settings)
 
 
-def depth(world: World, T_cw: Tensor) -> float:
+def depth(world: Submap, T_cw: Tensor) -> float:
     seen = world.map.points_seen_by(torch.tensor([0]))
     return float((world.map.positions_w[seen] @ T_cw[2, :3] + T_cw[2, 3]).median())
 

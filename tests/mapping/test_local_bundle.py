@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
-from torchslam.config import BundleConfig, load_config
+from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import HUBER, adjust, adjust_all, adjust_keyframes, drop_outliers, select
@@ -31,8 +31,10 @@ def which_moved(slam_map: Map, before: Tensor) -> list[int]:
     return torch.nonzero((slam_map.T_cw != before).flatten(1).any(1))[:, 0].tolist()
 
 
-def bundle(**changes: int) -> BundleConfig:
-    return load_config(None, [f"bundle.{name}={value}" for name, value in changes.items()]).bundle
+def bundle(**changes: int) -> BundleAdjustmentConfig:
+    return load_config(
+        None, [f"bundle_adjustment.{name}={value}" for name, value in changes.items()]
+    ).bundle_adjustment
 
 
 def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> None:
@@ -40,7 +42,7 @@ def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> Non
     truth = slam_map.T_cw.clone()
     shake(slam_map, [4, 5])
     before = slam_map.T_cw.clone()
-    adjust(slam_map, 5, CAMERA, bundle(window=2, iterations=20))
+    adjust(slam_map, 5, CAMERA, bundle(local_window=2, local_iterations=20))
     assert which_moved(slam_map, before) == [4, 5]  # the one that shares most with it
     torch.testing.assert_close(slam_map.T_cw, truth, atol=1e-5, rtol=0)
 
@@ -49,7 +51,7 @@ def test_the_first_keyframe_never_moves() -> None:
     slam_map = row(sideways(3))
     shake(slam_map, [1, 2])
     before = slam_map.T_cw.clone()
-    adjust(slam_map, 1, CAMERA, bundle(window=8))
+    adjust(slam_map, 1, CAMERA, bundle(local_window=8))
     assert which_moved(slam_map, before) == [1, 2]
     adjust_all(slam_map, CAMERA, bundle())
     assert torch.equal(slam_map.T_cw[0], before[0])
@@ -61,7 +63,7 @@ def test_no_more_keyframes_hold_than_are_allowed() -> None:
         slam_map = row(sideways(4))
         truth = slam_map.T_cw.clone()
         slam_map.keyframes["T_cw"][2:, 0, 3] *= 1.02
-        adjust(slam_map, 3, CAMERA, bundle(window=2, max_fixed=limit, iterations=30))
+        adjust(slam_map, 3, CAMERA, bundle(local_window=2, max_fixed_keyframes=limit, local_iterations=30))
         off = float((slam_map.T_cw[2:] - truth[2:]).abs().max())
         assert (off < 1e-6) is holds
 
@@ -104,9 +106,9 @@ def test_observations_are_dropped_in_units_of_their_scale(offset: float, stays: 
     drop_outliers(slam_map, slam_map.observations(), CAMERA)
     assert bool((table[2, at] == points).all()) is stays
     assert bool((table[2, at] == NO_POINT).all()) is not stays
-    alive = slam_map.points["alive"][points]
+    alive = slam_map.points["is_valid"][points]
     assert torch.equal(alive, before - int(not stays) >= 2)
-    assert slam_map.points["alive"].sum() > 100
+    assert slam_map.points["is_valid"].sum() > 100
 
 
 def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
@@ -119,7 +121,7 @@ def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
     drop_outliers(slam_map, slam_map.observations(), CAMERA)
     both = slam_map.points["times_observed"][points] == 0
     assert both.all()
-    assert not slam_map.points["alive"][points].any()
+    assert not slam_map.points["is_valid"][points].any()
     assert slam_map.num_points == count - 3
 
 
@@ -128,24 +130,24 @@ def test_a_bundle_leaves_no_observation_that_disagrees() -> None:
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[3] >= 0)[:5, 0]
     slam_map.keyframes["keypoints"][3, at] += 25.0
-    adjust(slam_map, 3, CAMERA, bundle(window=2))
+    adjust(slam_map, 3, CAMERA, bundle(local_window=2))
     assert (table[3, at] == NO_POINT).all()
 
 
 def test_adjusted_points_are_as_their_observers_have_them() -> None:
     slam_map = row(sideways(4))
-    slam_map.points["reach"][:] = 0
-    adjust(slam_map, 3, CAMERA, bundle(window=2))
+    slam_map.points["scale_distance"][:] = 0
+    adjust(slam_map, 3, CAMERA, bundle(local_window=2))
     seen = slam_map.points_seen_by(torch.tensor([3]))
     size = SCENE.sizes[torch.argsort(ROWS)[seen]] * 200.0
-    torch.testing.assert_close(slam_map.points["reach"][seen], size)
+    torch.testing.assert_close(slam_map.points["scale_distance"][seen], size)
 
 
 def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
     slam_map = row(sideways(5))
     truth = slam_map.T_cw.clone()
     shake(slam_map, [1, 2, 3, 4])
-    adjust_all(slam_map, CAMERA, bundle(final_iterations=30))
+    adjust_all(slam_map, CAMERA, bundle(global_iterations=30))
     torch.testing.assert_close(slam_map.T_cw[:, :3, :3], truth[:, :3, :3], atol=1e-6, rtol=0)
     scale = float(slam_map.T_cw[4, 0, 3] / truth[4, 0, 3])
     torch.testing.assert_close(slam_map.T_cw[:, :3, 3], scale * truth[:, :3, 3], atol=1e-6, rtol=0)
@@ -155,7 +157,7 @@ def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
 def test_certainty_is_noted_where_it_is_asked_for() -> None:
     for asked in (False, True):
         slam_map = world_in(SCENE, sideways(4), noise=0.5).map
-        adjust(slam_map, 3, CAMERA, bundle(window=2), covariances=asked)
+        adjust(slam_map, 3, CAMERA, bundle(local_window=2), covariances=asked)
         known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
         assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if asked else [])
         seen = slam_map.points_seen_by(torch.tensor([2, 3]))
@@ -166,7 +168,7 @@ def test_certainty_is_noted_where_it_is_asked_for() -> None:
 
 def test_nothing_to_adjust_changes_nothing() -> None:
     slam_map = row(sideways(2))
-    slam_map.kill(slam_map.living_points())
+    slam_map.invalidate(slam_map.valid_points())
     before = slam_map.T_cw.clone()
     adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5, covariances=True)
     assert torch.equal(slam_map.T_cw, before)

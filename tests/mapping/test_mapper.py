@@ -13,10 +13,10 @@ from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import transform, triangulation_covariance
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.mapping.mapper import YOUNG, Mapper, world_scale
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Start
+from torchslam.types import TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
 SCENE = Scene.of(300)
@@ -28,7 +28,7 @@ def mapper(*overrides: str) -> Mapper:
     return Mapper(CAMERA, load_config(None, overrides), Stopwatch())
 
 
-def start(true: bool = True) -> tuple[Start, Tensor]:
+def start(true: bool = True) -> tuple[TwoViewMap, Tensor]:
     """Two views half a unit apart, in units of their baseline, and (n,) which points they share."""
     one, two = SCENE.view(3, BASE[0]), SCENE.view(8, BASE[1])
     if true:
@@ -37,7 +37,7 @@ def start(true: bool = True) -> tuple[Start, Tensor]:
     both = torch.nonzero(one.mask[SCENE.at(3)] & two.mask[SCENE.at(8)])[:, 0]
     points_w, T_cw = 2 * SCENE.points_w[both], BASE[1].clone()
     T_cw[:3, 3] *= 2
-    return Start(one, two, T_cw, points_w, SCENE.at(3)[both], SCENE.at(8)[both]), both
+    return TwoViewMap(one, two, T_cw, points_w, SCENE.at(3)[both], SCENE.at(8)[both]), both
 
 
 def test_the_unit_of_the_world() -> None:
@@ -75,23 +75,23 @@ def test_a_start_becomes_two_keyframes_that_see_its_points(scale: str) -> None:
             CAMERA,
         ),
     )
-    assert points["from_start"].all()
-    assert (points["born"] == 1).all()
+    assert points["from_initialization"].all()
+    assert (points["first_keyframe"] == 1).all()
     assert (points["times_observed"] == 2).all()
     assert torch.equal(points["descriptors"], SCENE.descriptors[both])
     everyone = torch.arange(len(both))
     assert torch.equal(slam_map.keyframes["point_ids"][0, begin.keypoints_1], everyone)
     assert torch.equal(slam_map.keyframes["point_ids"][1, begin.keypoints_2], everyone)
     distance = (points["positions_w"] - centre(slam_map.T_cw[1])).norm(dim=-1)
-    torch.testing.assert_close(points["reach"], distance * begin.view.scales[begin.keypoints_2])
+    torch.testing.assert_close(points["scale_distance"], distance * begin.view.scales[begin.keypoints_2])
     assert torch.equal(begin.T_cw[:3, 3], 2 * BASE[1, :3, 3])  # the start itself is left alone
 
 
-def half_world(count: int = 2) -> World:
+def half_world(count: int = 2) -> Submap:
     return world_in(SCENE, sideways(count, step=0.4), seen=torch.arange(300) % 2 == 0)
 
 
-def inserted(by: Mapper, world: World, T_cw: Tensor) -> int:
+def inserted(by: Mapper, world: Submap, T_cw: Tensor) -> int:
     view = SCENE.view(50, T_cw)
     tracked = Tracker(CAMERA, Config()).track(world, view)
     assert tracked is not None
@@ -101,11 +101,11 @@ def inserted(by: Mapper, world: World, T_cw: Tensor) -> int:
 def test_a_keyframe_brings_the_points_it_tracked_and_new_ones() -> None:
     world = half_world()
     before = len(world.map.points)
-    keyframe = inserted(mapper("bundle.enabled=false"), world, sideways(1, start=0.8)[0])
+    keyframe = inserted(mapper("bundle_adjustment.local=false"), world, sideways(1, start=0.8)[0])
     assert keyframe == 2
     assert world.map.num_keyframes == 3
     new = torch.arange(before, len(world.map.points))
-    living = new[world.map.points["alive"][new]]
+    living = new[world.map.points["is_valid"][new]]
     assert len(living) > 50
     table, order = world.map.keyframes["point_ids"][2], SCENE.shows(50)
     at = torch.nonzero(table >= 0)[:, 0]
@@ -113,7 +113,7 @@ def test_a_keyframe_brings_the_points_it_tracked_and_new_ones() -> None:
     old = at[table[at] < before]
     assert len(old) > 50
     assert torch.equal(table[old], ROWS[order[old]])
-    assert (world.map.points["reach"][living] > 0).all()
+    assert (world.map.points["scale_distance"][living] > 0).all()
     seen = transform(world.map.T_cw[2], world.map.positions_w[living])
     assert (seen[:, 2] > 0).all()
 
@@ -124,13 +124,19 @@ def test_new_points_come_from_the_neighbours_that_are_asked() -> None:
         world = half_world(3)
         before = len(world.map.points)
         inserted(
-            mapper("bundle.enabled=false", f"mapping.neighbours={count}"), world, sideways(1, start=1.2)[0]
+            mapper("bundle_adjustment.local=false", f"mapping.num_partners={count}"),
+            world,
+            sideways(1, start=1.2)[0],
         )
         made.append(len(world.map.points) - before)
     assert 0 < made[0] < made[1]
     last = half_world(3)
     before = len(last.map.points)
-    inserted(mapper("bundle.enabled=false", "mapping.partners=last"), last, sideways(1, start=1.2)[0])
+    inserted(
+        mapper("bundle_adjustment.local=false", "mapping.triangulation_partners=last"),
+        last,
+        sideways(1, start=1.2)[0],
+    )
     assert len(last.map.points) - before == made[1]
 
 
@@ -143,17 +149,20 @@ def test_fusing_culling_and_adjusting_are_done_where_they_are_asked_for() -> Non
         originals = table[0, at].clone()
         world.map.forget(torch.zeros_like(at), at)
         twins = world.map.add_points(
-            world.map.positions_w[originals], world.map.points["descriptors"][originals], 0, from_start=True
+            world.map.positions_w[originals],
+            world.map.points["descriptors"][originals],
+            0,
+            from_initialization=True,
         )
         world.map.observe(0, at, twins)
         world.map.refresh(torch.arange(2))
         Tracker(CAMERA, Config()).follow(world, 1)
         inserted(
-            mapper("bundle.enabled=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
+            mapper("bundle_adjustment.local=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
             world,
             sideways(1, start=0.2)[0],
         )
-        doubles[fuse] = int(world.map.points["alive"][twins].sum())
+        doubles[fuse] = int(world.map.points["is_valid"][twins].sum())
     assert doubles["false"] == 10
     assert doubles["true"] < 5
 
@@ -162,7 +171,7 @@ def test_a_bundle_follows_a_keyframe() -> None:
     for enabled, gate in (("true", "chi_square"), ("true", "mahalanobis"), ("false", "mahalanobis")):
         world = world_in(SCENE, sideways(3, step=0.4), noise=0.5)
         before = world.map.T_cw.clone()
-        by = mapper(f"bundle.enabled={enabled}", f"measurement.gate={gate}")
+        by = mapper(f"bundle_adjustment.local={enabled}", f"measurement.gate={gate}")
         inserted(by, world, sideways(1, start=1.0)[0])
         has_moved = bool((world.map.T_cw[:3] != before).any())
         assert has_moved is (enabled == "true")
@@ -172,23 +181,23 @@ def test_a_bundle_follows_a_keyframe() -> None:
 
 
 def young_map(
-    age: int, *, found: int = 10, visible: int = 10, observed: int = 3, from_start: bool = False
+    age: int, *, found: int = 10, visible: int = 10, observed: int = 3, from_initialization: bool = False
 ) -> bool:
     """Whether a point of that kind survives; the keyframe asking is number 8."""
     world = world_in(SCENE, sideways(9, step=0.01))
     slam_map = world.map
     point = int(torch.nonzero(slam_map.points["times_observed"] == 9)[0])
     points = slam_map.points
-    points["born"][:] = 0
+    points["first_keyframe"][:] = 0
     points["times_found"][:] = points["times_visible"][:] = 10
-    points["born"][point] = 8 - age
+    points["first_keyframe"][point] = 8 - age
     points["times_found"][point], points["times_visible"][point] = found, visible
     points["times_observed"][point] = observed
-    points["from_start"][point] = from_start
+    points["from_initialization"][point] = from_initialization
     count = slam_map.num_points
     mapper().cull_recent_points(slam_map, 8)
     assert slam_map.num_points >= count - 1
-    return bool(points["alive"][point])
+    return bool(points["is_valid"][point])
 
 
 def test_young_points_must_be_found_where_they_should_be_seen() -> None:
@@ -205,4 +214,4 @@ def test_young_points_must_be_seen_by_a_third_keyframe_in_time() -> None:
     assert young_map(2, observed=3)
     assert not young_map(3, observed=2)
     assert young_map(4, observed=2)
-    assert young_map(2, observed=2, from_start=True)
+    assert young_map(2, observed=2, from_initialization=True)

@@ -12,7 +12,7 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.geometry import Noise, se3_exp, se3_inverse, transform
+from torchslam.geometry import KeypointNoise, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.keyframe_policy import why_keyframe
@@ -26,7 +26,7 @@ from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_line
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Start, View
+from torchslam.types import FrameFeatures, TwoViewMap
 
 OVERRIDES = [
     "features.kind=simulated",
@@ -56,8 +56,8 @@ def slam(slam_after_20: SLAM) -> SLAM:
     return copy.deepcopy(slam_after_20)
 
 
-def view_of(slam: SLAM, index: int) -> View:
-    return View.of(WALK[index], EYES(WALK[index]), WALK.camera.params.double())
+def view_of(slam: SLAM, index: int) -> FrameFeatures:
+    return FrameFeatures.of(WALK[index], EYES(WALK[index]), WALK.camera.params.double())
 
 
 def walk_from_start(slam: SLAM, index: int) -> torch.Tensor:
@@ -85,7 +85,7 @@ def test_every_observation_reprojects(slam: SLAM) -> None:
 def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     view = view_of(slam, 20)
     near = project_points(
-        slam.map, slam.map.living_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
+        slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
     pairs = match_near(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
     ids, keypoints = pairs.first, pairs.second
@@ -104,7 +104,7 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
 
 
 @pytest.mark.parametrize(
-    "override", ["tracking.predict=false", "tracking.guided=false", "tracking.recent_frames=10"]
+    "override", ["tracking.motion_model=false", "tracking.guided_matching=false", "tracking.recent_frames=10"]
 )
 def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
     tracker = Tracker(slam.camera, load_config(None, ["features.kind=simulated", override]))
@@ -116,7 +116,7 @@ def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
 
 def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
-    anywhere = match_points(slam.map, slam.map.living_points(), view, CONFIG.matching)
+    anywhere = match_points(slam.map, slam.map.valid_points(), view, CONFIG.matching)
     tracked = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
     assert tracked is not None
     assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
@@ -129,7 +129,7 @@ def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Gener
     count = slam.map.num_keyframes
     shake = 0.01 * torch.randn(count - 1, 6, generator=generator, dtype=torch.float64)
     slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
-    adjust_all(slam.map, slam.camera, CONFIG.bundle)
+    adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
     scale = (
         slam.map.T_cw[-1, :3, 3].norm()
         / walk_from_start(slam, int(slam.map.keyframes["frame_index"][-1]))[:3, 3].norm()
@@ -148,12 +148,12 @@ def test_an_adjustment_that_is_interrupted_leaves_the_map_as_it_was(
     before = copy.deepcopy(slam.map)
 
     def interrupt(iteration: int, iterations: int) -> None:
-        assert iterations == CONFIG.bundle.final_iterations
+        assert iterations == CONFIG.bundle_adjustment.global_iterations
         if iteration == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        adjust_all(slam.map, slam.camera, CONFIG.bundle, interrupt)
+        adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment, interrupt)
     for table, old in ((slam.map.points, before.points), (slam.map.keyframes, before.keyframes)):
         for name, column in table.columns().items():
             assert torch.equal(column, old[name]), name
@@ -163,14 +163,14 @@ def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
     keyframe = slam.map.num_keyframes - 1
     keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])
     slam.map.keyframes["keypoints"][keyframe, keypoint] += 40.0
-    adjust(slam.map, keyframe, slam.camera, CONFIG.bundle)
+    adjust(slam.map, keyframe, slam.camera, CONFIG.bundle_adjustment)
     assert slam.map.keyframes["point_ids"][keyframe, keypoint] == NO_POINT
 
 
 def test_the_first_keyframe_stays(slam: SLAM) -> None:
     before = slam.map.T_cw[0].clone()
-    adjust(slam.map, 1, slam.camera, CONFIG.bundle)
-    adjust_all(slam.map, slam.camera, CONFIG.bundle)
+    adjust(slam.map, 1, slam.camera, CONFIG.bundle_adjustment)
+    adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
     assert torch.equal(slam.map.T_cw[0], before)
 
 
@@ -189,11 +189,13 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
 
 def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
     newest = slam.map.num_keyframes - 1
-    born = torch.nonzero((slam.map.points["born"] >= newest - 2) & slam.map.points["alive"])[:3, 0]
+    born = torch.nonzero((slam.map.points["first_keyframe"] >= newest - 2) & slam.map.points["is_valid"])[
+        :3, 0
+    ]
     assert len(born) > 0
     slam.map.points["times_visible"][born] += 1000
     slam.mapper.cull_recent_points(slam.map, newest)
-    assert not slam.map.points["alive"][born].any()
+    assert not slam.map.points["is_valid"][born].any()
 
 
 def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
@@ -202,7 +204,7 @@ def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
             view.features,
             torch.arange(len(view.mask))[None],
             slam.camera.normalize(view.keypoints)[None],
-            Noise(view.scales[None], view.information[None]),
+            KeypointNoise(view.scales[None], view.information[None]),
         )
         for view in (view_of(slam, i) for i in (4, 9))
     )
@@ -224,11 +226,11 @@ def test_scale_consistency() -> None:
     assert consistent.tolist() == [True, False, False]
 
 
-def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[Start | None, str]:
+def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[TwoViewMap | None, str]:
     extract = Simulated(config, walk.camera, true_T_cw(walk))
     initializer = Initializer(walk.camera, config)
     for i in indices:
-        result = initializer.step(View.of(walk[i], extract(walk[i]), walk.camera.params.double()))
+        result = initializer.step(FrameFeatures.of(walk[i], extract(walk[i]), walk.camera.params.double()))
     return result
 
 
@@ -261,10 +263,12 @@ def test_pure_rotation_is_no_start() -> None:
 def test_scale_from_ground_truth_needs_ground_truth() -> None:
     start, _ = start_of((0, 5), WALK, CONFIG)
     assert start is not None
-    view = View(**{**start.view.__dict__, "T_cw_groundtruth": None})
+    view = FrameFeatures(**{**start.view.__dict__, "T_cw_groundtruth": None})
     with pytest.raises(ConfigError, match="ground truth"):
         world_scale(
-            Start(start.reference, view, start.T_cw, start.points_w, start.keypoints_1, start.keypoints_2),
+            TwoViewMap(
+                start.reference, view, start.T_cw, start.points_w, start.keypoints_1, start.keypoints_2
+            ),
             "groundtruth",
         )
 
@@ -273,7 +277,7 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
     tracked = slam.tracker.track(slam.world, view_of(slam, 20))
     assert tracked is not None
     reference = slam.map.T_cw[slam.world.track.reference]
-    view = View(**{**view_of(slam, 20).__dict__, "index": 100})
+    view = FrameFeatures(**{**view_of(slam, 20).__dict__, "index": 100})
 
     def why(T_cr: list[float], overlap: float = 1.0) -> str:
         pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference

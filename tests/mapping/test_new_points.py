@@ -11,12 +11,12 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import MatchingConfig, load_config
-from torchslam.geometry import Noise, se3_inverse, so3_exp, transform, triangulation_covariance
+from torchslam.geometry import KeypointNoise, se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.map.map import Map
 from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
 from torchslam.tracking.epipolar import FreeKeypoints, around, match_along_epipolar_lines
 from torchslam.tracking.matcher import max_distance
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
@@ -54,7 +54,7 @@ def test_what_both_see_and_neither_knows_becomes_a_point_where_it_is() -> None:
     both = views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)] & (torch.arange(300) % 2 == 1)
     assert len(new) == int(both.sum()) > 80
     assert torch.equal(slam_map.points["descriptors"][new], SCENE.descriptors[one])
-    assert (slam_map.points["born"][new] == 1).all()
+    assert (slam_map.points["first_keyframe"][new] == 1).all()
     assert (slam_map.points["times_observed"][new] == 2).all()
     assert len(triangulated(slam_map)) == 0  # they are known now
 
@@ -119,7 +119,7 @@ def test_points_must_be_seen_where_they_are(offset: float, good: bool) -> None:
     """Across the epipolar line an error is shared by the two views: each may be off by 2.45 times its scale."""
     slam_map = half_known(sideways(2, step=0.4))
     spoiled(slam_map, 0, offset, 1)
-    new = triangulated(slam_map, "mapping.epipolar_px=100")
+    new = triangulated(slam_map, "mapping.max_epipolar_px=100")
     assert (len(new) > 40) is good
     assert (len(new) == 0) is not good or good
 
@@ -127,7 +127,7 @@ def test_points_must_be_seen_where_they_are(offset: float, good: bool) -> None:
 def test_the_gate_is_the_configured_one() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     spoiled(slam_map, 0, 5.2, 1)
-    assert len(triangulated(slam_map, "mapping.epipolar_px=100", "measurement.chi_square=9")) > 40
+    assert len(triangulated(slam_map, "mapping.max_epipolar_px=100", "measurement.max_chi_square=9")) > 40
 
 
 def test_points_of_another_size_are_not_made() -> None:
@@ -165,15 +165,15 @@ def test_the_depth_is_that_of_the_neighbour() -> None:
 ALONG = sideways(2, step=0.4)  # epipolar lines are rows of the image
 
 
-def free(view: View, rows: Tensor) -> FreeKeypoints:
+def free(view: FrameFeatures, rows: Tensor) -> FreeKeypoints:
     """Some keypoints (n,) of a view."""
     features = view.features.rows(rows)
-    noise = Noise(view.scales[rows][None], view.information[rows][None])
+    noise = KeypointNoise(view.scales[rows][None], view.information[rows][None])
     return FreeKeypoints(features, rows[None], CAMERA.normalize(features.keypoints), noise)
 
 
-def matched(
-    views: list[View], rows: list[Tensor], T_21: Tensor, epipolar_px: float = 2.0
+def run_matcher(
+    views: list[FrameFeatures], rows: list[Tensor], T_21: Tensor, epipolar_px: float = 2.0
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) keypoints among some rows of two views that match."""
     one, two = (free(view, some) for view, some in zip(views, rows, strict=True))
@@ -192,7 +192,7 @@ def epipolar(offset: float, limit: float = 2.0, **changes: Tensor) -> tuple[Tens
     middle = (moved - torch.tensor([159.5, 119.5])).norm(dim=-1) < 60  # where a pixel is 1 / focal length
     rows = [torch.nonzero(mask)[:, 0] for mask in (views[0].mask, views[1].mask & middle)]
     T_21 = ALONG[1] @ se3_inverse(ALONG[0])
-    return matched(views, rows, T_21, limit)
+    return run_matcher(views, rows, T_21, limit)
 
 
 def test_matches_lie_on_the_epipolar_line() -> None:
@@ -226,7 +226,7 @@ def test_a_keypoint_has_one_partner() -> None:
     views[0] = replace(views[0], keypoints=keypoints, descriptors=descriptors)
     rows = [torch.nonzero(view.mask)[:, 0] for view in views]
     T_21 = ALONG[1] @ se3_inverse(ALONG[0])
-    first, second = matched(views, rows, T_21)
+    first, second = run_matcher(views, rows, T_21)
     assert twin[0] in first
     assert twin[1] not in first
     assert len(torch.unique(second)) == len(second)
@@ -236,7 +236,7 @@ def test_nobody_matches_nobody() -> None:
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
     rows, nobody = torch.arange(10), torch.arange(0)
     for one, other in ((nobody, rows), (rows, nobody)):
-        assert [len(part) for part in matched(views, [one, other], pose(1.0))] == [0, 0]
+        assert [len(part) for part in run_matcher(views, [one, other], pose(1.0))] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_a_window_reaches_over_the_end_of_a_turn() -> None:
     ahead = torch.stack([pose(), pose(0, 0, -0.8)])
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ahead)]
     rows = [torch.nonzero(view.mask)[:, 0] for view in views]
-    first, second = matched(views, rows, ahead[1])
+    first, second = run_matcher(views, rows, ahead[1])
     shows = SCENE.shows(0)[first]
     assert torch.equal(shows, SCENE.shows(1)[second])
     both = set(SCENE.shows(0)[rows[0]].tolist()) & set(SCENE.shows(1)[rows[1]].tolist())

@@ -35,7 +35,7 @@ def loaded(*command: str) -> list[str]:
         (["--version"], "0"),
         (["info", "--help"], "0"),
         (["info", "--stride", "none", "x"], "2"),
-        (["config", "--config", "fast"], "0"),
+        (["config", "--config", "paper"], "0"),
         (["config", "--set", "seed=-1"], "2"),
         (["nonsense"], "2"),
     ],

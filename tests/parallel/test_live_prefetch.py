@@ -17,7 +17,7 @@ from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import EndOfSequence
 from torchslam.errors import FrameError
 from torchslam.geometry import Camera
-from torchslam.parallel.live_prefetch import LiveAhead
+from torchslam.parallel.live_prefetch import LivePrefetcher
 from torchslam.system.front_end import image_extractor
 from torchslam.utils.timing import Stopwatch
 
@@ -58,9 +58,9 @@ def live(frames: int, pause: float = 0.0) -> LiveSequence:
 
 
 @pytest.fixture
-def reader() -> Iterator[LiveAhead]:
+def reader() -> Iterator[LivePrefetcher]:
     clock = Stopwatch()
-    with LiveAhead(live(8), CAMERA, CONFIG, clock) as frames:
+    with LivePrefetcher(live(8), CAMERA, CONFIG, clock) as frames:
         assert frames._worker._ours.poll(PATIENCE)
         yield frames
 
@@ -70,7 +70,7 @@ def expected(index: int) -> Features:
     return image_extractor(CONFIG)(Frame(index, 0.0, image))
 
 
-def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LiveAhead) -> None:
+def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LivePrefetcher) -> None:
     found = []
     for index in range(8):
         if index == SMALL:
@@ -95,7 +95,7 @@ def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LiveAhea
 
 def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.data.readers.live.STALE", PATIENCE)
-    with LiveAhead(live(4, pause=0.05), CAMERA, CONFIG, Stopwatch()) as frames:
+    with LivePrefetcher(live(4, pause=0.05), CAMERA, CONFIG, Stopwatch()) as frames:
         assert frames._worker._ours.poll(PATIENCE)
         frames[0], frames[1]
         deadline = time.monotonic() + 10
@@ -105,7 +105,7 @@ def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyP
         assert frames[2].index == 2
 
 
-def test_without_the_process_it_goes_on(reader: LiveAhead) -> None:
+def test_without_the_process_it_goes_on(reader: LivePrefetcher) -> None:
     reader[0], reader[1]
     os.kill(reader._worker._process.pid or 0, signal.SIGKILL)
     reader._worker._process.join()

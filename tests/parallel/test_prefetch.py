@@ -25,7 +25,7 @@ from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
-from torchslam.parallel.prefetch import Ahead
+from torchslam.parallel.prefetch import FeaturePrefetcher
 from torchslam.system.front_end import image_extractor
 from torchslam.utils.timing import Stopwatch
 
@@ -60,14 +60,14 @@ def patient(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     if is_copied and sys.platform != "linux":
         pytest.skip("processes are copied on Linux alone")
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: is_copied)
-    enter = Ahead.__enter__
+    enter = FeaturePrefetcher.__enter__
 
-    def wait(self: Ahead) -> Ahead:
+    def wait(self: FeaturePrefetcher) -> FeaturePrefetcher:
         enter(self)
         assert all(worker._ours.poll(PATIENCE) for worker in self._workers)
         return self
 
-    monkeypatch.setattr(Ahead, "__enter__", wait)
+    monkeypatch.setattr(FeaturePrefetcher, "__enter__", wait)
 
 
 def picture(seed: int) -> np.ndarray:
@@ -75,7 +75,7 @@ def picture(seed: int) -> np.ndarray:
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX)
 
 
-def look(frames: Ahead | Sequence, index: int) -> tuple[Frame, Features] | str:
+def look(frames: FeaturePrefetcher | Sequence, index: int) -> tuple[Frame, Features] | str:
     """A frame and its features, or the error in words."""
     try:
         frame = frames[index]
@@ -84,7 +84,7 @@ def look(frames: Ahead | Sequence, index: int) -> tuple[Frame, Features] | str:
     return frame, image_extractor(CONFIG)(frame) if frame.features is None else frame.features
 
 
-def check_same(frames: Ahead, sequence: Sequence, index: int) -> bool:
+def check_same(frames: FeaturePrefetcher, sequence: Sequence, index: int) -> bool:
     """The frame is the one without other processes; returns whether it came from one of them."""
     found, expected = look(frames, index), look(sequence, index)
     if isinstance(found, str) or isinstance(expected, str):
@@ -105,8 +105,8 @@ def check_same(frames: Ahead, sequence: Sequence, index: int) -> bool:
     return found[0].features is not None
 
 
-def ahead(sequence: Sequence, clock: Stopwatch | None = None, processes: int = 1) -> Ahead:
-    return Ahead(sequence, sequence.camera, CONFIG, clock or Stopwatch(), processes)
+def ahead(sequence: Sequence, clock: Stopwatch | None = None, processes: int = 1) -> FeaturePrefetcher:
+    return FeaturePrefetcher(sequence, sequence.camera, CONFIG, clock or Stopwatch(), processes)
 
 
 @pytest.mark.usefixtures("patient")
@@ -291,7 +291,7 @@ def test_a_signal_to_all_ends_the_run_with_results(
         "--processes",
         "2",
         "--set",
-        "bundle.final=false",
+        "bundle_adjustment.global_at_end=false",
     ]
     with (tmp_path / "err").open("w+") as errors:
         child = subprocess.Popen(command, stderr=errors, stdout=errors, start_new_session=True)

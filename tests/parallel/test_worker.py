@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from torchslam.errors import FrameError
-from torchslam.parallel.worker import READY, Worker, attempt, outcome, questions, reply, serve, task
+from torchslam.parallel.worker import READY, Worker, pack_task, requests, send_result, serve, try_call, unwrap
 
 
 def fail(error: Exception) -> None:
@@ -25,14 +25,14 @@ def fail(error: Exception) -> None:
 
 
 def test_an_answer_is_itself_and_is_found_in_inference_mode() -> None:
-    assert outcome(attempt("adds", lambda a, b: a + b, 1, 2)) == 3
-    assert attempt("looks", torch.is_inference_mode_enabled) is True
+    assert unwrap(try_call("adds", lambda a, b: a + b, 1, 2)) == 3
+    assert try_call("looks", torch.is_inference_mode_enabled) is True
 
 
 def test_an_error_is_raised_where_it_is_wanted_with_where_it_was() -> None:
-    answer = pickle.loads(pickle.dumps(attempt("reads ahead", fail, ZeroDivisionError("what is this?"))))
+    answer = pickle.loads(pickle.dumps(try_call("reads ahead", fail, ZeroDivisionError("what is this?"))))
     with pytest.raises(ZeroDivisionError, match="what is this") as raised:
-        outcome(answer)
+        unwrap(answer)
     (note,) = raised.value.__notes__
     assert note.startswith("in the process that reads ahead:\nTraceback")
     assert "in fail" in note
@@ -40,21 +40,21 @@ def test_an_error_is_raised_where_it_is_wanted_with_where_it_was() -> None:
 
 def test_errors_of_our_own_say_all_by_themselves() -> None:
     with pytest.raises(FrameError) as raised:
-        outcome(attempt("reads ahead", fail, FrameError("frame 3 is damaged")))
+        unwrap(try_call("reads ahead", fail, FrameError("frame 3 is damaged")))
     assert not hasattr(raised.value, "__notes__")
 
 
 def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
     ours, theirs = multiprocessing.Pipe()
-    ours.send_bytes(task("twice", 2))
+    ours.send_bytes(pack_task("twice", 2))
     for number in (3, 4):
         ours.send_bytes(pickle.dumps(number))
     heard: list[object] = []
 
     def work(connection: Connection, name: str, factor: int) -> None:
         heard.append(ours.recv_bytes())
-        for number in questions(connection):
-            reply(connection, (name, factor * number))
+        for number in requests(connection):
+            send_result(connection, (name, factor * number))
             heard.append(pickle.loads(ours.recv_bytes()))
             if number == 4:
                 ours.close()
@@ -65,10 +65,10 @@ def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
 
 def multiply(connection: Connection, factor: int) -> None:
     """What a process of these tests does; asked for nothing, it ends as if somebody had killed it."""
-    for number in questions(connection):
+    for number in requests(connection):
         if number is None:
             os.kill(os.getpid(), signal.SIGKILL)
-        reply(connection, (factor * number, torch.get_num_threads()))
+        send_result(connection, (factor * number, torch.get_num_threads()))
 
 
 @pytest.fixture(params=[True, False], ids=["copied", "spawned"])
@@ -97,7 +97,7 @@ def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
     (process,) = helpers()
     assert process.daemon  # none outlives this one
     come(worker)
-    assert worker.send(task(3))
+    assert worker.send(pack_task(3))
     for number in (1, 2):
         assert worker.send(pickle.dumps(number))
         assert worker.receive() == (3 * number, torch.get_num_threads())
@@ -107,7 +107,7 @@ def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
 
 def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker) -> None:
     come(worker)
-    assert worker.send(task(3))
+    assert worker.send(pack_task(3))
     assert worker.send(pickle.dumps(None))
     with pytest.warns(UserWarning, match=r"has ended \(-9\): going on without it"):
         assert worker.receive() is None
@@ -121,9 +121,9 @@ def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker)
 def test_nothing_is_sent_to_a_process_that_was_not_seen_to_be_there() -> None:
     worker = Worker(multiply)
     try:
-        assert not worker.send(task(3))
+        assert not worker.send(pack_task(3))
         come(worker)
-        assert worker.send(task(4))
+        assert worker.send(pack_task(4))
         assert worker.send(pickle.dumps(1))
         assert worker.receive() == (4, torch.get_num_threads())
     finally:

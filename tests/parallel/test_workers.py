@@ -14,11 +14,10 @@ from torchslam.data.sequence import Sequence
 from torchslam.features import OpenCVORB
 from torchslam.geometry import Camera
 from torchslam.mapping.async_bundle import solve_here
-from torchslam.parallel.bundle_worker import Beside
-from torchslam.parallel.live_prefetch import LiveAhead
-from torchslam.parallel.patch_worker import Scouting
-from torchslam.parallel.prefetch import Ahead
-from torchslam.parallel.workers import WORTH, WORTH_AT_ONCE, best_number, helped, processors, why_alone
+from torchslam.parallel.bundle_worker import BundleWorker
+from torchslam.parallel.live_prefetch import LivePrefetcher
+from torchslam.parallel.prefetch import FeaturePrefetcher
+from torchslam.parallel.workers import WORTH, WORTH_AT_ONCE, best_number, processors, why_alone, with_workers
 from torchslam.system.slam import SLAM
 
 CONFIG = load_config(None, ["features.kind=opencv-orb"])
@@ -31,16 +30,16 @@ def room(frames: int) -> Sequence:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is started: only who would be is looked at."""
-    for kind in (Ahead, LiveAhead, Scouting, Beside):
+    for kind in (FeaturePrefetcher, LivePrefetcher, BundleWorker):
         monkeypatch.setattr(kind, "__enter__", lambda self: self)
         monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
-    monkeypatch.setattr(Ahead, "begin", lambda self, start: None)
+    monkeypatch.setattr(FeaturePrefetcher, "begin", lambda self, start: None)
 
 
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
     """Where the frames come from, and whether adjustments are found beside."""
-    with helped(sequence, slam, processes, start) as frames:
-        is_beside = isinstance(slam.mapper.adjusting.solver, Beside)
+    with with_workers(sequence, slam, processes, start) as frames:
+        is_beside = isinstance(slam.mapper.adjusting.solver, BundleWorker)
     assert slam.mapper.adjusting.solver is solve_here
     return type(frames).__name__, is_beside
 
@@ -51,17 +50,14 @@ def test_who_does_what(capsys: pytest.CaptureFixture[str]) -> None:
     slam = SLAM(sequence.camera, CONFIG)
     here = type(sequence).__name__
     assert who(sequence, slam, 1) == (here, False)
-    assert who(sequence, slam, 2) == ("Ahead", False)
-    assert who(sequence, slam, 3) == ("Ahead", True)
+    assert who(sequence, slam, 2) == ("FeaturePrefetcher", False)
+    assert who(sequence, slam, 3) == ("FeaturePrefetcher", True)
     for processes, readers in ((2, 1), (3, 1), (4, 2), (6, 4)):
-        with helped(sequence, slam, processes) as frames:
-            assert isinstance(frames, Ahead)
+        with with_workers(sequence, slam, processes) as frames:
+            assert isinstance(frames, FeaturePrefetcher)
             assert frames._count == readers
-    fast = SLAM(sequence.camera, load_config(None, ["patches.enabled=true"]))
-    assert who(sequence, fast, 2) == ("Scouting", False)
-    assert who(sequence, fast, 3) == ("Scouting", True)
     slam.mapping = False
-    assert who(sequence, slam, 3) == ("Ahead", False)
+    assert who(sequence, slam, 3) == ("FeaturePrefetcher", False)
     assert capsys.readouterr().err == ""
 
 
@@ -74,15 +70,11 @@ def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
     simulated = SLAM(sequence.camera, load_config(None, ["features.kind=simulated"]))
     assert who(sequence, simulated, 2) == (here, True)
     assert "frames are read here: simulated features need no images" in capsys.readouterr().err
-    slam, fast = (
-        SLAM(sequence.camera, load_config(None, [*settings])) for settings in ((), ["patches.enabled=true"])
-    )
+    slam = SLAM(sequence.camera)
     sequence.timestamps = sequence.timestamps[:0]
     monkeypatch.setattr("torchslam.parallel.workers.best_number", lambda *arguments: 3)
-    assert who(sequence, slam, None) == ("LiveAhead", True)
+    assert who(sequence, slam, None) == ("LivePrefetcher", True)
     assert why_alone(sequence, slam) == ""
-    assert who(sequence, fast, None) == (here, True)
-    assert "live source" in why_alone(sequence, fast)
     assert capsys.readouterr().err == ""  # nobody asked for more
 
 
@@ -150,17 +142,17 @@ def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
     extract, seen = slam.extractor, []
     assert extract is not None
     slam.extractor = lambda frame: (seen.append(frame.image), extract(frame))[1]
-    with helped(sequence, slam, 1):
+    with with_workers(sequence, slam, 1):
         (image,) = seen
         assert image.shape[-2:] == (sequence.camera.height, sequence.camera.width)
         assert not image.any()
     other = SLAM(sequence.camera, CONFIG)
     other.extractor = lambda frame: pytest.fail("other front ends are shown frames alone")
-    with helped(sequence, other, 1):
+    with with_workers(sequence, other, 1):
         pass
     own = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]), extractor=OpenCVORB(100))
     own.extractor = lambda frame: pytest.fail("what somebody else made is shown frames alone")
-    with helped(sequence, own, 1):
+    with with_workers(sequence, own, 1):
         pass
     assert slam.last_frame is None
 
@@ -174,5 +166,5 @@ def test_the_first_frame_that_is_tracked_does_not_wait_for_a_table() -> None:
     )
     undistorted = slam.tracker.localizer.undistorted
     assert "_table" not in vars(undistorted)
-    with helped(sequence, slam, 1):
+    with with_workers(sequence, slam, 1):
         assert "_table" in vars(undistorted)

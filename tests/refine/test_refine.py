@@ -18,7 +18,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.refine import CameraChoice, Refined, refine
+from torchslam.refine import CameraChoice, Refined, refine_poses
 from torchslam.system.front_end import Simulated
 from torchslam.types import State, Trajectory
 
@@ -74,7 +74,7 @@ def errors(refined: Refined, truth: Trajectory) -> tuple[float, float]:
 def exact() -> Refined:
     """All but exact features; poses 3 cm and 2 degrees off, the focal length 5 %."""
     settings = config()
-    return refine(with_focal(seen(settings), 1.05), disturbed(TRUE), settings)
+    return refine_poses(with_focal(seen(settings), 1.05), disturbed(TRUE), settings)
 
 
 def test_exact_features_give_the_true_poses(exact: Refined) -> None:
@@ -101,10 +101,11 @@ def test_the_results_are_those_of_a_run(exact: Refined) -> None:
 def test_noise_is_averaged_and_said() -> None:
     """A third of a pixel of noise, and every tenth match wrong: better by far, and twice the same."""
     assert WALK.groundtruth is not None
-    settings = config("simulated.noise_px=0.3", "simulated.outliers=0.1")
+    settings = config("simulated.noise_px=0.3", "simulated.outlier_ratio=0.1")
     given = disturbed(TRUE)
     found = [
-        refine(with_focal(seen(settings), 0.95), given, settings, CameraChoice.FREE).run for _ in range(2)
+        refine_poses(with_focal(seen(settings), 0.95), given, settings, CameraChoice.FREE).run
+        for _ in range(2)
     ]
     assert torch.equal(found[0].trajectory.T_wc, found[1].trajectory.T_wc)
     before = evaluate(given, WALK.groundtruth).ate_m
@@ -119,7 +120,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
     T_wc = S @ WALK.groundtruth.T_wc if WALK.groundtruth is not None else S
     T_wc[:, :3, 3] *= 3.28
     given = Trajectory(WALK.timestamps, T_wc)
-    found = refine(seen(settings), given, settings, CameraChoice.FIXED)
+    found = refine_poses(seen(settings), given, settings, CameraChoice.FIXED)
     assert found.camera is None
     ate, angle = errors(found, given)
     assert ate < 2e-3
@@ -129,7 +130,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
 def test_a_right_camera_stays() -> None:
     """The images do not contradict it, so not a bit of it changes; freed, it comes out as good as the same."""
     settings = config("simulated.noise_px=0.3")
-    judged = refine(seen(settings), disturbed(TRUE), settings)
+    judged = refine_poses(seen(settings), disturbed(TRUE), settings)
     assert torch.equal(judged.run.camera.params, WALK.camera.params.double())
     assert judged.rounds == 1
     assert judged.camera is not None
@@ -142,32 +143,34 @@ def test_frames_and_poses_that_have_no_partner() -> None:
     T_wc = se3_inverse(TRUE)
     times = torch.cat([WALK.timestamps[:10], WALK.timestamps[-1:] + 5])
     given = Trajectory(times, torch.cat([T_wc[:10], T_wc[:1]]))
-    found = refine(seen(settings), given, settings, CameraChoice.FIXED)
+    found = refine_poses(seen(settings), given, settings, CameraChoice.FIXED)
     assert (found.without_pose, found.without_image) == (4, 1)
     assert len(found.run.trajectory) == 10
     torch.testing.assert_close(found.run.trajectory.timestamps, WALK.timestamps[:10])
     with pytest.raises(TrajectoryError, match="are not those of the images"):
-        refine(seen(settings), Trajectory(WALK.timestamps + 100, T_wc), settings)
+        refine_poses(seen(settings), Trajectory(WALK.timestamps + 100, T_wc), settings)
     with pytest.raises(TrajectoryError, match="without poses"):
-        refine(seen(settings), Trajectory.empty(), settings)
+        refine_poses(seen(settings), Trajectory.empty(), settings)
 
 
 def test_images_that_make_no_map() -> None:
     """The run says why, and has no poses."""
     settings, rest = config(), Walk(still(4))
-    found = refine(rest, disturbed(true_T_cw(rest)), settings)
+    found = refine_poses(rest, disturbed(true_T_cw(rest)), settings)
     assert found.run.failure == "no map: nothing moves in the 4 images"
     assert len(found.run.trajectory) == 0
     assert [result.state for result in found.run.results] == [State.LOST] * 4
     one = GivenPoses("tum", Path("one.txt"), TRUE[:1], WALK.timestamps[:1])
-    assert refine(seen(settings), one, settings).run.failure == "no map: 1 images with a pose are too few"
+    assert (
+        refine_poses(seen(settings), one, settings).run.failure == "no map: 1 images with a pose are too few"
+    )
 
 
 def test_devices(device: torch.device) -> None:
     """All of it works where it is asked to, and comes to the same."""
     settings = config()
     walk = WALK.part(0, 6)
-    found = refine(seen(settings, walk), _first(6), settings, device=device)
+    found = refine_poses(seen(settings, walk), _first(6), settings, device=device)
     assert found.run.map.T_cw.device.type == device.type
     assert len(found.run.trajectory) == 6
 
@@ -185,7 +188,7 @@ def test_a_kitchen(data_dir: Path) -> None:
     truth = torch.stack([pose for i in range(20) if (pose := sequence.pose(i)) is not None])
     given = disturbed(truth)
     given = Trajectory(sequence.timestamps, given.T_wc)
-    found = refine(with_focal(sequence, 0.95), given, choice=CameraChoice.FREE)
+    found = refine_poses(with_focal(sequence, 0.95), given, choice=CameraChoice.FREE)
     assert len(found.run.trajectory) == 20
     evaluation = evaluate(found.run.trajectory, sequence.groundtruth)
     assert evaluation.ate_m < 0.05

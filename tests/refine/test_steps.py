@@ -12,10 +12,10 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, sideways
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, so3_log, transform
-from torchslam.refine.adjustment import map_of, turned
-from torchslam.refine.alignment import back_to_given
+from torchslam.refine.adjustment import align_rotations, build_map
+from torchslam.refine.alignment import align_to_input
 from torchslam.refine.pairs import Pair, candidates, choose_keyframes, find_pairs
-from torchslam.refine.refine import largest_part
+from torchslam.refine.refine import largest_connected_part
 from torchslam.refine.rotations import average_rotations
 from torchslam.refine.tracks import Tracks, join_matches, make_map, triangulate_tracks
 
@@ -81,9 +81,9 @@ def test_turning_leaves_the_centres(generator: torch.Generator) -> None:
     pairs = [
         pair(i, j, (0, 0), R_21=(T_cw[j] @ se3_inverse(T_cw[i]))[:3, :3]) for i, j in ((0, 1), (1, 2), (0, 2))
     ]
-    found = turned(off, pairs)
+    found = align_rotations(off, pairs)
     torch.testing.assert_close(se3_inverse(found)[:, :3, 3], se3_inverse(off)[:, :3, 3])
-    assert turned(off, [pair(0, 1, (0, 0))]) is off
+    assert align_rotations(off, [pair(0, 1, (0, 0))]) is off
 
 
 # --- tracks --------------------------------------------------------------------------------------------------
@@ -106,9 +106,13 @@ def test_two_keypoints_of_a_keyframe_contradict_each_other() -> None:
 
 
 def test_the_largest_part_that_hangs_together() -> None:
-    assert largest_part([pair(0, 1, (0, 0)), pair(2, 4, (0, 0)), pair(3, 4, (0, 0))], 5) == [2, 3, 4]
-    assert largest_part([pair(0, 1, (0, 0)), pair(2, 3, (0, 0))], 4) == [0, 1]
-    assert largest_part([], 0) == []
+    assert largest_connected_part([pair(0, 1, (0, 0)), pair(2, 4, (0, 0)), pair(3, 4, (0, 0))], 5) == [
+        2,
+        3,
+        4,
+    ]
+    assert largest_connected_part([pair(0, 1, (0, 0)), pair(2, 3, (0, 0))], 4) == [0, 1]
+    assert largest_connected_part([], 0) == []
 
 
 def test_long_tracks_are_triangulated(generator: torch.Generator) -> None:
@@ -143,7 +147,7 @@ def test_a_map_sees_what_the_tracks_say() -> None:
     placed = made.positions_w[seen.point_index]
     assert placed[:, 0].tolist() == [1, 0, 1, 0, 1]  # keyframes 0, 1, 1, 2, 2
     assert seen.keypoint_index.tolist() == [7, 5, 8, 6, 9]
-    assert made.points["born"].tolist() == [0, 1]
+    assert made.points["first_keyframe"].tolist() == [0, 1]
     assert made.points["times_observed"].tolist() == [3, 2]
 
 
@@ -222,8 +226,8 @@ def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> N
     given = se3_exp(tangent * randn(generator, 8, 6)) @ T_cw
     pairs = find_pairs(views, given, CAMERA, CONFIG)
     tracks = join_matches(pairs, 8, len(views[0].mask))
-    made, _ = map_of(views, turned(given, pairs), tracks, CAMERA, CONFIG)
-    S = back_to_given(made.T_cw, T_cw)
+    made, _ = build_map(views, align_rotations(given, pairs), tracks, CAMERA, CONFIG)
+    S = align_to_input(made.T_cw, T_cw)
     centres = se3_inverse(made.T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
     off = (centres - se3_inverse(T_cw)[:, :3, 3]).norm(dim=-1)
     assert float(off.max()) < (1e-5 if noise == 0 else 0.04)
@@ -242,13 +246,13 @@ def test_back_to_the_given_frame(generator: torch.Generator) -> None:
     ):
         moved = given @ S  # world to camera, of points before S
         own = rigid(moved[:, :3, :3] / 1.6, moved[:, :3, 3] / 1.6)
-        torch.testing.assert_close(back_to_given(own, given), S, atol=1e-9, rtol=0)
+        torch.testing.assert_close(align_to_input(own, given), S, atol=1e-9, rtol=0)
         wild = given.clone()
         wild[4, :3, 3] += 3.0
-        torch.testing.assert_close(back_to_given(own, wild), S, atol=1e-9, rtol=0)
+        torch.testing.assert_close(align_to_input(own, wild), S, atol=1e-9, rtol=0)
 
 
 def test_a_camera_in_one_place_keeps_its_unit(generator: torch.Generator) -> None:
     given = rigid(so3_exp(randn(generator, 5, 3)), torch.zeros(5, 3, dtype=torch.float64))
     turn = se3_exp(torch.tensor([0, 0, 0, 0.3, -0.4, 0.2], dtype=torch.float64))
-    torch.testing.assert_close(back_to_given(given @ turn, given), turn, atol=1e-9, rtol=0)
+    torch.testing.assert_close(align_to_input(given @ turn, given), turn, atol=1e-9, rtol=0)

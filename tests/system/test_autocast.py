@@ -112,7 +112,7 @@ def estimator_cases() -> dict[str, Case]:
         "start_pose": (
             with_camera(
                 lambda points_w, pixels, camera: geometry.start_pose(
-                    points_w[0], geometry.Undistorted.of(pixels[0], camera), size, 2.0
+                    points_w[0], geometry.UndistortedKeypoints.of(pixels[0], camera), size, 2.0
                 )
             ),
             (points_w, pixels, params),

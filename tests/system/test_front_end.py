@@ -20,9 +20,9 @@ from torchslam.types import Features
 
 WALK = "synthetic:room?frames=20"
 GROWING = {
-    "initialization": {"min_motion_px", "still_px", "threshold_px"},
+    "initialization": {"min_motion_px", "max_static_px", "threshold_px"},
     "tracking": {"threshold_px"},
-    "stillness": {"min_motion_px", "radius_px", "cell_px"},
+    "static_overlay": {"min_motion_px", "radius_px", "cell_px"},
     "independent_motion": {"threshold_px", "search_px"},
 }
 
@@ -36,9 +36,9 @@ GROWING = {
 )  # fmt: skip
 def test_only_much_larger_images_are_reduced(size: tuple[int, int], factor: float) -> None:
     assert FeaturesConfig().reduction(size) == pytest.approx(factor, rel=1e-5)
-    assert FeaturesConfig(image_pixels=0).reduction(size) == 1
+    assert FeaturesConfig(max_image_pixels=0).reduction(size) == 1
     assert FeaturesConfig(kind="simulated").reduction(size) == 1
-    assert FeaturesConfig(image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
+    assert FeaturesConfig(max_image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
 
 
 def test_what_is_not_said_in_units_of_a_scale_grows() -> None:
@@ -58,7 +58,7 @@ def test_what_is_not_said_in_units_of_a_scale_grows() -> None:
 def seen(width: int, height: int, image_pixels: int = 640 * 480) -> Features:
     """The features of a rendered image at another size."""
     frame = resize(open_sequence(WALK), f"{width}x{height}")[0]
-    return image_extractor(Config(features=FeaturesConfig(image_pixels=image_pixels)))(frame)
+    return image_extractor(Config(features=FeaturesConfig(max_image_pixels=image_pixels)))(frame)
 
 
 @pytest.mark.parametrize("size", [(1280, 960), (1920, 1440), (1500, 1000)])
@@ -96,7 +96,7 @@ def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
     slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
     told = Config().for_size((1280, 960))
     assert slam.config == Config()
-    initializer = slam._following.beginning.initializer
+    initializer = slam._states.beginning.initializer
     assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, initializer))
     assert slam.tracker.settings == told.tracking
     assert slam.foreign.stillness.evidence.shape == (121, 161)

@@ -19,7 +19,7 @@ from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import Simulated, WithFeatures
-from torchslam.system.run import Progressed, run_sequence
+from torchslam.system.run import RunProgress, run_sequence
 from torchslam.types import Frame
 
 CONFIG = load_config(
@@ -29,8 +29,8 @@ CONFIG = load_config(
         "features.num_keypoints=250",
         "simulated.points_per_view=150",
         "simulated.noise_px=0.3",
-        "simulated.scales=true",
-        "bundle.delay=0",  # young or not, a world grows alike
+        "simulated.with_scales=true",
+        "bundle_adjustment.delay_frames=0",  # young or not, a world grows alike
     ],
 )
 WALK = Walk(arc(30)[:16])
@@ -102,11 +102,11 @@ SAID = told_by(by_matrix)
 
 def test_a_checkpoint_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     whole = run_with(by_matrix)[1]
-    slam, so_far = SLAM(WALK.camera, CONFIG), Progressed()
+    slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
     for index in range(12):
         so_far.results.append(slam.step(SAID[index]))
         so_far.next = index + 1
-    slam.settle()
+    slam.confirm_map()
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
     slam, so_far = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
     resumed = run_sequence(slam, SAID, so_far=so_far)
@@ -167,7 +167,7 @@ def test_gradients_reach_what_says_the_information(kind: str) -> None:
     walk = Walk(arc(6, length=1.0))
     images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
     eyes = Doubtful(walk, kind)
-    clip_slam = ClipSLAM(eyes, config=load_config(None, ["bundle.final_iterations=30"]))
+    clip_slam = ClipSLAM(eyes, config=load_config(None, ["bundle_adjustment.global_iterations=30"]))
     graph = clip_slam.look(images, walk.camera)
 
     def loss(falloff: float) -> Tensor:

@@ -26,16 +26,16 @@ from torchslam.cli import arguments, main
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
 from torchslam.io.frames_file import read_frames
-from torchslam.loop_closing.loop_detector import Recall
-from torchslam.map.file import read_tensors, read_worlds, write_tensors, write_worlds
-from torchslam.map.tracking_state import Track
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.map.file import read_atlas, read_tensors, write_atlas, write_tensors
+from torchslam.map.tracking_state import TrackingState
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
-from torchslam.system.run import Progressed, run_sequence
+from torchslam.system.run import RunProgress, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 # A system is settled once its world is no longer to be taken back. Without any noise, what a run says of its camera
 # would be looked for to the last bit, in hundreds of iterations.
-SETTINGS += ["initialization.min_frames=8", "simulated.noise_px=0.05"]
+SETTINGS += ["initialization.provisional_frames=8", "simulated.noise_px=0.05"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
 CONFIG = load_config(None, SETTINGS)
 FRAMES = 26
@@ -48,12 +48,12 @@ class PowerCut(BaseException):
     """Ends a run wherever it is, as nothing else does."""
 
 
-def half(config: Config = CONFIG) -> tuple[SLAM, Progressed]:
+def half(config: Config = CONFIG) -> tuple[SLAM, RunProgress]:
     """A system in the middle of the walk."""
-    slam, so_far = SLAM(WALK.camera, config), Progressed()
+    slam, so_far = SLAM(WALK.camera, config), RunProgress()
 
     def cut(result: StepResult) -> None:
-        if result.index >= STOP and slam.is_settled:
+        if result.index >= STOP and slam.can_checkpoint:
             raise PowerCut
 
     with pytest.raises(PowerCut):
@@ -66,7 +66,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
     slam.foreign.stillness.evidence[3, 4] = 1  # too little to matter
-    slam.memory.recalls.append(Recall(15, 3, 0, 0))
+    slam.memory.recalls.append(LoopClosureRecord(15, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -88,13 +88,13 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
         assert replace(after, **plain) == replace(before, **plain, stage_ms=times)
     assert resumed.last_frame == slam.last_frame
     assert resumed.session.number == 0
-    assert resumed.is_settled
+    assert resumed.can_checkpoint
     assert resumed.world is not None
     assert slam.world is not None
     assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
     assert resumed.state is State.TRACKING
-    assert resumed.memory.recalls == [Recall(15, 3, 0, 0)]
-    for column in fields(Track):
+    assert resumed.memory.recalls == [LoopClosureRecord(15, 3, 0, 0)]
+    for column in fields(TrackingState):
         before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
         assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
             column.name
@@ -107,7 +107,7 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
     resumed = run_sequence(slam, WALK, None, so_far)
     for name, run in (("whole", whole), ("resumed", resumed)):
-        write_worlds(tmp_path / name, run.worlds, run.camera, run.sessions)
+        write_atlas(tmp_path / name, run.worlds, run.camera, run.sessions)
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
     assert [result.index for result in resumed.results] == list(range(FRAMES))
     assert torch.equal(resumed.trajectory.T_wc, whole.trajectory.T_wc)
@@ -116,12 +116,14 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path
 
 @pytest.mark.parametrize("window", [3, 1000])  # few keyframes are enough to wait, or none are
 def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, window: int) -> None:
-    config = load_config(None, [*SETTINGS, "bundle.delay=3", f"bundle.window={window}"])
+    config = load_config(
+        None, [*SETTINGS, "bundle_adjustment.delay_frames=3", f"bundle_adjustment.local_window={window}"]
+    )
     whole = SLAM(WALK.camera, config).run(WALK)
-    slam, so_far = SLAM(WALK.camera, config), Progressed()
+    slam, so_far = SLAM(WALK.camera, config), RunProgress()
 
     def cut(result: StepResult) -> None:
-        if slam.is_settled and slam.mapper.adjusting:
+        if slam.can_checkpoint and slam.mapper.adjusting:
             raise PowerCut
 
     with pytest.raises(PowerCut):
@@ -130,7 +132,7 @@ def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, wind
     resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, config)
     assert resumed.mapper.adjusting
     assert resumed.mapper.adjusting.due == slam.mapper.adjusting.due
-    assert resumed.mapper.adjusting.is_due_first is (window == 1000)
+    assert resumed.mapper.adjusting.due_before_next_frame is (window == 1000)
     run = run_sequence(resumed, WALK, None, loaded)
     assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
     assert torch.equal(run.online.T_wc, whole.online.T_wc)
@@ -150,11 +152,11 @@ def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: P
             read_checkpoint(checkpoint, other, CONFIG)
     with pytest.raises(ResultsError, match="with another configuration"):
         read_checkpoint(checkpoint, WALK, replace(CONFIG, seed=1))
-    write_worlds(tmp_path / "map", [], WALK.camera)
+    write_atlas(tmp_path / "map", [], WALK.camera)
     with pytest.raises(ResultsError, match="a map, but not a checkpoint"):
         read_checkpoint(tmp_path / "map", WALK, CONFIG)
     with pytest.raises(ResultsError, match="foreign tensors: run"):
-        read_worlds(checkpoint)
+        read_atlas(checkpoint)
 
 
 DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
@@ -182,7 +184,7 @@ def test_damaged_checkpoints_are_refused(
 
 def test_only_a_settled_system_is_kept(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="held back"):
-        write_checkpoint(tmp_path / "x", SLAM(WALK.camera, CONFIG), Progressed(), WALK)
+        write_checkpoint(tmp_path / "x", SLAM(WALK.camera, CONFIG), RunProgress(), WALK)
 
 
 # --- the command ---------------------------------------------------------------------------------------------
@@ -267,7 +269,7 @@ def test_results_are_not_overwritten_unless_told(
     assert "no checkpoint to resume" in capsys.readouterr().err
     assert (tmp_path / "map.safetensors").read_bytes() == b"the work of years"
     assert command(tmp_path, "--overwrite") == 0
-    read_worlds(tmp_path / "map.safetensors")
+    read_atlas(tmp_path / "map.safetensors")
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -345,13 +347,13 @@ def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch:
     from torchslam.cli import result_folder as folder
 
     taken: list[int] = []
-    slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, is_settled=True)
+    slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, can_checkpoint=True)
     state.worlds = [SimpleNamespace(map=slam_map)]
     monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
-    checkpoints = folder.Checkpoints(tmp_path, 10, state, Progressed(), WALK)  # type: ignore[arg-type]
+    checkpoints = folder.Checkpoints(tmp_path, 10, state, RunProgress(), WALK)  # type: ignore[arg-type]
     for count in range(1, 1001):
         slam_map.num_keyframes = count
-        state.is_settled = count not in (30, 31)
+        state.can_checkpoint = count not in (30, 31)
         checkpoints.offer()
     assert taken[:4] == [10, 20, 32, 42]
     gaps = [after - before for before, after in itertools.pairwise(taken)]
@@ -371,7 +373,7 @@ def test_a_saved_map_is_gone_on_in_and_localised_in(
     content = (tmp_path / "first" / "map.safetensors").read_bytes()
     assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration beside the map
     assert "session" in capsys.readouterr().out
-    grown = read_worlds(tmp_path / "second" / "map.safetensors")
+    grown = read_atlas(tmp_path / "second" / "map.safetensors")
     (world,) = grown.worlds
     assert grown.sessions == 2
     assert len(world.trajectory(0)) == len(world.trajectory(1)) == FRAMES
@@ -392,7 +394,7 @@ def test_maps_that_cannot_be_gone_on_in(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = WALK.camera.with_params(WALK.camera.params + 1)
-    write_worlds(tmp_path / "map", [], other)
+    write_atlas(tmp_path / "map", [], other)
     assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 2
     assert "made with the camera pinhole 401,401,160.5,120.5 of 320 x 240" in capsys.readouterr().err
     assert command(tmp_path / "out", "--map", str(tmp_path / "nowhere")) == 2
@@ -407,7 +409,7 @@ def test_the_camera_of_a_map_is_known_to_as_many_digits_as_a_calibration_file_ha
     tmp_path: Path, cut: type[Cut]
 ) -> None:
     rounded = WALK.camera.with_params(WALK.camera.params * (1 + 4e-10))
-    write_worlds(tmp_path / "map", [], rounded)
+    write_atlas(tmp_path / "map", [], rounded)
     assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 0
 
 

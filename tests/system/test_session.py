@@ -9,15 +9,15 @@ import torch
 
 from tests.map.simulated import CAMERA, simulated_world
 from torchslam.errors import ResultsError
-from torchslam.map.atlas import Worlds
-from torchslam.map.file import read_worlds
+from torchslam.map.atlas import Atlas
+from torchslam.map.file import read_atlas
 from torchslam.system.session import Session
 
 
 def in_a_world() -> Session:
     world = simulated_world()
-    world.map.points["last_seen"][:] = 7
-    return Session(CAMERA, Worlds.of([world], 1, CAMERA.params))
+    world.map.points["last_seen_frame"][:] = 7
+    return Session(CAMERA, Atlas.of([world], 1, CAMERA.params))
 
 
 def test_each_session_has_the_next_number(tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Pa
     session = Session.load(path, mapping=False)
     assert (session.number, session.count) == (1, 1)
     (world,) = session.worlds
-    assert (world.map.points["last_seen"] == 7).all()
+    assert (world.map.points["last_seen_frame"] == 7).all()
     session.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
@@ -44,12 +44,12 @@ def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Pa
 def test_where_the_map_may_change_frames_are_numbered_anew(tmp_path: Path) -> None:
     in_a_world().save(tmp_path / "map")
     (world,) = Session.load(tmp_path / "map").worlds
-    assert (world.map.points["last_seen"] == -1).all()
+    assert (world.map.points["last_seen_frame"] == -1).all()
 
 
 def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
-    Session(CAMERA, Worlds(CAMERA.params)).save(tmp_path / "empty")
-    assert read_worlds(tmp_path / "empty").sessions == 1
+    Session(CAMERA, Atlas(CAMERA.params)).save(tmp_path / "empty")
+    assert read_atlas(tmp_path / "empty").sessions == 1
     assert len(Session.load(tmp_path / "empty").worlds) == 0
     with pytest.raises(ResultsError, match="no world in it to localise in"):
         Session.load(tmp_path / "empty", mapping=False)

@@ -59,7 +59,7 @@ def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_pat
     slam = SLAM.load(first[2], config_of())
     assert slam.map.num_keyframes == first[1].map.num_keyframes
     assert len(slam.trajectory()) == 0
-    assert (slam.map.points["last_seen"] == -1).all()  # frames are numbered anew
+    assert (slam.map.points["last_seen_frame"] == -1).all()  # frames are numbered anew
     run = slam.run(SEEN.part(FIRST - 10))
     assert len(run.worlds) == 1
     assert run.session == 1
@@ -106,7 +106,7 @@ def test_localising_leaves_the_map_as_it_is(first: tuple[SLAM, Run, Path], tmp_p
 
 
 def test_localising_elsewhere_finds_nothing_and_begins_nothing(first: tuple[SLAM, Run, Path]) -> None:
-    slam = SLAM.load(first[2], config_of("relocalization.patience=2"), mapping=False)
+    slam = SLAM.load(first[2], config_of("relocalization.frames_before_new_submap=2"), mapping=False)
     run = slam.run(eyes(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
     assert {result.state for result in run.results} == {State.LOST}
     assert len(run.worlds) == 1
@@ -185,7 +185,7 @@ class Stumbling(Sequence):
 
 
 def test_a_run_skips_frames_that_cannot_be() -> None:
-    slam = SLAM(WALK.camera, config_of("bundle.final=false"))
+    slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run = slam.run(eyes().of(Stumbling()))
@@ -197,7 +197,7 @@ def test_a_run_skips_frames_that_cannot_be() -> None:
 
 @pytest.mark.parametrize("before", [lambda slam: slam.run(SEEN.part(0, 5)), lambda slam: slam.step(SEEN[0])])
 def test_a_second_run_is_refused_until_reset(before: Callable[[SLAM], object]) -> None:
-    slam = SLAM(WALK.camera, config_of("bundle.final=false"))
+    slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
     before(slam)
     with pytest.raises(TorchslamError, match=r"reset\(\).*SLAM.load\(\)"):
         slam.run(SEEN.part(0, 5))

@@ -16,16 +16,14 @@ from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, loa
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
-from torchslam.geometry import Noise, se3_inverse, se3_log, transform
+from torchslam.geometry import KeypointNoise, se3_inverse, se3_log, transform
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.mapping.async_bundle import Adjusting
-from torchslam.mapping.map_initialization import Founder
+from torchslam.map.submap import Submap
+from torchslam.mapping.async_bundle import AsyncBundleAdjustment
+from torchslam.mapping.map_initialization import MapInitializer
 from torchslam.system.front_end import Simulated
-from torchslam.system.lost import FOUND_AGAIN
-from torchslam.system.tracking_state import STARTED_ANEW
 from torchslam.tracking.localizer import Localizer
-from torchslam.types import Start, View
+from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -46,8 +44,8 @@ def test_exact_features_give_the_exact_trajectory() -> None:
 @pytest.mark.parametrize("scales", ["false", "true"])
 def test_noise_and_outliers_are_withstood(scales: str) -> None:
     walk = Walk(arc(60)[:30])
-    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
-    run = run_walk(walk, *noisy, f"simulated.scales={scales}")
+    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "simulated.dropout_ratio=0.1")
+    run = run_walk(walk, *noisy, f"simulated.with_scales={scales}")
     assert len(run.trajectory) == 30
     result = evaluate(run.trajectory, walk.groundtruth)
     assert result.ate_m < 0.01 * result.path_length_m
@@ -61,8 +59,8 @@ def test_the_scale_of_ground_truth() -> None:
 
 def test_unit_scale_puts_the_median_depth_of_the_start_at_one() -> None:
     walk = Walk(arc(12))
-    run = run_walk(walk, "bundle.enabled=false", "mapping.cull=false")
-    born = run.map.points["born"] == 1
+    run = run_walk(walk, "bundle_adjustment.local=false", "mapping.cull=false")
+    born = run.map.points["first_keyframe"] == 1
     assert float(run.map.positions_w[born, 2].median()) == pytest.approx(1.0, rel=0.2)
 
 
@@ -79,7 +77,7 @@ def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, mess
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
     walk = Walk(arc(40)[:16])
-    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1")
+    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
     one, two, other = run_walk(walk, *noisy), run_walk(walk, *noisy), run_walk(walk, *noisy, "seed=1")
     assert torch.equal(one.trajectory.T_wc, two.trajectory.T_wc)
     assert torch.equal(one.map.positions_w, two.map.positions_w)
@@ -104,9 +102,9 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     states = [r.state for r in run.results]
     assert states[35:40] == [State.LOST] * 5
     assert all(r.T_cw is None for r in run.results[35:40])
-    confirmed = 40 + Config().relocalization.confirmations
+    confirmed = 40 + Config().relocalization.num_confirming_frames
     assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
-    assert run.results[40].reason == FOUND_AGAIN
+    assert run.results[40].reason == Reason.FOUND_AGAIN
     assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
     assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
     assert len(run.worlds) == 1
@@ -120,7 +118,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
 ) -> None:
     walk = Gap(arc(60)[:42])
     with monkeypatch.context() as patch:
-        patch.setattr(SLAM, "conclude", SLAM.settle)
+        patch.setattr(SLAM, "finalize", SLAM.confirm_map)
         without = run_walk(walk)
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
     run = slam.run(walk)
@@ -138,7 +136,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     assert len(torch.unique(frames)) == len(frames) == 41
 
 
-class Glimpse(Walk):
+class FrameSnapshot(Walk):
     """From frame 25 on the camera is where nothing was ever seen, but for one frame that shows frame 20 again."""
 
     def __getitem__(self, index: int) -> Frame:
@@ -151,10 +149,10 @@ class Glimpse(Walk):
 
 
 def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
-    run = run_walk(Glimpse(arc(34)))
+    run = run_walk(FrameSnapshot(arc(34)))
     states = [r.state for r in run.results]
     assert states[25:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
-    assert run.results[28].reason == FOUND_AGAIN
+    assert run.results[28].reason == Reason.FOUND_AGAIN
     assert len(run.trajectory) == 25
     assert int(run.map.keyframes["frame_index"].max()) < 25
     assert int(run.history.frames["frame_index"].max()) < 25
@@ -165,13 +163,18 @@ def test_a_start_must_explain_the_frames_since_its_reference(
     least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reference frame is explained, the one that starts the map is not."""
-    explains = Founder._explains
+    explains = MapInitializer._explains
     monkeypatch.setattr(
-        Founder, "_explains", lambda founder, world, view: explains(founder, world, view) and view.index == 0
+        MapInitializer,
+        "_explains",
+        lambda founder, world, view: explains(founder, world, view) and view.index == 0,
     )
     walk = Walk(arc(40)[[0, 3]])
     run = run_walk(
-        walk, "simulated.depth_near=7", "simulated.depth_far=25", f"initialization.min_explained={least}"
+        walk,
+        "simulated.depth_near=7",
+        "simulated.depth_far=25",
+        f"initialization.min_explained_ratio={least}",
     )
     assert (len(run.worlds) == 1) is believed
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
@@ -185,16 +188,16 @@ def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
     few = ("initialization.min_matches=30", "initialization.min_points=20")
     walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
     monkeypatch.setattr("torchslam.tracking.provisional_map.LEAST_SUPPORT", 2.0)
-    found, founded = Founder.found, []
+    found, founded = MapInitializer.found, []
 
-    def counted(founder: Founder, world: World, start: Start, views: list[View]) -> str:
+    def counted(founder: MapInitializer, world: Submap, start: TwoViewMap, views: list[FrameFeatures]) -> str:
         founded.append(views)
         return found(founder, world, start, views) if explained or len(founded) == 1 else "it does not"
 
-    monkeypatch.setattr(Founder, "found", counted)
+    monkeypatch.setattr(MapInitializer, "found", counted)
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
     run = slam.run(walk)
-    anew = [r for r in run.results if r.reason == STARTED_ANEW]
+    anew = [r for r in run.results if r.reason == Reason.STARTED_ANEW]
     assert len(founded) > 1
     assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
     assert len(run.trajectory) == 30
@@ -221,8 +224,8 @@ def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 
 
-JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.noise_px=0.5", "simulated.scales=true",
-          "relocalization.patience=3", "initialization.min_frames=8")  # fmt: skip
+JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.noise_px=0.5", "simulated.with_scales=true",
+          "relocalization.frames_before_new_submap=3", "initialization.provisional_frames=8")  # fmt: skip
 
 
 def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
@@ -401,7 +404,7 @@ def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
         depth_far=settings.depth_far,
         seed=slam.config.seed,
     )
-    ids = slam.map.living_points()
+    ids = slam.map.valid_points()
     same = (slam.map.points["descriptors"][ids][:, None] == scene.descriptors).all(-1)
     assert same.any(1).all()
     return scene.points_w[same.int().argmax(1)], ids
@@ -414,12 +417,14 @@ def normalised(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
 def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     """An error that is too large for the pixel alone is accepted where the point is uncertain by as much."""
     walk = Walk(arc(40)[:16])
-    run = run_walk(walk, "simulated.noise_px=0.5", "simulated.outliers=0.1", "measurement.gate=mahalanobis")
+    run = run_walk(
+        walk, "simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "measurement.gate=mahalanobis"
+    )
     assert len(run.trajectory) == 16
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
     localizer = Localizer(run.camera, run.config)
     ids = run.map.points_seen_by(torch.tensor([1]))
-    T_cw, noise = run.map.T_cw[1], Noise.of(torch.ones(len(ids), dtype=torch.float64), None)
+    T_cw, noise = run.map.T_cw[1], KeypointNoise.of(torch.ones(len(ids), dtype=torch.float64), None)
     pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
     assert localizer.agrees(run.map, T_cw, ids, pixels, noise).all()
     run.map.points["covariances_w"][ids] = 0
@@ -466,19 +471,21 @@ def test_an_adjustment_is_taken_over_after_some_frames_or_before_the_next_keyfra
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
-    at_once = asked_and_taken(monkeypatch, walk, "bundle.delay=0")
+    at_once = asked_and_taken(monkeypatch, walk, "bundle_adjustment.delay_frames=0")
     assert len(at_once) >= 6
     assert {(what, frame) for what, frame in at_once if what == "asked"} == {
         ("asked", frame) for what, frame in at_once if what == "taken"
     }
     for delay in (1, 3):
-        events = asked_and_taken(monkeypatch, walk, f"bundle.delay={delay}")
+        events = asked_and_taken(monkeypatch, walk, f"bundle_adjustment.delay_frames={delay}")
         kinds = [what for what, _ in events]
         assert kinds[: len(kinds) // 2 * 2] == ["asked", "taken"] * (len(kinds) // 2)  # one after the other
         waits = [taken - asked for (_, asked), (_, taken) in zip(events[::2], events[1::2], strict=False)]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
-    rare = asked_and_taken(monkeypatch, walk, "bundle.delay=2", "keyframes.max_translation=0.6")
+    rare = asked_and_taken(
+        monkeypatch, walk, "bundle_adjustment.delay_frames=2", "keyframes.max_translation=0.6"
+    )
     waits = [taken - asked for (_, asked), (_, taken) in zip(rare[::2], rare[1::2], strict=False)]
     assert 2 in waits
 
@@ -487,39 +494,45 @@ def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
-    begin = Adjusting.begin
+    begin = AsyncBundleAdjustment.begin
 
-    def beginning(self: Adjusting) -> None:
+    def beginning(self: AsyncBundleAdjustment) -> None:
         if self and self._begun is None:
             begun.append(self.due)
         begin(self)
 
-    monkeypatch.setattr(Adjusting, "begin", beginning)
+    monkeypatch.setattr(AsyncBundleAdjustment, "begin", beginning)
     for delay in (0, 2):
         begun.clear()
-        runs.append(run_walk(walk, "bundle.window=1000", f"bundle.delay={delay}"))
+        runs.append(
+            run_walk(walk, "bundle_adjustment.local_window=1000", f"bundle_adjustment.delay_frames={delay}")
+        )
         assert len(begun) > 6
         assert set(begun) == {None}  # no frame is tracked before
     at_once, between = runs
     assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
     assert torch.equal(at_once.map.positions_w, between.map.positions_w)
-    events = asked_and_taken(monkeypatch, walk, "bundle.window=1000", "bundle.delay=2")
+    events = asked_and_taken(
+        monkeypatch, walk, "bundle_adjustment.local_window=1000", "bundle_adjustment.delay_frames=2"
+    )
     assert [what for what, _ in events[:6]] == ["asked", "taken"] * 3
     assert all(taken == asked + 1 for (_, asked), (_, taken) in zip(events[:6:2], events[1:6:2], strict=True))
 
 
 def test_a_camera_that_is_lost_leaves_no_adjustment_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(there_and_elsewhere())
-    events = asked_and_taken(monkeypatch, walk, "bundle.delay=1000", "keyframes.min_overlap=0")
+    events = asked_and_taken(
+        monkeypatch, walk, "bundle_adjustment.delay_frames=1000", "keyframes.min_overlap=0"
+    )
     assert [what for what, _ in events if what == "taken"]
 
 
 def test_a_delay_costs_no_accuracy() -> None:
     walk = Walk(arc(80, 6.0)[:35])
-    noisy = ("simulated.noise_px=0.5", "simulated.outliers=0.1", "simulated.dropout=0.1")
+    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "simulated.dropout_ratio=0.1")
     errors = []
     for delay in (0, 2):
-        run = run_walk(walk, *noisy, f"bundle.delay={delay}")
+        run = run_walk(walk, *noisy, f"bundle_adjustment.delay_frames={delay}")
         assert len(run.trajectory) == 35
         result = evaluate(run.trajectory, walk.groundtruth)
         errors.append(result.ate_m / result.path_length_m)

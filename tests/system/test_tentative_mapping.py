@@ -12,9 +12,9 @@ from torch import Tensor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
-from torchslam.system import tracking_state as following
+from torchslam.system import state_machine as following
 from torchslam.system.front_end import Simulated
-from torchslam.system.tentative_mapping import OnTrial
+from torchslam.system.tentative_mapping import TentativeMapping
 from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking import pose_confirmation as probation
 from torchslam.tracking.dynamic.independent_motion import NOTHING
@@ -63,7 +63,7 @@ def shown(slam: SLAM, walk: Walk, each: Callable[[int], None] = lambda _: None) 
 def tables(slam: SLAM) -> dict[str, Tensor]:
     """The columns of a map, but for when points were looked for."""
     points, keyframes = slam.map.points.columns(), slam.map.keyframes.columns()
-    return {name: column for name, column in (points | keyframes).items() if name != "last_seen"}
+    return {name: column for name, column in (points | keyframes).items() if name != "last_seen_frame"}
 
 
 def test_the_map_grows_on_trial_and_is_kept_when_it_is_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,7 +91,7 @@ def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: 
     assert len(slam.memory.places) == slam.map.num_keyframes == grown[DOUBTED[0] - 1]
 
     cautious = doubting(monkeypatch, DOUBTED)
-    monkeypatch.setattr(OnTrial, "take", lambda *_: None)
+    monkeypatch.setattr(TentativeMapping, "take", lambda *_: None)
     assert shown(cautious, walk) == states
     assert tables(slam).keys() == tables(cautious).keys()
     for name, column in tables(slam).items():
@@ -123,7 +123,7 @@ def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyP
     slam = doubting(monkeypatch, range(22, 60))
     states = shown(slam, walk)
     before = slam.map.num_keyframes
-    slam.conclude()
+    slam.finalize()
     assert states[-1] is State.UNCERTAIN
     assert len(slam.trajectory()) == len(walk)
     assert slam.map.num_keyframes == before
@@ -133,7 +133,7 @@ def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyP
 
 def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
     """No world may begin before frame `LATE`: what comes before waits for the way back."""
-    beginning = slam._following.beginning
+    beginning = slam._states.beginning
     step = beginning.step
     monkeypatch.setattr(beginning, "step", lambda view: "wait" if view.index < LATE else step(view))
 
@@ -172,7 +172,7 @@ def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.Mo
     assert len(slam.memory.places) == slam.map.num_keyframes
 
 
-@pytest.mark.parametrize(("end", "posed"), [(SLAM.conclude, 36), (SLAM.settle, 22)])
+@pytest.mark.parametrize(("end", "posed"), [(SLAM.finalize, 36), (SLAM.confirm_map, 22)])
 def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
     end: Callable[[SLAM], None], posed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,8 +217,8 @@ def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: py
     recognizer, world = slam.memory.recognizer, slam.world
     assert world is not None
     monkeypatch.setattr(recognizer, "recognize", lambda _, keyframe: asked.append(keyframe))
-    slam._following.loop_closing.look_back(world)
+    slam._states.loop_closing.detect_and_close(world)
     assert not asked  # it is known already
     slam.memory.looks_known = -1, False
-    slam._following.loop_closing.look_back(world)
+    slam._states.loop_closing.detect_and_close(world)
     assert asked == [newest]

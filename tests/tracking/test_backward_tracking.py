@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways, world_in
-from torchslam.config import Config, JudgeConfig
-from torchslam.map.submap import World
+from torchslam.config import Config, PoseValidationConfig
+from torchslam.map.submap import Submap
 from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking.backward_tracking import MISSES, track_back
 from torchslam.tracking.pose_confirmation import Held
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(300)
 AWAY = pose(0, 0, 0, 0, 3.0)  # looks back: sees nothing
@@ -31,26 +31,26 @@ class Ledger:
         self.tried: list[int] = []
         self.dropped = 0
 
-    def take(self, world: World, view: View, tracked: Tracked) -> None:
+    def take(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
         self.taken[view.index] = tracked.T_cw
 
-    def try_out(self, world: World, view: View, tracked: Tracked) -> bool:
+    def try_out(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> bool:
         self.tried.append(view.index)
         return False
 
-    def keep(self, world: World, held: list[Held]) -> None:
+    def keep(self, world: Submap, held: list[Held]) -> None:
         for view, tracked, T_cr, reference in held:
             self.taken[view.index] = tracked.T_cw
             torch.testing.assert_close(T_cr @ world.map.T_cw[reference], tracked.T_cw)
 
-    def drop(self, world: World) -> None:
+    def drop(self, world: Submap) -> None:
         self.dropped += 1
 
 
-def walked(T_cw: Tensor, judge: JudgeConfig | None = None, noise: float = 0.0) -> Ledger:
+def walked(T_cw: Tensor, judge: PoseValidationConfig | None = None, noise: float = 0.0) -> Ledger:
     """What became of cameras at T_cw (F, 4, 4), the first the one before the world's first keyframe, frame 100."""
     world = world_in(SCENE, sideways(4), first=100)
-    config = replace(Config(), judge=judge or JudgeConfig())
+    config = replace(Config(), pose_validation=judge or PoseValidationConfig())
     tracker, ledger = Tracker(CAMERA, config), Ledger()
     tracker.follow(world, 0)
     views = [SCENE.view(99 - offset, T, noise=noise) for offset, T in enumerate(T_cw)]
@@ -60,7 +60,7 @@ def walked(T_cw: Tensor, judge: JudgeConfig | None = None, noise: float = 0.0) -
 
 
 def back(
-    T_cw: Tensor, judge: JudgeConfig | None = None, noise: float = 0.0
+    T_cw: Tensor, judge: PoseValidationConfig | None = None, noise: float = 0.0
 ) -> tuple[list[int], dict[int, Tensor]]:
     """Frames posed, and where; see `walked`."""
     taken = walked(T_cw, judge, noise).taken
@@ -97,13 +97,13 @@ def test_many_frames_that_see_nothing_end_the_way() -> None:
 def test_frames_whose_poses_are_not_sound_are_not_taken() -> None:
     T_cw = sideways(3, -0.05, start=-0.05)
     assert back(T_cw, noise=0.5)[0] == [99, 98, 97]
-    assert back(T_cw, JudgeConfig(max_rotation_std_deg=1e-6), noise=0.5)[0] == []
+    assert back(T_cw, PoseValidationConfig(max_rotation_std_deg=1e-6), noise=0.5)[0] == []
 
 
 def test_a_jump_from_where_the_motion_leads_is_doubted() -> None:
     T_cw = sideways(4, -0.05, start=-0.05)
     # the first frame has no motion to be compared with; the motion from the first to the third is too large
-    judge = JudgeConfig(max_jump=0.03)
+    judge = PoseValidationConfig(max_jump=0.03)
     T_cw[2:] = sideways(2, -0.05, start=-0.5)
     assert back(T_cw, judge)[0] == [99, 98]
 
@@ -132,7 +132,7 @@ def test_strange_frames_are_not_kept_where_the_way_ends(monkeypatch: pytest.Monk
 def test_strange_frames_are_kept_once_as_many_certain_ones_as_are_asked_for_follow(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = JudgeConfig().confirmations
+    asked = PoseValidationConfig().num_confirming_frames
     T_cw = sideways(15, -0.02, start=-0.02)
     for certain, posed in ((asked - 1, [99]), (asked, list(range(99, 96 - asked, -1)))):
         doubting(monkeypatch, {1, 2})

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, centre, pose
 from torchslam.config import InitializationConfig, load_config
-from torchslam.geometry import Noise, Triangulation, transform
+from torchslam.geometry import KeypointNoise, Triangulation, transform
 from torchslam.tracking.initialization import Initializer, is_good, refine_pair, why_not
-from torchslam.types import Start, View
+from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
 SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
@@ -22,12 +22,12 @@ SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
 
 def tried(
     T_cw: Tensor, *overrides: str, scene: Scene = SCENE, noise: float = 0.0
-) -> tuple[Start | None, str]:
+) -> tuple[TwoViewMap | None, str]:
     """The last answer for views at T_cw (F, 4, 4)."""
     return tried_views([scene.view(index, T, noise=noise) for index, T in enumerate(T_cw)], *overrides)
 
 
-def tried_views(views: list[View], *overrides: str) -> tuple[Start | None, str]:
+def tried_views(views: list[FrameFeatures], *overrides: str) -> tuple[TwoViewMap | None, str]:
     initializer = Initializer(CAMERA, load_config(None, overrides))
     for view in views:
         answer = initializer.step(view)
@@ -88,7 +88,9 @@ def test_a_camera_that_stands_is_told_from_one_that_moves() -> None:
         assert ("stands still" in tried_views([views[0], moved])[1]) is still
 
 
-def static(view: View, share: float, order: Tensor, at_rest: View, rest_order: Tensor) -> View:
+def static(
+    view: FrameFeatures, share: float, order: Tensor, at_rest: FrameFeatures, rest_order: Tensor
+) -> FrameFeatures:
     """The view in which a share of the points is seen where another view has them."""
     count = round(share * len(order))
     chosen = torch.arange(count)
@@ -189,7 +191,7 @@ def test_a_plane_is_believed_after_a_while() -> None:
     for patience, believed in ((4, True), (5, False)):
         start, reason = tried(
             poses,
-            f"initialization.planar_patience={patience}",
+            f"initialization.min_planar_frames={patience}",
             "initialization.min_points=30",
             scene=WALL,
             noise=0.2,
@@ -206,7 +208,7 @@ def test_planes_seen_with_an_earlier_reference_do_not_count() -> None:
     poses = torch.stack([pose(), *[TURNED] * 3, pose(), TURNED])
     start, reason = tried(
         poses,
-        "initialization.planar_patience=4",
+        "initialization.min_planar_frames=4",
         "initialization.max_reference_age=4",
         "initialization.min_points=30",
         scene=WALL,
@@ -293,7 +295,7 @@ def refined(scales: Tensor, off: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Refinement from the truth, in units of twice the baseline, with pixels of the second view off by (n, 2)."""
     points_w = SCENE.points_w[:200]
     pixels = [CAMERA.project(transform(T, points_w))[0] for T in (pose(), SIDE)]
-    return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, Noise.of(scales, None), CAMERA)
+    return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, KeypointNoise.of(scales, None), CAMERA)
 
 
 def test_a_pair_that_is_right_stays_as_it_is() -> None:

@@ -10,10 +10,10 @@ import torch
 from tests.map.simulated import tracked_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
-from torchslam.geometry import Noise, Undistorted, transform
-from torchslam.map.submap import World
+from torchslam.geometry import KeypointNoise, UndistortedKeypoints, transform
+from torchslam.map.submap import Submap
 from torchslam.tracking.localizer import Localizer
-from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.tracker import Tracker
 
 SCENE = Scene.of(300)
@@ -24,7 +24,7 @@ def localizer(*overrides: str) -> Localizer:
     return Localizer(CAMERA, load_config(None, overrides))
 
 
-def world() -> World:
+def world() -> Submap:
     return world_in(SCENE, sideways(4))
 
 
@@ -49,7 +49,7 @@ def test_where_few_of_the_matches_agree_others_are_heard(
     ]
     asked = iter(answers)
     monkeypatch.setattr(finder, "_locate", lambda *_: next(asked))
-    nobody = Pairs(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
+    nobody = MatchIndices(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
     view = SCENE.view(50, pose())
     tracked = finder.locate(here.map, view, iter([nobody] * len(poses)), here.track.local_points)
     assert tracked is (None if chosen is None else answers[chosen])
@@ -63,8 +63,8 @@ def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
     view = SCENE.view(50, T_cw)
     at = torch.nonzero(view.mask)[:, 0]
     there = ROWS[SCENE.shows(50)[at]]
-    alive = here.map.points["alive"][there]
-    matches = iter([Pairs(there[alive][:30], at[alive][:30])])
+    alive = here.map.points["is_valid"][there]
+    matches = iter([MatchIndices(there[alive][:30], at[alive][:30])])
     tracked = finder.locate(here.map, view, matches, here.track.local_points)
     assert tracked is not None
     torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
@@ -85,10 +85,12 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
     off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
     scales = torch.full((len(seen),), scale, dtype=torch.float64)
-    agreeing = localizer().agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
+    agreeing = localizer().agrees(here.map, T_cw, seen, pixels + off, KeypointNoise.of(scales, None))
     assert agreeing.all() if agrees else not agreeing.any()
-    wide = localizer("measurement.chi_square=24")
-    assert wide.agrees(here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, Noise.of(scales, None)).all()
+    wide = localizer("measurement.max_chi_square=24")
+    assert wide.agrees(
+        here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, KeypointNoise.of(scales, None)
+    ).all()
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
@@ -108,7 +110,7 @@ def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: 
     for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
         off = torch.zeros(2, dtype=torch.float64)
         off[axis] = offset * sigma * math.sqrt(5.991)
-        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, Noise.of(scales, None))
+        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, KeypointNoise.of(scales, None))
         assert agreeing.all() if agrees else not agreeing.any()
 
 
@@ -121,7 +123,7 @@ def test_points_behind_the_camera_agree_with_nothing() -> None:
     for gate in ("chi_square", "mahalanobis"):
         by = localizer(f"measurement.gate={gate}")
         assert not by.agrees(
-            here.map, T_cw, seen, middle, Noise.of(torch.ones(len(seen), dtype=torch.float64), None)
+            here.map, T_cw, seen, middle, KeypointNoise.of(torch.ones(len(seen), dtype=torch.float64), None)
         ).any()
 
 
@@ -134,7 +136,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     coarse = torch.arange(len(seen)) % 2 == 1
     scales = torch.where(coarse, 4.0, 1.0).double()
     shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-    noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+    noise, undistorted = KeypointNoise.of(scales, None), UndistortedKeypoints.of(shifted, CAMERA)
     refined, errors, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
     assert agrees.all()
     fitted = CAMERA.project(transform(refined.T_cw, here.map.positions_w[seen]))[0]
@@ -152,7 +154,7 @@ def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
     wrong = torch.arange(len(seen)) < len(seen) // 4
     for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
         shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-        noise, undistorted = Noise.of(scales, None), Undistorted.of(shifted, CAMERA)
+        noise, undistorted = KeypointNoise.of(scales, None), UndistortedKeypoints.of(shifted, CAMERA)
         refined, _, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
         assert torch.equal(agrees, ~wrong)
         torch.testing.assert_close(refined.T_cw, T_cw, atol=exact, rtol=0)

@@ -14,8 +14,8 @@ from torch import Tensor
 from tests.walks import Walk, arc
 from torchslam import SLAM, Matches, Run, load_config
 from torchslam.errors import ConfigError
-from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, nearest_keypoints
-from torchslam.types import State, View
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, MatchPrior, nearest_keypoints
+from torchslam.types import FrameFeatures, State
 
 CONFIG = load_config(
     None,
@@ -24,7 +24,7 @@ CONFIG = load_config(
         "features.num_keypoints=250",
         "simulated.points_per_view=150",
         "simulated.noise_px=0.4",
-        "simulated.outliers=0.05",
+        "simulated.outlier_ratio=0.05",
     ],
 )
 WALK = Walk(arc(36)[:22])
@@ -42,7 +42,7 @@ class Wrapped:
         self.own, self.wants_images = DescriptorMatcher(CONFIG.matching), wants_images
         self.asked: set[str] = set()
 
-    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+    def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         kind = "anywhere" if prior is None else "lines" if prior.radius_px is None else "near"
         self.asked.add(kind)
         assert (view_2.image is not None) == self.wants_images
@@ -69,7 +69,7 @@ class Counting(Wrapped):
         super().__init__()
         self.asked_by: Counter[str] = Counter()
 
-    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+    def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         modules = {Path(frame.filename).stem for frame in traceback.extract_stack()}
         # Relocalisation asks through the tracker, which then is not tracking.
         stages = ("initialization", "youth", "new_points", "relocalization", "tracker")
@@ -83,7 +83,7 @@ def test_it_is_asked_in_all_stages() -> None:
     behind = poses[18:20].clone()
     behind[:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y
     walk = Walk(torch.cat([poses[:18], behind, poses[12:22]]))
-    matcher, initialization = Counting(), replace(CONFIG.initialization, min_frames=8)
+    matcher, initialization = Counting(), replace(CONFIG.initialization, provisional_frames=8)
     run = SLAM(walk.camera, replace(CONFIG, initialization=initialization), matcher=matcher).run(walk)
     states = [result.state for result in run.results]
     assert states[18:20] == [State.LOST, State.LOST]
@@ -108,7 +108,7 @@ class Doubting(Wrapped):
 
     weighs = True
 
-    def __call__(self, view_1: View, view_2: View, prior: Prior | None) -> Matches:
+    def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         found = super().__call__(view_1, view_2, prior)
         left = view_2.keypoints[found.indices_2[0], 0] < 160
         return replace(found, weights=torch.where(left, 0.5, 1.0)[None].double())
@@ -149,7 +149,7 @@ def matches(**changes: object) -> Matches:
     ],
 )
 def test_a_wrong_answer_is_named(answer: Matches | None, words: str) -> None:
-    def odd(view_1: View, view_2: View, prior: Prior | None) -> Matches:
+    def odd(view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         return answer  # type: ignore[return-value]
 
     with pytest.raises(ConfigError, match=f"matcher odd: .*{words}"):
@@ -159,7 +159,7 @@ def test_a_wrong_answer_is_named(answer: Matches | None, words: str) -> None:
 def test_pixels_belong_to_the_nearest_keypoint_and_each_keypoint_to_one() -> None:
     keypoints = torch.tensor([[10.0, 10.0], [20.0, 10.0], [30.0, 10.0], [40.0, 10.0]]).double()
     mask = torch.tensor([True, True, True, False])
-    view = View(0, 0.0, keypoints, torch.ones(4).double(), torch.zeros(4), torch.zeros(4, 0), mask)
+    view = FrameFeatures(0, 0.0, keypoints, torch.ones(4).double(), torch.zeros(4), torch.zeros(4, 0), mask)
     pixels = torch.tensor([[11.0, 10.0], [10.0, 10.2], [30.0, 12.0], [40.0, 10.0], [21.0, 10.0]])
     found = nearest_keypoints(pixels, torch.tensor([4, 5, 6, 7, 8]), view)
     assert found.mask.tolist() == [[False, True, False, False, True]]

@@ -8,28 +8,28 @@ import torch
 from tests.map.simulated import tracked_at
 from tests.scene import Scene, pose
 from torchslam.config import Config, load_config
-from torchslam.map.tracking_state import Track
-from torchslam.tracking.pose_confirmation import Probation
-from torchslam.types import Tracked, View
+from torchslam.map.tracking_state import TrackingState
+from torchslam.tracking.pose_confirmation import PoseConfirmation
+from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(10)
 
 
-def frame(index: int) -> tuple[View, Tracked, Track]:
-    track = Track.nowhere(torch.zeros(1, dtype=torch.float64))
+def frame(index: int) -> tuple[FrameFeatures, PoseEstimate, TrackingState]:
+    track = TrackingState.nowhere(torch.zeros(1, dtype=torch.float64))
     track.T_cr, track.reference = pose(0.1 * index), 100 + index
     return SCENE.view(index, pose()), tracked_at(pose(index), torch.arange(5), torch.arange(5)), track
 
 
 def test_nothing_is_held_at_first() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     assert not probation
     assert not probation.came_back
     assert probation.views() == []
 
 
 def test_two_certain_frames_confirm_a_doubtful_one() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     probation.hold(*frame(0), "odd")
     assert probation
     assert probation.reason == "to be confirmed by 2 more frames"
@@ -43,7 +43,7 @@ def test_two_certain_frames_confirm_a_doubtful_one() -> None:
 
 
 def test_another_doubt_begins_the_count_again() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     for index, doubt in enumerate(["odd", "", "odd", ""]):
         probation.hold(*frame(index), doubt)
         assert probation
@@ -52,7 +52,7 @@ def test_another_doubt_begins_the_count_again() -> None:
 
 
 def test_what_came_back_needs_more_confirmations() -> None:
-    probation = Probation(load_config(None, ["relocalization.confirmations=3"]))
+    probation = PoseConfirmation(load_config(None, ["relocalization.num_confirming_frames=3"]))
     probation.come_back(*frame(0))
     assert probation
     assert probation.came_back
@@ -69,14 +69,14 @@ def test_what_came_back_needs_more_confirmations() -> None:
 
 
 def test_coming_back_forgets_what_was_held_before() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     probation.hold(*frame(7), "odd")
     probation.come_back(*frame(8))
     assert [view.index for view in probation.views()] == [8]
 
 
 def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     frames = [frame(index) for index in range(3)]
     probation.come_back(*frames[0])
     for held in frames[1:]:
@@ -91,7 +91,7 @@ def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
 
 
 def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     probation.hold(*frame(0), "odd")
     probation.hold(*frame(1), "")
     assert [held[0].index for held in probation.hand_over()] == [0, 1]
@@ -103,7 +103,7 @@ def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
 
 
 def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_ones() -> None:
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     for index in range(5):
         probation.hold(*frame(index), "odd", is_mapped=index > 2)
     assert probation.reason == "to be confirmed by 5 more frames"
@@ -119,7 +119,7 @@ def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_one
 
 def test_no_more_than_so_many_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.tracking.pose_confirmation.MOST", 3)
-    probation = Probation(Config())
+    probation = PoseConfirmation(Config())
     for index in range(3):
         assert not probation.is_full
         probation.hold(*frame(index), "odd")

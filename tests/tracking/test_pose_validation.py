@@ -11,24 +11,24 @@ from torch import Tensor
 
 from tests.map.simulated import tracked_at
 from tests.scene import pose
-from torchslam.config import JudgeConfig
+from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
-from torchslam.map.tracking_state import Track
+from torchslam.map.tracking_state import TrackingState
 from torchslam.tracking.pose_validation import deviations, jump, why_doubt
-from torchslam.types import Tracked
+from torchslam.types import PoseEstimate
 
-SETTINGS = JudgeConfig()
+SETTINGS = PoseValidationConfig()
 HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
 
 
-def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> Tracked:
+def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> PoseEstimate:
     return tracked_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
 
 
 def doubt(
-    tracked: Tracked, expected: Tensor | None = None, error: float = 0.9, explained: float = 1.0
+    tracked: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained: float = 1.0
 ) -> str:
-    track = replace(Track.nowhere(HERE), error=error, explained=explained)
+    track = replace(TrackingState.nowhere(HERE), error=error, explained=explained)
     return why_doubt(tracked, expected, track, SETTINGS)
 
 
@@ -45,18 +45,18 @@ def test_half_of_the_matches_must_agree() -> None:
 
 
 def test_errors_over_many_frames_must_be_noise() -> None:
-    assert doubt(seen(), error=SETTINGS.max_error - 0.01) == ""
-    assert doubt(seen(), error=SETTINGS.max_error) == ""
+    assert doubt(seen(), error=SETTINGS.max_squared_error - 0.01) == ""
+    assert doubt(seen(), error=SETTINGS.max_squared_error) == ""
     assert doubt(seen(), error=9.0).startswith("the matches of the last frames are off by 3.0 times")
 
 
 def test_enough_of_the_image_must_show_what_is_expected() -> None:
-    assert doubt(seen(coverage=SETTINGS.min_coverage)) == ""
-    assert doubt(seen(coverage=SETTINGS.min_coverage - 0.01)).startswith("only 19% of the image")
+    assert doubt(seen(coverage=SETTINGS.min_coverage_ratio)) == ""
+    assert doubt(seen(coverage=SETTINGS.min_coverage_ratio - 0.01)).startswith("only 19% of the image")
 
 
 def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
-    least = SETTINGS.min_explained
+    least = SETTINGS.min_explained_ratio
     assert doubt(seen(), explained=least) == ""
     assert doubt(seen(explained=0.0)) == ""  # one frame alone proves nothing
     assert doubt(seen(), explained=least - 0.01).startswith(

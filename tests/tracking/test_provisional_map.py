@@ -12,8 +12,8 @@ from tests.scene import CAMERA, Scene, pose, world_in
 from torchslam.config import Config
 from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.provisional_map import INTERVAL, LEAST_SUPPORT, Youth, support
-from torchslam.types import Start, View
+from torchslam.tracking.provisional_map import INTERVAL, LEAST_SUPPORT, ProvisionalMap, support
+from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
 SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
@@ -28,18 +28,18 @@ def swung(degrees: float) -> Tensor:
     return T_cw
 
 
-def young(T_cw: Tensor, age: int = INTERVAL) -> Youth:
+def young(T_cw: Tensor, age: int = INTERVAL) -> ProvisionalMap:
     """A world with a frame at the origin and one at SIDE that the map has at T_cw, in a frame of its own."""
     world = world_in(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
     world.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
-    youth = Youth(world, [SCENE.view(0, pose())])
+    youth = ProvisionalMap(world, [SCENE.view(0, pose())])
     youth.grow(SCENE.view(1, SIDE))
     youth.age = age
     return youth
 
 
-def two_views() -> Start:
+def two_views() -> TwoViewMap:
     initializer = Initializer(CAMERA, Config())
     initializer.step(SCENE.view(0, pose()))
     start, reason = initializer.step(SCENE.view(1, SIDE))
@@ -47,14 +47,14 @@ def two_views() -> Start:
     return start
 
 
-def supported(start: Start, T_21: Tensor) -> float:
+def supported(start: TwoViewMap, T_21: Tensor) -> float:
     pixels_1 = start.reference.keypoints[start.keypoints_1]
     return support(pixels_1, start.view.keypoints[start.keypoints_2], T_21, CAMERA, THRESHOLD)
 
 
 def test_a_world_that_has_the_camera_where_it_was_has_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
     assert young(SIDE).rival(CAMERA, Config()) is None
-    looked: list[View] = []
+    looked: list[FrameFeatures] = []
     monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view) or (None, ""))
     assert young(SIDE).rival(CAMERA, Config()) is None
     assert not looked  # it explains more than half of the matches: no motion can have twice as much support

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.tracking.correspondences import (
     match_keyframe,
     match_points,
@@ -27,13 +27,13 @@ def relocalizer(*overrides: str) -> Relocalizer:
     return Relocalizer(Tracker(CAMERA, config), config)
 
 
-def worlds() -> tuple[World, World]:
+def worlds() -> tuple[Submap, Submap]:
     return world_in(SCENE, sideways(6)), world_in(FAR, sideways(6), number=1)
 
 
 def found(
-    T_cw: Tensor, candidates: list[tuple[World, int]], *overrides: str, noise: float = 0.3
-) -> World | None:
+    T_cw: Tensor, candidates: list[tuple[Submap, int]], *overrides: str, noise: float = 0.3
+) -> Submap | None:
     located = relocalizer(*overrides).locate(SCENE.view(50, T_cw, noise=noise), candidates)
     if located is None:
         return None
@@ -64,10 +64,10 @@ def test_only_so_many_are_tried() -> None:
     candidates = [(other, 0) for other in others]
     assert found(ANYWHERE, [*candidates, (right, 0)]) is None
     assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
-    assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.tries=4") is right
+    assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.max_candidates=4") is right
     # those beside one that failed are not tried, nor do they count
     assert (
-        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.tries=2") is right
+        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.max_candidates=2") is right
     )
 
 
@@ -83,9 +83,9 @@ def test_beside_a_candidate_are_as_many_as_the_local_map_has() -> None:
 
 def test_a_pose_that_is_doubted_is_no_pose() -> None:
     right, _ = worlds()
-    assert found(ANYWHERE, [(right, 0)], "judge.max_position_std=1e-6") is None
-    assert found(ANYWHERE, [(right, 0)], "judge.max_error=1e-3") is None
-    assert found(ANYWHERE, [(right, 0)], "judge.max_jump=1e-9") is right  # nothing was expected
+    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_position_std=1e-6") is None
+    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_squared_error=1e-3") is None
+    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_jump=1e-9") is right  # nothing was expected
 
 
 def test_a_keyframe_matches_by_its_own_descriptors() -> None:
@@ -102,7 +102,7 @@ def test_a_keyframe_matches_by_its_own_descriptors() -> None:
 def test_points_match_by_descriptor_wherever_they_are() -> None:
     right, _ = worlds()
     view = SCENE.view(50, ANYWHERE)
-    ids = right.map.living_points().flip(0)
+    ids = right.map.valid_points().flip(0)
     pairs = match_points(right.map, ids, view, relocalizer().tracker.matching)
     points, keypoints = pairs.first, pairs.second
     assert len(points) > 150
@@ -112,6 +112,6 @@ def test_points_match_by_descriptor_wherever_they_are() -> None:
 
 def test_thresholds_of_bits_and_of_floats() -> None:
     bits, floats = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 2)
-    settings = load_config(None, ["matching.max_distance=50", "matching.max_cosine_distance=0.3"]).matching
+    settings = load_config(None, ["matching.max_hamming_distance=50", "matching.max_cosine_distance=0.3"]).matching
     assert max_distance(bits, settings) == 50
     assert max_distance(floats, settings) == 0.3

@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.tracking.correspondences import Projected, project_points
 from torchslam.tracking.match_selection import (
     CELLS,
@@ -27,7 +27,7 @@ from torchslam.tracking.match_selection import (
     voices,
 )
 from torchslam.tracking.tracker import MEMORY, Tracker, well_observed
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
@@ -39,11 +39,11 @@ def tracker(*overrides: str) -> Tracker:
     return Tracker(CAMERA, load_config(None, overrides))
 
 
-def world(count: int = 4, **options: float) -> World:
+def world(count: int = 4, **options: float) -> Submap:
     return world_in(SCENE, sideways(count), **options)  # type: ignore[arg-type]
 
 
-def followed(where: World, view: View, by: Tracker | None = None) -> Tracked:
+def followed(where: Submap, view: FrameFeatures, by: Tracker | None = None) -> PoseEstimate:
     tracked = (by or tracker()).track(where, view)
     assert tracked is not None
     return tracked
@@ -78,13 +78,13 @@ def test_the_local_map_is_bounded() -> None:
 
 def test_the_local_map_may_be_what_was_seen_lately() -> None:
     here, recent = world(4), tracker("tracking.recent_frames=5")
-    last_seen = here.map.points["last_seen"]
+    last_seen = here.map.points["last_seen_frame"]
     last_seen[:] = 10
     last_seen[:20] = 15
     last_seen[20:30] = 11
-    here.map.kill(torch.tensor([3]))
+    here.map.invalidate(torch.tensor([3]))
     recent.follow(here, 3)
-    wanted = [row for row in range(30) if here.map.points["alive"][row]]
+    wanted = [row for row in range(30) if here.map.points["is_valid"][row]]
     assert here.track.local_points.tolist() == wanted
     last_seen[0] = 16
     recent.follow(here, 3)
@@ -100,7 +100,7 @@ def test_a_prediction_repeats_the_last_motion() -> None:
     torch.testing.assert_close(here.track.velocity, se3_exp(STEP), atol=1e-7, rtol=0)
     torch.testing.assert_close(follower.predict(here), path[2], atol=1e-7, rtol=0)
     torch.testing.assert_close(here.T_cw, path[1], atol=1e-7, rtol=0)
-    torch.testing.assert_close(tracker("tracking.predict=false").predict(here), here.T_cw)
+    torch.testing.assert_close(tracker("tracking.motion_model=false").predict(here), here.T_cw)
     here.track.velocity = None
     torch.testing.assert_close(follower.predict(here), here.T_cw)
 
@@ -129,7 +129,7 @@ def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() ->
     )
     assert torch.equal(here.track.seen_last, tracked.point_ids)
     assert here.track.velocity is not None
-    last_seen = here.map.points["last_seen"]
+    last_seen = here.map.points["last_seen_frame"]
     assert (last_seen[tracked.point_ids] == 50).all()
     others = torch.ones(len(last_seen), dtype=torch.bool).index_fill(0, tracked.point_ids, False)
     assert (last_seen[others] == 0).all()
@@ -149,14 +149,14 @@ def test_a_track_begins_anew_where_a_frame_was_found() -> None:
     here.track.velocity, here.track.error, here.track.explained = pose(0.1), 3.0, 0.1
     view = SCENE.view(50, sideways(1, start=0.02)[0])
     tracked = followed(here.aside(), view, follower)
-    here.map.points["last_seen"][:] = 0
+    here.map.points["last_seen_frame"][:] = 0
     follower.start_at(here, view, tracked)
     assert here.track.reference == 0
     assert here.track.velocity is None
     assert (here.track.error, here.track.explained) == (0.0, 1.0)
     assert torch.equal(here.track.seen_last, tracked.point_ids)
     torch.testing.assert_close(here.T_cw, tracked.T_cw)
-    assert (here.map.points["last_seen"][tracked.point_ids] == 50).all()
+    assert (here.map.points["last_seen_frame"][tracked.point_ids] == 50).all()
 
 
 # --- one frame --------------------------------------------------------------------------------------------------
@@ -204,11 +204,11 @@ def test_the_error_is_in_units_of_the_noise() -> None:
     assert sum(medians) / len(medians) == pytest.approx(1.386 * 0.7**2, rel=0.15)
 
 
-def few(here: World, count: int) -> None:
+def few(here: Submap, count: int) -> None:
     """Leave the map so many of the points that all keyframes see."""
     everyone = torch.nonzero(here.map.points["times_observed"] == here.map.num_keyframes)[:, 0]
-    rest = here.map.living_points()
-    here.map.kill(rest[~torch.isin(rest, everyone[:count])])
+    rest = here.map.valid_points()
+    here.map.invalidate(rest[~torch.isin(rest, everyone[:count])])
     tracker().follow(here, here.map.num_keyframes - 1)
 
 
@@ -226,7 +226,7 @@ def test_enough_matches_must_agree_in_the_end() -> None:
     here = world(2)
     few(here, 40)
     view = SCENE.view(50, sideways(1, start=0.1)[0])
-    wrong = SCENE.at(50)[torch.argsort(ROWS)[here.map.living_points()[:12]]]
+    wrong = SCENE.at(50)[torch.argsort(ROWS)[here.map.valid_points()[:12]]]
     off = view.keypoints.clone()
     off[wrong, 1] += 4.5 * view.scales[wrong]  # near enough to match, too far to agree
     spoiled = replace(view, keypoints=off)
@@ -235,14 +235,14 @@ def test_enough_matches_must_agree_in_the_end() -> None:
     assert tracker("tracking.min_inliers=29").track(here.aside(), spoiled) is None
 
 
-def located(here: World, view: View, T_cw: Tensor) -> Tracked | None:
+def located(here: Submap, view: FrameFeatures, T_cw: Tensor) -> PoseEstimate | None:
     """Track a view from a prediction."""
     aside = here.aside()
     aside.track.T_cr = T_cw @ se3_inverse(here.map.T_cw[here.track.reference])
     aside.track.velocity = None
     other = view.descriptors.clone()
     other[:, 0] ^= 255  # eight bits of noise: no nearest neighbour is a billion times nearer than the second
-    return tracker("matching.ratio=1e-9").track(aside, replace(view, descriptors=other))
+    return tracker("matching.max_ratio=1e-9").track(aside, replace(view, descriptors=other))
 
 
 @pytest.mark.parametrize(("pixels", "found"), [(10.0, True), (35.0, True), (110.0, False)])
@@ -270,7 +270,7 @@ def test_without_a_place_to_look_descriptors_alone_decide() -> None:
 def test_points_that_died_are_not_looked_for() -> None:
     here = world(3)
     dead = here.track.seen_last[:20]
-    here.map.kill(dead)
+    here.map.invalidate(dead)
     tracked = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]))
     assert not torch.isin(tracked.point_ids, dead).any()
 
@@ -355,7 +355,7 @@ def test_a_tracker_that_does_not_count_leaves_the_map_as_it_is() -> None:
 
 def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expected() -> None:
     here = world()
-    ids = here.map.living_points()[:30]
+    ids = here.map.valid_points()[:30]
     here.map.points["times_found"][ids] = SENIOR
     ten, five = [(10.0, 10.0)] * 10, [(100.0, 10.0)] * 5
     twos = [(300.0, 200.0), (300.0, 100.0), (300.0, 10.0)] * 2
@@ -378,14 +378,14 @@ def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expecte
 
 
 def projected(
-    here: World, T_cw: Tensor, angle: float = 60.0, scales: tuple[float, float] = (0.1, 50.0)
+    here: Submap, T_cw: Tensor, angle: float = 60.0, scales: tuple[float, float] = (0.1, 50.0)
 ) -> Projected:
-    return project_points(here.map, here.map.living_points(), T_cw, CAMERA, angle, scales)
+    return project_points(here.map, here.map.valid_points(), T_cw, CAMERA, angle, scales)
 
 
 def test_the_expected_scale_falls_with_the_distance() -> None:
     here = world(1)
-    here.map.points["alive"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
+    here.map.points["is_valid"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
     back = pose(0, 0, 4.0)
     seen = projected(here, back)
     size = SCENE.sizes[torch.argsort(ROWS)[seen.ids]]
@@ -401,7 +401,7 @@ def test_the_expected_scale_falls_with_the_distance() -> None:
 @pytest.mark.parametrize("limit", [20.0, 40.0])
 def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
     here = world(1)
-    here.map.points["alive"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
+    here.map.points["is_valid"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
     middle = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
     angle = math.radians(30.0)
     turn = pose(0, 0, 0, 0, angle)
@@ -414,7 +414,7 @@ def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
     assert alike[kept].all()
     assert 0 < len(kept) < 300
     pixels, valid = CAMERA.project(transform(T_cw, here.map.positions_w))
-    wanted = alike & valid & CAMERA.in_image(pixels) & here.map.points["alive"]
+    wanted = alike & valid & CAMERA.in_image(pixels) & here.map.points["is_valid"]
     assert torch.equal(kept, torch.nonzero(wanted)[:, 0])
 
 

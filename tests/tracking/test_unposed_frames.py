@@ -1,25 +1,25 @@
 from __future__ import annotations
 
 from tests.scene import CAMERA, Scene, pose
-from torchslam.map.atlas import Worlds
-from torchslam.tracking.provisional_map import Youth
-from torchslam.tracking.unposed_frames import Waiting
-from torchslam.types import View
+from torchslam.map.atlas import Atlas
+from torchslam.tracking.provisional_map import ProvisionalMap
+from torchslam.tracking.unposed_frames import UnposedFrames
+from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(5)
 
 
-def views(*indices: int) -> list[View]:
+def views(*indices: int) -> list[FrameFeatures]:
     return [SCENE.view(index, pose()) for index in indices]
 
 
-def waiting_for(limit: int, *indices: int) -> Waiting:
-    waiting = Waiting(limit)
+def waiting_for(limit: int, *indices: int) -> UnposedFrames:
+    waiting = UnposedFrames(limit)
     waiting.add(*views(*indices))
     return waiting
 
 
-def indices(waiting: Waiting) -> list[int]:
+def indices(waiting: UnposedFrames) -> list[int]:
     return [view.index for view in waiting]
 
 
@@ -49,8 +49,8 @@ def test_nobody_waits_where_nobody_may() -> None:
 
 
 def test_a_young_world_counts_its_frames_from_the_start_on() -> None:
-    world = Worlds(CAMERA.params).begin()
-    youth = Youth(world, views(0, 1))
+    world = Atlas(CAMERA.params).begin()
+    youth = ProvisionalMap(world, views(0, 1))
     assert youth.age == 0
     for view in views(2, 3, 4):
         youth.grow(view)

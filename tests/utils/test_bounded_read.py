@@ -16,7 +16,7 @@ from torchslam.data.formats.image_file import read_grey
 from torchslam.errors import LONGEST, TorchslamError
 from torchslam.features.learned import XFeat
 from torchslam.io.frames_file import read_frames
-from torchslam.map.file import read_worlds
+from torchslam.map.file import read_atlas
 from torchslam.utils.bounded_read import check_regular, parse_json, read_bytes, read_text
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -25,7 +25,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "image": lambda path: read_grey(path, str(path)),
     "poses": read_poses,
     "configuration": load_config,
-    "map": read_worlds,
+    "map": read_atlas,
     "frames": read_frames,
     "weights": XFeat,
     "sequence": open_sequence,

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from torchslam.batch.engines import ENGINES, RETRIES, Engine
-from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, failed
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, store_failure
 from torchslam.batch.rows import Row, named, read_list
-from torchslam.batch.run_row import Task, configuration, run_row
 from torchslam.batch.shards import Shard, parse_shard
 from torchslam.batch.table import write_table
+from torchslam.batch.task import Task, configuration, run_row
 
 __all__ = [
     "DONE",
@@ -43,7 +43,7 @@ def run_batch(
     tasks: Sequence[Task],
     engine: Engine | None = None,
     shard: Shard | None = None,
-    told: Callable[[Columns], None] = lambda columns: None,
+    on_progress: Callable[[Columns], None] = lambda columns: None,
 ) -> list[Columns]:
     """Run those of the tasks that are of the shard and not done yet, and write the table of all of them.
 
@@ -56,7 +56,7 @@ def run_batch(
     found: dict[int, Columns] = {}
     for number, columns in engine.each(run_row, [task.as_dict() for task in mine]):
         found[number] = _lost(mine[number]) if columns is None else columns
-        told(found[number])
+        on_progress(found[number])
     if tasks:
         write_table(tasks, Path(tasks[0].output))
     return [found[number] for number in range(len(mine))]
@@ -64,4 +64,4 @@ def run_batch(
 
 def _lost(task: Task) -> Columns:
     known = {"name": task.row.name, "configuration": configuration(task)}
-    return failed(Path(task.output), known, LOST)
+    return store_failure(Path(task.output), known, LOST)

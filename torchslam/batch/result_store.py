@@ -26,10 +26,10 @@ OPEN = "open"
 Columns = dict[str, Any]
 
 
-def keep(
+def run_or_reuse(
     output: Path,
     name: str,
-    marks: Callable[[], Columns],
+    fingerprints_of: Callable[[], Columns],
     work: Callable[[Path], Columns],
     overwrite: bool = False,
 ) -> Columns:
@@ -46,7 +46,7 @@ def keep(
     known: Columns = {"name": name, "configuration": ""}
     place = output / RUNS / name
     try:
-        known |= marks()
+        known |= fingerprints_of()
         record = read_record(place / RECORD)
         if record is not None and all(record.get(key) == value for key, value in known.items()):
             return record | {"is_new": False}
@@ -64,10 +64,10 @@ def keep(
         return columns | {"is_new": True}
     except Exception as error:
         is_meant = isinstance(error, TorchslamError | OSError)
-        return failed(output, known, _in_words(error), "" if is_meant else traceback.format_exc())
+        return store_failure(output, known, _describe(error), "" if is_meant else traceback.format_exc())
 
 
-def failed(output: Path, known: Columns, words: str, trace: str = "") -> Columns:
+def store_failure(output: Path, known: Columns, words: str, trace: str = "") -> Columns:
     """The columns of what ended with an error, which are kept where that can be done."""
     columns = known | {"status": ERROR, "error": words}
     try:
@@ -78,7 +78,7 @@ def failed(output: Path, known: Columns, words: str, trace: str = "") -> Columns
     return columns | {"is_new": True}
 
 
-def read_kept(output: Path, name: str, configuration: str) -> Columns:
+def read_stored(output: Path, name: str, configuration: str) -> Columns:
     """What is known of a name: the record of its results, or why there are none, of this configuration; else `open`."""
     for path in (output / RUNS / name / RECORD, output / ERRORS / f"{name}.json"):
         record = read_record(path)
@@ -106,7 +106,7 @@ def _write(path: Path, columns: Columns) -> None:
     write_whole(path, (json.dumps(columns, indent=2) + "\n").encode())
 
 
-def _in_words(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     """One line; of an error that nobody made on purpose, its kind and where it came from."""
     if isinstance(error, TorchslamError | OSError):
         return str(error)

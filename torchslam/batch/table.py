@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_kept
-from torchslam.batch.run_row import TIMES, Task, configuration
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_stored
+from torchslam.batch.task import TIMES, Task, configuration
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.io import plots
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
@@ -79,7 +79,7 @@ def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -
     for task, settings in zip(tasks, configurations, strict=True):
         name = task.row.name
         try:
-            record = read_kept(output, name, settings)
+            record = read_stored(output, name, settings)
         except ResultsError as error:
             record = {"status": ERROR, "error": str(error)}
         record |= {"name": name, "sequence": task.row.sequence}

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration import Round, calibrate, refine
-from torchslam.calibration.report import contradiction, in_words
+from torchslam.calibration import Round, calibrate, estimate_intrinsics
+from torchslam.calibration.report import contradiction, describe_camera
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.camera_argument import parse_camera
@@ -30,7 +30,7 @@ def find_camera(
     device: torch.device,
     radial: int,
     resume: bool = False,
-    told: Callable[[str], None] = lambda words: None,
+    on_progress: Callable[[str], None] = lambda words: None,
 ) -> tuple[Sequence, str]:
     """The sequence with the camera that its images ask for, and what there is to say of it; the file is written.
 
@@ -53,32 +53,35 @@ def find_camera(
             radial,
             sequence.calibrated is Calibrated.GUESSED,
             device,
-            told=lambda done: told(_in_short(done)),
+            on_progress=lambda done: on_progress(_describe_round(done)),
         )
-    said = in_words(calibrated)
+    description = describe_camera(calibrated)
     frames = calibrated.rounds[-1].frames
-    remarks = [said, f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames"]
+    remarks = [
+        description,
+        f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames",
+    ]
     if calibrated.refined is not None:
         remarks.append(f"relative standard error of the focal length: {calibrated.refined.std:.2g}")
     write_calibration(path, calibrated.camera, remarks)
-    told(said)
-    return sequence.with_camera(calibrated.camera.to("cpu")), said
+    on_progress(description)
+    return sequence.with_camera(calibrated.camera.to("cpu")), description
 
 
-def judged(finished: Run, found: str) -> str:
+def camera_remark(finished: Run, found: str) -> str:
     """What there is to say of the camera of a run: how it was found, and what the run has against its focal length.
 
     found: by `find_camera`, empty where the camera was given. Only a first session that was finished is asked.
     """
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
-        against = contradiction(finished.camera, refine(finished.graph))
+        against = contradiction(finished.camera, estimate_intrinsics(finished.graph))
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
     return f"{against}; --refine-camera looks for a better one" if against else ""
 
 
-def _in_short(done: Round) -> str:
+def _describe_round(done: Round) -> str:
     focal, refined = float(done.camera.focal), done.refined
     asks = (
         "no map" if refined is None else f"{float(refined.camera.focal):.0f} px, {refined.std:.1%} uncertain"

@@ -23,11 +23,11 @@ from torchslam.calibration.keyframes import (
     FOCAL,
     K1,
     K2,
-    adjust,
+    adjust_with_camera,
     directions,
-    part_of,
     problem_of,
-    simplest,
+    simplify_model,
+    subproblem,
     with_radial_terms,
 )
 from torchslam.geometry import Camera
@@ -36,14 +36,14 @@ from torchslam.optim.run_graph import ObservationGraph
 
 # A bend of the lens is believed where it lowers the cost by this share; a smaller one trades places with the focal
 # length and what else is wrong with a map.
-WORTH = 0.02
+MIN_COST_DECREASE = 0.02
 # Relative standard errors of what is not calibrated: centres of sensors lie this far, in widths, off their axes; k1 of
 # a lens that shows no bend.
-CENTRE_STD, K1_STD = 0.01, 0.05
-PARTS, PART_KEYFRAMES = 4, 6  # of the way, and at least so many keyframes in each
-UNCHECKED = 2.0  # how much too small a formal error is where the way is too short to be parted
+PRINCIPAL_POINT_STD, K1_STD = 0.01, 0.05
+NUM_PARTS, PART_KEYFRAMES = 4, 6  # of the way, and at least so many keyframes in each
+UNCHECKED_FACTOR = 2.0  # how much too small a formal error is where the way is too short to be parted
 BOUNDS = 0.3, 5.0  # of the focal length in widths
-UNDETERMINED = 0.1  # relative error from which on a focal length counts as unknown
+MAX_DETERMINED_STD = 0.1  # relative error from which on a focal length counts as unknown
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class Refinement:
     def is_determined(self) -> bool:
         """Whether the motion says what the focal length is."""
         low, high = BOUNDS
-        return self.std < UNDETERMINED and low < float(self.camera.focal) / self.camera.width < high
+        return self.std < MAX_DETERMINED_STD and low < float(self.camera.focal) / self.camera.width < high
 
 
-def refine(
-    graph: ObservationGraph, start: Camera | None = None, radial: int = 0, centre: bool = False
+def estimate_intrinsics(
+    graph: ObservationGraph, start: Camera | None = None, radial: int = 0, principal_point: bool = False
 ) -> Refinement:
     """Fit focal length and, where the residuals ask for them, up to `radial` coefficients to a run's graph.
 
@@ -86,26 +86,26 @@ def refine(
     fits = []
     for n in range(radial + 1):
         begin = torch.cat([camera.params[: 4 + n], base.params[4 + n :]])
-        fits.append(adjust(replace(problem, camera=camera.with_params(begin)), _fitted(n)))
+        fits.append(adjust_with_camera(replace(problem, camera=camera.with_params(begin)), _fitted(n)))
     costs = [float(fit.cost) for fit in fits]
-    num_radial = min(range(len(fits)), key=lambda n: costs[n] * (1 + WORTH) ** n)
+    num_radial = min(range(len(fits)), key=lambda n: costs[n] * (1 + MIN_COST_DECREASE) ** n)
     best = fits[num_radial]
     count = max(1, int(best.moved_points[problem.point_index].sum()))
     at = replace(problem, T_cw=best.T_cw, points_w=best.points_w, camera=best.camera)
     doubt = _disagreement(at, _fitted(num_radial))
     if int(graph.is_keyframe.sum()) < 2 * PART_KEYFRAMES:  # frames between the same keyframes err together
-        doubt = max(doubt, UNCHECKED)
+        doubt = max(doubt, UNCHECKED_FACTOR)
     bend = float((fits[1].camera.params - base.params)[4]) if radial and not num_radial else None
-    guess = base.params[2:4] if centre else None
-    params, stds, given_rest = _with_the_rest(at, _fitted(num_radial), doubt, bend, guess)
+    guess = base.params[2:4] if principal_point else None
+    params, stds, given_rest = _propagate_held_parameters(at, _fitted(num_radial), doubt, bend, guess)
     return Refinement(
-        simplest(best.camera.with_params(params)),
+        simplify_model(best.camera.with_params(params)),
         num_radial,
         stds[0],
         given_rest,
         tuple(stds[1:]),
         costs[num_radial] / count,
-        float(adjust(problem, []).cost) / count,
+        float(adjust_with_camera(problem, []).cost) / count,
     )
 
 
@@ -113,7 +113,7 @@ def _fitted(num_radial: int) -> list[int]:
     return [FOCAL, K1, K2][: 1 + num_radial]
 
 
-def _with_the_rest(
+def _propagate_held_parameters(
     at: BundleProblem, fitted: list[int], doubt: float, bend: float | None, guess: Tensor | None
 ) -> tuple[Tensor, list[float], float]:
     """The parameters (K,) once the centre has moved, their errors, and that of the focal length given the rest.
@@ -125,9 +125,9 @@ def _with_the_rest(
     bend:  k1 by a fit that was not believed, where there was one
     guess: (2,) the principal point before the images were asked; None where it is given
     """
-    n, k, centre = len(fitted), int(bend is not None), [CX, CY] if guess is not None else []
-    which = fitted + [K1] * k + centre
-    free = adjust(at, which)
+    n, k, principal_point = len(fitted), int(bend is not None), [CX, CY] if guess is not None else []
+    which = fitted + [K1] * k + principal_point
+    free = adjust_with_camera(at, which)
     covariance = doubt**2 * free.covariance().camera
     if not bool((covariance.diagonal() > 0).all()):
         return at.camera.params, [math.inf] * n, math.inf
@@ -140,7 +140,7 @@ def _with_the_rest(
         held[0, 0] = min(K1_STD, math.hypot(bend, float(covariance[n, n].sqrt()))) ** 2
     if guess is not None:
         said = torch.linalg.inv(covariance[n + k :, n + k :])
-        prior = torch.eye(2, dtype=said.dtype, device=said.device) / CENTRE_STD**2
+        prior = torch.eye(2, dtype=said.dtype, device=said.device) / PRINCIPAL_POINT_STD**2
         held[k:, k:] = torch.linalg.inv(said + prior)
         found = guess + held[k:, k:] @ said @ (free.camera.params[2:4] - guess)
         move[n + k :] = (found - at.camera.params[2:4]) / at.camera.width
@@ -152,13 +152,13 @@ def _with_the_rest(
 def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
     """By how much parts of the way disagree on the focal length, in units of their formal errors; one at least."""
     keyframes = len(at.T_cw)
-    count = min(PARTS, keyframes // PART_KEYFRAMES)
+    count = min(NUM_PARTS, keyframes // PART_KEYFRAMES)
     if count < 2:
-        return UNCHECKED
+        return UNCHECKED_FACTOR
     ends = [keyframes * part // count for part in range(count + 1)]
     squares = []
     for start, stop in itertools.pairwise(ends):
-        part = adjust(part_of(at, start, stop), fitted)
+        part = adjust_with_camera(subproblem(at, start, stop), fitted)
         variance = float(part.covariance().camera[0, 0])
         off = math.log(float(part.camera.focal) / float(at.camera.focal))
         squares.append(off**2 / variance if variance > 0 else 0.0)

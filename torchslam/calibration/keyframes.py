@@ -14,7 +14,7 @@ from torchslam.optim.run_graph import ObservationGraph
 KERNEL_SCALE = 2.45  # as in `solve`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6
 ITERATIONS = 400  # where all depths have to move with a focal length that is far off, 200 are needed
-FEWEST = 24  # frames that a camera is refined on, if there are
+MIN_FRAMES = 24  # frames that a camera is refined on, if there are
 # What is looked at of a camera, in this order: the logarithm of the focal length, k1, k2, and the principal point.
 FOCAL, K1, K2, CX, CY = range(5)
 
@@ -37,7 +37,7 @@ def problem_of(graph: ObservationGraph) -> BundleProblem:
     )
 
 
-def part_of(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
+def subproblem(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
     """The frames from `start` to before `stop` and the points that they see."""
     rows = ((problem.frame_index >= start) & (problem.frame_index < stop)).nonzero().squeeze(-1)
     points, point_index = torch.unique(problem.point_index[rows], return_inverse=True)
@@ -59,7 +59,7 @@ def frames_of(graph: ObservationGraph) -> Tensor:
     frames = (graph.world == world).nonzero().squeeze(-1)
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
     keyframes = graph.is_keyframe[frames].nonzero().squeeze(-1)
-    missing = FEWEST - len(keyframes)
+    missing = MIN_FRAMES - len(keyframes)
     if missing > 0:
         others = (~graph.is_keyframe[frames]).nonzero().squeeze(-1)
         every = max(1, -(-len(others) // missing))
@@ -77,7 +77,9 @@ def directions(camera: Camera, which: list[int]) -> Tensor:
     return columns[:, which]
 
 
-def adjust(problem: BundleProblem, which: list[int], iterations: int = ITERATIONS) -> BundleSolution:
+def adjust_with_camera(
+    problem: BundleProblem, which: list[int], iterations: int = ITERATIONS
+) -> BundleSolution:
     """The least robust cost over poses, points and those parameters of the camera."""
     return bundle_adjust(
         problem,
@@ -97,7 +99,7 @@ def with_radial_terms(camera: Camera) -> Camera:
     return Camera("radial_tangential", torch.cat([camera.params, camera.params.new_zeros(5)]), camera.size)
 
 
-def simplest(camera: Camera) -> Camera:
+def simplify_model(camera: Camera) -> Camera:
     """The same camera, as a pinhole where it does not bend the image."""
     if camera.model != "radial_tangential" or bool(camera.params[4:].any()):
         return camera

@@ -16,7 +16,7 @@ SUFFERS = "poses and map may be badly wrong with it"
 OPEN = "pure rotation, a straight way and a plane leave it open"
 
 
-def in_words(calibrated: FoundCamera) -> str:
+def describe_camera(calibrated: FoundCamera) -> str:
     """The camera that was found and its standard errors, or that it is not determined and how wrong it may be."""
     camera, refined = calibrated.camera, calibrated.refined
     if refined is None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchslam.calibration.intrinsics import Refinement, refine
+from torchslam.calibration.intrinsics import Refinement, estimate_intrinsics
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
@@ -23,15 +23,18 @@ from torchslam.types import Features, Frame
 
 # Focal lengths in widths of the image that are tried beside the first one; the first map decides.
 GUESSES = 0.6, 1.2, 1.7
-FIRST_FRAMES, MOST_FRAMES = 80, 800
-FEW_KEYFRAMES = 3  # a map of fewer does not decide
+INITIAL_FRAMES, MAX_FRAMES = 80, 800
+MIN_KEYFRAMES = 3  # a map of fewer does not decide
 # Change of the focal length that the discrete choices of a run make by themselves, and that is not worth another run,
 # as a share of its error.
-SETTLED, SETTLED_SHARE = 5e-3, 0.3
+MIN_CHANGE, MIN_CHANGE_IN_STD = 5e-3, 0.3
 # Relative error with which more frames are not worth their time: of a camera from nothing, and of one to refine.
-PRECISE, PRECISE_REFINED = 0.01, 0.005
-MOST_ROUNDS = 10
-SURE, NEAR = 0.05, 0.15  # relative error, and change of the focal length, with which no other guess is tried
+TARGET_STD, TARGET_STD_REFINED = 0.01, 0.005
+MAX_ROUNDS = 10
+CONFIDENT_STD, CONFIDENT_CHANGE = (
+    0.05,
+    0.15,
+)  # relative error, and change of the focal length, with which no other guess is tried
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,12 @@ class Round:
         return self.refined.cost * (self.frames / len(self.run.trajectory)) ** 2
 
     @property
-    def is_sure(self) -> bool:
+    def is_confident(self) -> bool:
         """Whether the images confirm the focal length of the run."""
         if self.refined is None or not self.refined.is_determined:
             return False
         off = math.log(float(self.refined.camera.focal) / float(self.camera.focal))
-        return self.refined.std < SURE and abs(off) < NEAR
+        return self.refined.std < CONFIDENT_STD and abs(off) < CONFIDENT_CHANGE
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class FoundCamera:
         return self.refined is not None and self.refined.is_determined
 
 
-class Remembered:
+class CachedExtractor:
     """An extractor that looks at every image once: features do not depend on the camera."""
 
     def __init__(self, extractor: Extractor) -> None:
@@ -98,7 +101,7 @@ def calibrate(
     guess: bool = True,
     device: torch.device | str = "cpu",
     extractor: FrontEnd | None = None,
-    told: Callable[[Round], None] | None = None,
+    on_progress: Callable[[Round], None] | None = None,
 ) -> FoundCamera:
     """Find the camera of a sequence, started at the one it has.
 
@@ -109,44 +112,44 @@ def calibrate(
 
     Raises KeyboardInterrupt where that ends a run.
     """
-    remembered = None
+    cached = None
     if not sequence.brings_features:
-        remembered = Remembered(image_extractor(config, device, extractor))
+        cached = CachedExtractor(image_extractor(config, device, extractor))
     rounds: list[Round] = []
     start = sequence.camera.to(torch.float64).to(device)
 
     def one(camera: Camera, frames: int) -> Round:
         part = sequence.part(stop=frames)
-        looked = part if remembered is None else WithFeatures(part, remembered)
+        looked = part if cached is None else WithFeatures(part, cached)
         run = SLAM(camera, config, extractor).run(looked)
         if run.interrupted:
             raise KeyboardInterrupt
-        refined = None if run.failure else refine(run.graph, start, radial, guess)
+        refined = None if run.failure else estimate_intrinsics(run.graph, start, radial, guess)
         rounds.append(Round(camera, frames, run, refined))
-        if told is not None:
-            told(rounds[-1])
+        if on_progress is not None:
+            on_progress(rounds[-1])
         return rounds[-1]
 
-    most = min(len(sequence), MOST_FRAMES)
-    frames = min(FIRST_FRAMES, most)
+    most = min(len(sequence), MAX_FRAMES)
+    frames = min(INITIAL_FRAMES, most)
     last = one(start, frames)
-    while guess and frames < most and last.run.map.num_keyframes < FEW_KEYFRAMES:
+    while guess and frames < most and last.run.map.num_keyframes < MIN_KEYFRAMES:
         frames = min(2 * frames, most)
         last = one(start, frames)
     tried = [last]
     for share in GUESSES if guess else ():
-        if tried[-1].is_sure:
+        if tried[-1].is_confident:
             break
         tried.append(one(_scaled(start, share * start.width / float(start.focal)), frames))
-    last = tried[-1] if tried[-1].is_sure else min(tried, key=lambda each: each.cost)
-    for _ in range(MOST_ROUNDS):
+    last = tried[-1] if tried[-1].is_confident else min(tried, key=lambda each: each.cost)
+    for _ in range(MAX_ROUNDS):
         if last.refined is None:  # also where a rotation that a wrong camera took for a motion shows as one
             break
         camera = last.refined.camera
         moved = abs(math.log(float(camera.focal) / float(last.camera.focal)))
-        settled = moved < max(SETTLED, SETTLED_SHARE * last.refined.std)
-        if settled and last.refined.num_radial == _bends(last.camera, start):
-            if last.refined.std < (PRECISE if guess else PRECISE_REFINED) or frames == most:
+        settled = moved < max(MIN_CHANGE, MIN_CHANGE_IN_STD * last.refined.std)
+        if settled and last.refined.num_radial == _num_distorted(last.camera, start):
+            if last.refined.std < (TARGET_STD if guess else TARGET_STD_REFINED) or frames == most:
                 break
             frames = min(2 * frames, most)
         last = one(camera, frames)
@@ -157,7 +160,7 @@ def _scaled(camera: Camera, factor: float) -> Camera:
     return camera.with_params(torch.cat([factor * camera.params[:2], camera.params[2:]]))
 
 
-def _bends(camera: Camera, start: Camera) -> int:
+def _num_distorted(camera: Camera, start: Camera) -> int:
     """How many coefficients of the distortion differ from those of the start."""
     own, given = (torch.cat([c.params, c.params.new_zeros(2)])[4:6] for c in (camera, start))
     return int((own != given).sum())

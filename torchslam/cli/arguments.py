@@ -141,8 +141,8 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
         "--processes",
         type=positive,
         metavar="N",
-        help="with 2 or more, others than the one that tracks find features ahead, and with 3 adjust the map beside "
-        "it: the same results, sooner (default: 3 where there are two processors and enough frames, else 1)",
+        help="number of processes: 2 adds a feature prefetcher, 3 also a bundle-adjustment worker; results are "
+        "identical (default: 3 if there are two processors and enough frames, else 1)",
     )
 
 

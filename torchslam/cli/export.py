@@ -40,8 +40,8 @@ from torchslam.io.export.scene import Scene, scene_of
 from torchslam.io.export.undistortion import undistorted
 from torchslam.io.report import table
 from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
-from torchslam.map.file import read_worlds
-from torchslam.map.submap import World
+from torchslam.map.file import read_atlas
+from torchslam.map.submap import Submap
 from torchslam.system.run import keyframe_rows, keyframe_trajectory
 from torchslam.types import Trajectory
 
@@ -62,7 +62,7 @@ class Job:
 
     directory: Path
     figures: dict[str, Any]
-    world: World
+    world: Submap
     camera: Camera
     output: Path
     keyframes_alone: bool
@@ -151,7 +151,7 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
     directory = options.directory
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
-    figures, saved = read_metrics(directory), read_worlds(directory / MAP)
+    figures, saved = read_metrics(directory), read_atlas(directory / MAP)
     number = figures["world"] if options.world is None else options.world
     worlds = {world.number: world for world in saved.worlds}
     if not worlds:

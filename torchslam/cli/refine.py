@@ -30,11 +30,10 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.io.calibration_file import check_replaceable, is_found, write_calibration
-from torchslam.io.export.colors import paint
-from torchslam.io.pictures import draw
 from torchslam.io.report import metrics, summary, table
-from torchslam.io.results import CALIBRATION, read_results, write_results
-from torchslam.refine import CameraChoice, Refined, refine
+from torchslam.io.results import CALIBRATION
+from torchslam.io.write_run import write_run
+from torchslam.refine import CameraChoice, Refined, refine_poses
 from torchslam.refine.files import write_refined
 from torchslam.types import Trajectory
 
@@ -90,7 +89,7 @@ def execute(options: argparse.Namespace) -> int:
     given = read_poses(options.poses)
     sequence = _with_camera(arguments.sequence(options), given, options.camera)
     is_guess = sequence.calibrated is Calibrated.GUESSED
-    choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.JUDGED
+    choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
     plan = Plan(
         options.path,
         options.fps,
@@ -107,14 +106,14 @@ def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> in
     """Refine, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, resume=False)
     check_replaceable(plan.output / CALIBRATION)
-    refined = refine(
+    refined = refine_poses(
         sequence,
         given,
         config,
         plan.choice,
         plan.radial,
         plan.device,
-        told=lambda words: print(f"torchslam: {words}", file=sys.stderr),
+        on_progress=lambda words: print(f"torchslam: {words}", file=sys.stderr),
     )
     figures = _write(refined, sequence, plan)
     written = {} if refined.run.failure else {"refined": str(write_refined(plan.output / REFINED, refined))}
@@ -136,13 +135,13 @@ def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> S
     if camera is None and given.calibration is not None:
         return sequence.with_camera(fit_camera(given.calibration, sequence.size, str(given.path)))
     if sequence.calibrated is Calibrated.MISSING:
-        print("torchslam: no calibration here: the images decide", file=sys.stderr)
+        print("torchslam: no calibration found; estimating intrinsics from the images", file=sys.stderr)
         return sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
     return sequence
 
 
 def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
-    """Evaluate, colour the map, write, draw; returns the figures."""
+    """Evaluate and write the refined run; returns the metrics."""
     finished = refined.run
     before = Trajectory.empty() if finished.failure else finished.online
     after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
@@ -157,14 +156,12 @@ def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
         "source": full_name(plan.source),
         "source_fps": plan.fps,
     }
-    paint([world.map for world in finished.worlds], sequence, finished.session)
-    write_results(finished, sequence, figures, plan.output)
     path = plan.output / CALIBRATION
     if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
         write_calibration(path, finished.camera, [figures["camera"]])
     elif is_found(path):
         path.unlink()
-    draw(read_results(plan.output), plan.output)
+    write_run(finished, sequence, figures, plan.output, viewer=False)
     return figures
 
 

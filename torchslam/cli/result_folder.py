@@ -8,7 +8,7 @@ from torchslam.data import Sequence
 from torchslam.errors import ResultsError
 from torchslam.io.results import CHECKPOINT, results_in
 from torchslam.system.checkpoint import write_checkpoint
-from torchslam.system.run import Progressed
+from torchslam.system.run import RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.utils.atomic_write import write_whole
 
@@ -43,7 +43,7 @@ class Checkpoints:
     every: keyframes from one to the next, at least, and 5 % of those that there are; 0: none is taken
     """
 
-    def __init__(self, folder: Path, every: int, slam: SLAM, so_far: Progressed, sequence: Sequence) -> None:
+    def __init__(self, folder: Path, every: int, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
         self._path = folder / CHECKPOINT
         self._every = every
         self._run = slam, so_far, sequence
@@ -52,7 +52,7 @@ class Checkpoints:
     def offer(self, at_once: bool = False) -> None:
         """After a frame: take a checkpoint if it is time for one, or because the run is to end."""
         slam, so_far, sequence = self._run
-        if not self._every or not slam.mapping or not slam.is_settled:
+        if not self._every or not slam.mapping or not slam.can_checkpoint:
             return
         keyframes = self._keyframes()
         if at_once or keyframes - self._last >= max(self._every, GROWTH * keyframes):

@@ -28,18 +28,17 @@ from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.calibration_file import is_found
-from torchslam.io.export.colors import paint
 from torchslam.io.export.recording import import_rerun
-from torchslam.io.metrics import figures_of
-from torchslam.io.pictures import draw
-from torchslam.io.report import doubts, summary, table
-from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, read_results, write_results
-from torchslam.io.viewer.frames import VIDEO, LiveView, Screen, Watching, film_of
-from torchslam.io.viewer.page import VIEW, write_view
-from torchslam.parallel.workers import helped
+from torchslam.io.metrics import compute_metrics
+from torchslam.io.report import result_warnings, summary, table
+from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP
+from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
+from torchslam.io.viewer.page import VIEW
+from torchslam.io.write_run import write_run
+from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import source
-from torchslam.system.run import Progressed, Run, run_sequence
+from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 
@@ -155,7 +154,10 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     found = arguments.sequence(options)
     if found.calibrated is not Calibrated.MISSING or found.known_length is None:
         return found
-    print("torchslam: no calibration here: as with --camera auto, the images decide", file=sys.stderr)
+    print(
+        "torchslam: no calibration found; estimating intrinsics from the images (--camera auto)",
+        file=sys.stderr,
+    )
     return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
 
 
@@ -182,7 +184,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                 watching.show(result)
                 progress.update(result)
 
-            with helped(watching.sequence, slam, processes, so_far.next) as frames:
+            with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
                 finished = run_sequence(
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
@@ -193,8 +195,8 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     written |= {"video": plan.output / VIDEO} if plan.video else {}
     words = summary(figures) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
-    for doubt in doubts(figures):
-        print(f"torchslam: warning: {doubt}", file=sys.stderr)
+    for warning in result_warnings(figures):
+        print(f"torchslam: warning: {warning}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
         return stopping.status
@@ -225,7 +227,7 @@ def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequen
     )
 
 
-def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progressed]:
+def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunProgress]:
     """The system before the first frame, or after the last one that a checkpoint knows."""
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
@@ -235,7 +237,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
     if plan.resume:
         print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
     if plan.map is None:
-        return SLAM(sequence.camera.to(plan.device), config), Progressed()
+        return SLAM(sequence.camera.to(plan.device), config), RunProgress()
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
     known, mine = slam.camera, sequence.camera.to(torch.float64)
     same = known.params.shape == mine.params.shape  # to the nine digits of a calibration file
@@ -248,16 +250,16 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, Progre
             f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
             f"the sequence has {_words(mine.model, mine.params, mine.size)}"
         )
-    return slam, Progressed()
+    return slam, RunProgress()
 
 
-def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> Watching:
+def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> FrameViewers:
     """What shows the frames as they pass; a film of an earlier run goes."""
     (plan.output / VIDEO).unlink(missing_ok=True)
-    screens: list[Screen] = [LiveView.spawn(slam)] if plan.view else []
+    screens: list[FrameViewer] = [LiveView.spawn(slam)] if plan.view else []
     if plan.video:
         screens.append(film_of(sequence, plan.output))
-    return Watching(slam, sequence, screens)
+    return FrameViewers(slam, sequence, screens)
 
 
 def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
@@ -268,20 +270,16 @@ def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
 def _write(
     finished: Run, sequence: Sequence, plan: Plan, camera: str, latencies: list[float]
 ) -> dict[str, object]:
-    """Evaluate, colour the map, write, draw; returns the figures.
+    """Evaluate and write the run; returns the metrics.
 
     camera: what there is to say of it before the run; latencies: milliseconds, of a live source
     """
-    figures = figures_of(
+    figures = compute_metrics(
         finished, sequence, camera, lambda words: print(f"torchslam: warning: {words}", file=sys.stderr)
     )
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
         figures["latency_ms"] = {"median": median, "p95": p95}
     figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
-    paint([world.map for world in finished.worlds], sequence, finished.session)
-    write_results(finished, sequence, figures, plan.output)
-    results = read_results(plan.output)
-    draw(results, plan.output)
-    write_view(results, plan.output)
+    write_run(finished, sequence, figures, plan.output)
     return figures

@@ -1,7 +1,6 @@
-"""The configuration: what can be set, with defaults and what each setting allows.
+"""Configuration: settings with their defaults and allowed values.
 
-Its sections are in `torchslam.sections`, and all of them can be imported from here. A configuration is valid however it
-was built: see `torchslam.config.schema`.
+Every section is exported here. A configuration is validated however it is built: see `torchslam.config.schema`.
 """
 
 from __future__ import annotations
@@ -11,35 +10,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchslam.config.builtin import find
-from torchslam.config.dynamic import IndependentMotionConfig, StillnessConfig
+from torchslam.config.dynamic import IndependentMotionConfig, StaticOverlayConfig
 from torchslam.config.features import FeaturesConfig, MatchingConfig, MeasurementConfig, SimulatedConfig
-from torchslam.config.mapping import BundleConfig, KeyframesConfig, LoopsConfig, MappingConfig
+from torchslam.config.mapping import BundleAdjustmentConfig, KeyframesConfig, LoopClosingConfig, MappingConfig
 from torchslam.config.schema import Settings, choices, enlarged, merged, setting, to_toml
 from torchslam.config.tracking import (
     InitializationConfig,
-    JudgeConfig,
-    PatchesConfig,
+    PoseValidationConfig,
     RelocalizationConfig,
     TrackingConfig,
 )
 
 __all__ = [
     "CHOICES",
-    "BundleConfig",
+    "BundleAdjustmentConfig",
     "Config",
     "FeaturesConfig",
     "IndependentMotionConfig",
     "InitializationConfig",
-    "JudgeConfig",
     "KeyframesConfig",
-    "LoopsConfig",
+    "LoopClosingConfig",
     "MappingConfig",
     "MatchingConfig",
     "MeasurementConfig",
-    "PatchesConfig",
+    "PoseValidationConfig",
     "RelocalizationConfig",
     "SimulatedConfig",
-    "StillnessConfig",
+    "StaticOverlayConfig",
     "TrackingConfig",
     "load_config",
     "to_toml",
@@ -48,16 +45,16 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Config(Settings):
-    """All settings, section by section: `Config(loops=LoopsConfig(enabled=False))`, or read by `load_config`.
+    """All settings, section by section: `Config(loop_closing=LoopClosingConfig(enabled=False))`, or by `load_config`.
 
     Frozen, like its sections: `dataclasses.replace` makes another one. Raises ConfigError for a value that is not
     allowed, however it is made.
     """
 
-    seed: int = setting(0, "of all random choices", low=0, high=2**63 - 1)
+    seed: int = setting(0, "Seed of the random number generators.", low=0, high=2**63 - 1)
     scale: str = setting(
         "unit",
-        "length of a map unit; unit: the median depth of the first map is 1",
+        "Length unit of the map; unit: the median depth of the initial map is 1.",
         choices=("unit", "groundtruth"),
     )
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
@@ -66,15 +63,14 @@ class Config(Settings):
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    patches: PatchesConfig = field(default_factory=PatchesConfig)
-    stillness: StillnessConfig = field(default_factory=StillnessConfig)
+    static_overlay: StaticOverlayConfig = field(default_factory=StaticOverlayConfig)
     independent_motion: IndependentMotionConfig = field(default_factory=IndependentMotionConfig)
-    judge: JudgeConfig = field(default_factory=JudgeConfig)
+    pose_validation: PoseValidationConfig = field(default_factory=PoseValidationConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
-    loops: LoopsConfig = field(default_factory=LoopsConfig)
-    bundle: BundleConfig = field(default_factory=BundleConfig)
+    loop_closing: LoopClosingConfig = field(default_factory=LoopClosingConfig)
+    bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
 
     def for_size(self, size: tuple[int, int]) -> Config:
         """The configuration for images (width, height): what is said in pixels of reduced ones grows with them.
@@ -91,7 +87,7 @@ CHOICES = choices(Config)
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
     """The defaults, changed by a TOML file, changed by overrides of the form `section.key=value`.
 
-    path: of the file, or as a string the name of one of `configs/`, such as "fast"
+    path: of the file, or as a string the name of one of `configs/`, such as "paper"
 
     Raises ConfigError for a missing or malformed file, an unknown key, or a value of the wrong type or not allowed.
     """

@@ -1,57 +1,101 @@
-"""What does not belong to the scene."""
+"""Settings of the filters for image content that is not part of the static scene."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchslam.config.limits import LARGEST, LONGEST_PX, MOST
+from torchslam.config.limits import MAX_COUNT, MAX_FACTOR, MAX_LENGTH_PX
 from torchslam.config.schema import Settings, setting
 
 
 @dataclass(frozen=True)
-class StillnessConfig(Settings, section="stillness"):
-    """When pixels stay in place that should have moved with the scene, as logos and dirt on the lens do."""
+class StaticOverlayConfig(Settings, section="static_overlay"):
+    """Detection of pixels that stay in place while the scene moves, such as logos and dirt on the lens."""
 
-    enabled: bool = setting(True, "whether such pixels are looked for")
+    enabled: bool = setting(True, "Detect static overlays.")
     min_motion_px: float = setting(
-        4.0, "a point of the scene would have moved by at least this", above=0, grows=True, high=LONGEST_PX
+        4.0,
+        "Minimum image motion, in pixels, that a scene point must have had between the compared frames.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
-    min_moving_share: float = setting(0.5, "of the keypoints, before two frames are compared", low=0, high=1)
+    min_moving_ratio: float = setting(
+        0.5, "Minimum ratio of keypoints that must have moved before two frames are compared.", low=0, high=1
+    )
     radius_px: float = setting(
-        1.5, "within which a keypoint has stayed", above=0, grows=True, high=LONGEST_PX
+        1.5,
+        "Radius, in pixels, within which a keypoint counts as not having moved.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
     cell_px: float = setting(
         4.0,
-        "of the cells that evidence is kept of: a corner wanders a little under noise",
+        "Size, in pixels, of the cells that accumulate evidence; corners move slightly under noise.",
         above=0,
         grows=True,
-        high=LONGEST_PX,
+        high=MAX_LENGTH_PX,
     )
-    max_distance_share: float = setting(0.6, "of the distance at which descriptors match", above=0, high=1)
-    min_keypoints: int = setting(8, "fewer that stay are chance", low=1, high=MOST)
-    min_evidence: int = setting(2, "comparisons in which a pixel stayed", low=1, high=MOST)
+    max_distance_ratio: float = setting(
+        0.6,
+        "Maximum descriptor distance as a ratio of the limit of ordinary matching.",
+        above=0,
+        high=1,
+    )
+    min_keypoints: int = setting(
+        8, "Minimum number of static keypoints; fewer are considered a coincidence.", low=1, high=MAX_COUNT
+    )
+    min_evidence: int = setting(
+        2,
+        "Number of comparisons in which a cell must have been static before it is masked.",
+        low=1,
+        high=MAX_COUNT,
+    )
 
 
 @dataclass(frozen=True)
 class IndependentMotionConfig(Settings, section="independent_motion"):
-    """When a part of the image moves against the scene, as people and cars do."""
+    """Detection of image regions that move relative to the scene, such as people and cars."""
 
-    enabled: bool = setting(True, "whether such parts are looked for")
-    frames: int = setting(5, "from one comparison to the next", low=1, high=MOST)
+    enabled: bool = setting(True, "Detect independently moving objects.")
+    frame_interval: int = setting(5, "Number of frames between two comparisons.", low=1, high=MAX_COUNT)
     min_error_px: float = setting(
-        4.0, "by which a match misses where a point of the scene can be", above=0, high=LONGEST_PX
+        4.0,
+        "Minimum distance, in pixels, of a match from every position that a static point could have.",
+        above=0,
+        high=MAX_LENGTH_PX,
     )
-    threshold_px: float = setting(2.0, "of the motion that they share", above=0, grows=True, high=LONGEST_PX)
-    search_px: float = setting(
-        16.0,
-        "how far a keypoint is looked for from where the last motion took it",
+    threshold_px: float = setting(
+        2.0,
+        "Inlier threshold, in pixels, of the motion shared by an object's matches.",
         above=0,
         grows=True,
-        high=LONGEST_PX,
+        high=MAX_LENGTH_PX,
     )
-    min_matches: int = setting(20, "that share a motion", low=5, high=MOST)
-    min_share: float = setting(0.5, "of the matches that miss the scene", low=0, high=1)
-    max_share: float = setting(
-        2.0, "of the image, as a multiple of what agrees with the map", above=0, high=LARGEST
+    search_px: float = setting(
+        16.0,
+        "Search radius, in pixels, around the position predicted by the object's last motion.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
-    max_unseen: int = setting(150, "frames that it is followed without being seen to move", low=1, high=MOST)
+    min_matches: int = setting(20, "Minimum number of matches that share a motion.", low=5, high=MAX_COUNT)
+    min_outlier_ratio: float = setting(
+        0.5,
+        "Minimum ratio of the matches inconsistent with the scene that must share the motion.",
+        low=0,
+        high=1,
+    )
+    max_area_ratio: float = setting(
+        2.0,
+        "Maximum image area of the object as a multiple of the area that agrees with the map.",
+        above=0,
+        high=MAX_FACTOR,
+    )
+    max_unseen_frames: int = setting(
+        150,
+        "Number of frames for which an object is tracked without being observed to move.",
+        low=1,
+        high=MAX_COUNT,
+    )

@@ -1,10 +1,10 @@
-"""The largest numbers that make sense in any section."""
+"""Upper bounds shared by the settings of all sections."""
 
 from __future__ import annotations
 
-MOST = 1_000_000
-"""Of anything that is counted: more frames, keyframes or matches than that are none."""
-LONGEST_PX = 10_000
-"""Of a length in the image: no image is larger."""
-LARGEST = 1_000_000
-"""Of shares and factors that have no end of their own: far beyond what switches a test off."""
+MAX_COUNT = 1_000_000
+"""Upper bound of every count: frames, keyframes, points or matches."""
+MAX_LENGTH_PX = 10_000
+"""Upper bound of every length in the image; no image is larger."""
+MAX_FACTOR = 1_000_000
+"""Upper bound of ratios and factors without a natural limit; far beyond the value that disables a test."""

@@ -1,152 +1,226 @@
-"""Where the camera is: from the first map on, and after it was lost."""
+"""Settings of map initialization, tracking, pose validation and relocalization."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchslam.config.limits import LARGEST, LONGEST_PX, MOST
+from torchslam.config.limits import MAX_COUNT, MAX_FACTOR, MAX_LENGTH_PX
 from torchslam.config.schema import Settings, setting
 
 
 @dataclass(frozen=True)
 class InitializationConfig(Settings, section="initialization"):
+    """Two-view initialization of a map."""
+
     criterion: str = setting(
         "uncertainty",
-        "what makes a point of the start a good one; configs/paper.toml goes by the parallax",
+        "Criterion by which a point of the initial map counts as good; configs/paper.toml uses the parallax.",
         choices=("uncertainty", "parallax"),
     )
     min_matches: int = setting(
-        100, "fewer than this with the reference frame: a new reference", low=1, high=MOST
+        100,
+        "Minimum number of matches with the reference frame; with fewer, the reference is replaced.",
+        low=1,
+        high=MAX_COUNT,
     )
     min_motion_px: float = setting(
-        2.0, "of the matches, in the median; less is a standstill", low=0, grows=True, high=LONGEST_PX
+        2.0,
+        "Minimum median motion of the matches, in pixels; below it the camera is considered stationary.",
+        low=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
-    still_px: float = setting(
-        1.0, "matches that moved less stay in place", above=0, grows=True, high=LONGEST_PX
+    max_static_px: float = setting(
+        1.0,
+        "Maximum motion, in pixels, of a match that is considered static.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
-    min_points: int = setting(60, "that the start must have", low=1, high=MOST)
+    min_points: int = setting(60, "Minimum number of points of the initial map.", low=1, high=MAX_COUNT)
     threshold_px: float = setting(
-        1.5, "of the epipolar and homography RANSAC", above=0, grows=True, high=LONGEST_PX
+        1.5,
+        "Inlier threshold of the essential-matrix and homography RANSAC, in pixels.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
     max_depth_std: float = setting(
         0.1,
-        "uncertainty: a point counts when its relative depth is known better than this",
+        "Maximum relative standard deviation of the depth of a good point (criterion uncertainty).",
         above=0,
-        high=LARGEST,
+        high=MAX_FACTOR,
     )
-    min_good_share: float = setting(0.15, "... and this share of the matches must count", low=0, high=1)
-    planar_patience: int = setting(10, "frames that look planar before a plane is believed", low=0, high=MOST)
-    min_planar_share: float = setting(0.5, "uncertainty: ... of the matches on a plane", low=0, high=1)
-    min_parallax_deg: float = setting(3.0, "parallax: a point counts from this angle on", low=0, high=180)
-    min_mean_parallax_deg: float = setting(5.0, "parallax: of all points of the start", low=0, high=180)
-    min_explained: float = setting(
-        0.8, "share of the frames since the reference that the start must explain", low=0, high=1
+    min_good_ratio: float = setting(
+        0.15, "Minimum ratio of good points to matches (criterion uncertainty).", low=0, high=1
     )
-    max_reference_age: int = setting(300, "frames; an older reference is replaced", low=2, high=MOST)
-    max_waiting: int = setting(
-        1000, "frames without a pose that are kept, to be posed once there is a map", low=0, high=100_000
-    )
-    min_frames: int = setting(
-        20,
-        "a world that was lost before it had tracked this many frames after its start is taken back",
+    min_planar_frames: int = setting(
+        10,
+        "Number of frames that must look planar before a planar scene is accepted.",
         low=0,
-        high=MOST,
+        high=MAX_COUNT,
+    )
+    min_planar_ratio: float = setting(
+        0.5,
+        "Minimum ratio of good points to matches in a planar scene (criterion uncertainty).",
+        low=0,
+        high=1,
+    )
+    min_parallax_deg: float = setting(
+        3.0, "Minimum parallax of a good point, in degrees (criterion parallax).", low=0, high=180
+    )
+    min_mean_parallax_deg: float = setting(
+        5.0,
+        "Minimum mean parallax of the initial map, in degrees (criterion parallax).",
+        low=0,
+        high=180,
+    )
+    min_explained_ratio: float = setting(
+        0.8,
+        "Minimum ratio of the frames since the reference frame that can be localized in the initial map.",
+        low=0,
+        high=1,
+    )
+    max_reference_age: int = setting(
+        300, "Number of frames after which the reference frame is replaced.", low=2, high=MAX_COUNT
+    )
+    max_unposed_frames: int = setting(
+        1000,
+        "Maximum number of frames without a pose that are kept and posed once there is a map.",
+        low=0,
+        high=100_000,
+    )
+    provisional_frames: int = setting(
+        20,
+        "Number of tracked frames after which a new map is no longer discarded when tracking is lost.",
+        low=0,
+        high=MAX_COUNT,
     )
 
 
 @dataclass(frozen=True)
 class TrackingConfig(Settings, section="tracking"):
-    predict: bool = setting(True, "constant velocity; without it the previous pose")
-    guided: bool = setting(True, "match near the projection first; without it brute force alone")
-    radius_px: float = setting(
-        12.0, "around a projection, at the finest pyramid level", above=0, high=LONGEST_PX
+    """Tracking of a frame in the local map."""
+
+    motion_model: bool = setting(
+        True,
+        "Predict the pose with a constant-velocity model; otherwise the previous pose is the prediction.",
+    )
+    guided_matching: bool = setting(
+        True, "Match by projection before brute force; otherwise brute force only."
+    )
+    search_radius_px: float = setting(
+        12.0,
+        "Search radius around a projected point, in pixels of the finest pyramid level.",
+        above=0,
+        high=MAX_LENGTH_PX,
     )
     wide_radius_factor: float = setting(
-        3.0, "of the second search, where the first found too little", low=1, high=100
+        3.0,
+        "Factor of the search radius in the second search, made if the first has too few matches.",
+        low=1,
+        high=100,
     )
     refine_radius_px: float = setting(
-        5.0, "around the projections by the pose that was found", above=0, high=LONGEST_PX
+        5.0,
+        "Search radius around points projected with the estimated pose, in pixels.",
+        above=0,
+        high=MAX_LENGTH_PX,
     )
     threshold_px: float = setting(
-        3.0, "of the PnP, with RANSAC or without", above=0, grows=True, high=LONGEST_PX
+        3.0,
+        "Inlier threshold of the absolute pose, in pixels.",
+        above=0,
+        grows=True,
+        high=MAX_LENGTH_PX,
     )
-    min_matches: int = setting(20, "fewer: brute force", low=1, high=MOST)
-    min_inliers: int = setting(20, "fewer: the frame is lost", low=1, high=MOST)
-    local_keyframes: int = setting(12, "whose points are looked for", low=1, high=MOST)
+    min_matches: int = setting(
+        20, "Minimum number of guided matches; with fewer, brute force is used.", low=1, high=MAX_COUNT
+    )
+    min_inliers: int = setting(
+        20, "Minimum number of inliers; with fewer, tracking is lost.", low=1, high=MAX_COUNT
+    )
+    local_keyframes: int = setting(
+        12, "Number of keyframes that make up the local map.", low=1, high=MAX_COUNT
+    )
     max_view_angle_deg: float = setting(
-        60.0, "between the direction that a point was last seen from and this one", above=0, high=180
+        60.0,
+        "Maximum angle, in degrees, between the current and the last viewing direction of a point.",
+        above=0,
+        high=180,
     )
     recent_frames: int = setting(
         0,
-        "match points seen in the last n frames instead of the co-visible ones; 0: co-visible",
+        "Number of recent frames whose points are matched instead of the local map; 0 uses the local map.",
         low=0,
-        high=MOST,
+        high=MAX_COUNT,
     )
 
 
 @dataclass(frozen=True)
-class PatchesConfig(Settings, section="patches"):
-    """When a frame is followed by patches of an earlier one, without features of its own."""
+class PoseValidationConfig(Settings, section="pose_validation"):
+    """Validation of a pose; mapping from an uncertain one stays tentative until later frames confirm it."""
 
-    enabled: bool = setting(False, "whether frames are followed")
-    count: int = setting(300, "patches that are followed", low=20, high=MOST)
-    min_agreeing: int = setting(
-        150, "that must agree with the pose: a thin map is in need of every frame", low=20, high=MOST
+    min_inlier_ratio: float = setting(
+        0.5, "Minimum ratio of inliers to matches around the predicted pixels.", low=0, high=1
     )
-    min_similarity: float = setting(
-        0.8, "normalised cross-correlation of a patch with the earlier frame", low=0, high=1
-    )
-    min_share: float = setting(0.6, "of the patches, that must agree with the pose", above=0, high=1)
-    max_error_growth: float = setting(
-        1.3, "median squared error, as a multiple of that in the earlier frame", above=0, high=1e6
-    )
-    max_frames: int = setting(5, "followed one after the other", low=1, high=MOST)
-    overlap_share: float = setting(
-        0.8,
-        "of the overlap at which a frame becomes a keyframe: patches are lost sooner than matches",
+    max_squared_error: float = setting(
+        1.3,
+        "Maximum median squared error in units of the noise, averaged over ten frames.",
         above=0,
-        high=10,
+        high=MAX_FACTOR,
     )
-    delay: int = setting(
-        0,
-        "frames after which is known what came of one with features: it is mapped meanwhile",
+    min_explained_ratio: float = setting(
+        0.3,
+        "Minimum ratio of the image area with keypoints that the map explains, averaged over ten frames.",
         low=0,
-        high=64,
+        high=1,
     )
-
-
-@dataclass(frozen=True)
-class JudgeConfig(Settings, section="judge"):
-    """When a pose is uncertain: what is mapped from it is on trial until later frames confirm it."""
-
-    min_inlier_share: float = setting(0.5, "of the matches around the predicted pixels", low=0, high=1)
-    max_error: float = setting(
-        1.3, "median squared error in units of the noise, over ten frames", above=0, high=LARGEST
+    min_coverage_ratio: float = setting(
+        0.2,
+        "Minimum ratio of the image area covered by inliers where map points are expected.",
+        low=0,
+        high=1,
     )
-    min_explained: float = setting(
-        0.3, "of the image, where it has keypoints: what the map explains, over ten frames", low=0, high=1
-    )
-    min_coverage: float = setting(0.2, "of the image, where the map expects something", low=0, high=1)
     max_position_std: float = setting(
         0.017,
-        "standard deviation of the position as a share of the median depth of the tracked points",
+        "Maximum standard deviation of the position as a ratio of the median depth of the tracked points.",
         above=0,
-        high=LARGEST,
+        high=MAX_FACTOR,
     )
-    max_rotation_std_deg: float = setting(0.9, "standard deviation of the rotation", above=0, high=180)
+    max_rotation_std_deg: float = setting(
+        0.9, "Maximum standard deviation of the rotation, in degrees.", above=0, high=180
+    )
     max_jump: float = setting(
-        0.5, "from the predicted position, as a share of the depth", above=0, high=LARGEST
+        0.5,
+        "Maximum distance from the predicted position as a ratio of the median depth.",
+        above=0,
+        high=MAX_FACTOR,
     )
-    max_turn_deg: float = setting(20.0, "from the predicted rotation", above=0, high=180)
-    confirmations: int = setting(2, "certain frames in a row after an uncertain one", low=1, high=MOST)
+    max_turn_deg: float = setting(
+        20.0, "Maximum rotation from the predicted orientation, in degrees.", above=0, high=180
+    )
+    num_confirming_frames: int = setting(
+        2,
+        "Number of consecutive valid frames that confirm an uncertain pose.",
+        low=1,
+        high=MAX_COUNT,
+    )
 
 
 @dataclass(frozen=True)
 class RelocalizationConfig(Settings, section="relocalization"):
-    """What happens after the camera is lost."""
+    """Relocalization after tracking was lost."""
 
-    tries: int = setting(3, "places compared a frame", low=1, high=MOST)
-    confirmations: int = setting(
-        4, "certain frames in a row after a relocalised one, before anything is mapped", low=1, high=MOST
+    max_candidates: int = setting(
+        3, "Maximum number of candidate keyframes per frame.", low=1, high=MAX_COUNT
     )
-    patience: int = setting(20, "lost frames before a new world may begin", low=0, high=MOST)
+    num_confirming_frames: int = setting(
+        4,
+        "Number of consecutive valid frames after a relocalization before mapping resumes.",
+        low=1,
+        high=MAX_COUNT,
+    )
+    frames_before_new_submap: int = setting(
+        20, "Number of lost frames before a new submap may be initialized.", low=0, high=MAX_COUNT
+    )

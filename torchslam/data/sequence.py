@@ -130,7 +130,7 @@ class Sequence(ABC):
     def image(self, index: int) -> Tensor:
         """(1, 1, H, W) float32 in [0, 1]. Raises FrameError where it cannot be read or has another size."""
 
-    def colour(self, index: int) -> Tensor:
+    def color(self, index: int) -> Tensor:
         """(H, W, 3) uint8 red, green, blue; three times the same where the sequence is grey. Raises FrameError."""
         return (self.image(index)[0, 0, :, :, None] * 255.0).round().to(torch.uint8).expand(-1, -1, 3)
 
@@ -293,8 +293,8 @@ class Transformed(Sequence):
     def image(self, index: int) -> Tensor:
         return self._whole.image(self._at(index))
 
-    def colour(self, index: int) -> Tensor:
-        return self._whole.colour(self._at(index))
+    def color(self, index: int) -> Tensor:
+        return self._whole.color(self._at(index))
 
     def image_name(self, index: int) -> str:
         return self._whole.image_name(self._at(index))

@@ -14,7 +14,13 @@ from torch import Tensor, nn
 from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
 from torchslam.features.fast import Bands, fast_scores, find_peaks, patch_scores
-from torchslam.features.pyramid import Atlas, build_levels, fill_atlas, gather_level_patches, plan_atlas
+from torchslam.features.pyramid import (
+    PackedPyramid,
+    build_levels,
+    fill_atlas,
+    gather_level_patches,
+    plan_atlas,
+)
 from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread
 from torchslam.types import Features
 
@@ -43,7 +49,7 @@ class Corners:
 
     levels: list[Tensor]
     pixels: Tensor
-    atlas: Atlas
+    atlas: PackedPyramid
     positions: Tensor
     slots: Tensor
     strengths: Tensor
@@ -213,7 +219,7 @@ class ORB(nn.Module):
         return soft_peak(fast), _stand_out(fast)
 
 
-def _bands(grid: Grid, atlas: Atlas, batch: int, beside: int = 0) -> Bands:
+def _bands(grid: Grid, atlas: PackedPyramid, batch: int, beside: int = 0) -> Bands:
     """The pixels of the flattened atlases of so many images in whose rows there are cells, and rows beside them."""
     return tuple(
         (
@@ -238,7 +244,7 @@ def _stand_out(fast: Tensor) -> Tensor:
     return fast[:, 1, 1] + (fast[:, 1, 1] - fast.flatten(1).mean(1)) / 256
 
 
-def _on_atlas(wanted: Tensor, atlas: Atlas) -> Tensor:
+def _on_atlas(wanted: Tensor, atlas: PackedPyramid) -> Tensor:
     """(B * rows * stride,) bool: whether the nearest pixel of a mask (B, 1, H, W) to each place on the atlas is set."""
     levels = [F.interpolate(wanted.float(), size=size, mode="nearest-exact") for size in atlas.sizes]
     return fill_atlas(levels, atlas).flatten() > 0

@@ -1,6 +1,6 @@
 """The tests of the descriptor: x1, y1, x2, y2 of each in pixels of the level, within radius 14.5.
 
-Written by experiments/benchmarks/learn_pattern.py.
+Written by experiments/benchmarks/learn_pattern.py of revision 6b0ee00.
 """
 
 PATTERN: tuple[tuple[int, int, int, int], ...] = (

@@ -18,7 +18,7 @@ MIN_SIDE = 40  # of an atlas, so that every neighbourhood fits whatever the imag
 
 
 @dataclass(frozen=True)
-class Atlas:
+class PackedPyramid:
     """Where the levels of a pyramid lie in the atlas. Everything in pixels of the atlas.
 
     sizes:  (height, width) of each level; corners: (top, left) of each level; scales: full-resolution pixels
@@ -33,7 +33,7 @@ class Atlas:
 
 
 @lru_cache(maxsize=32)
-def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) -> Atlas:
+def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) -> PackedPyramid:
     """Sizes of the levels and their places: each level goes on the first shelf with room, or opens a new one."""
     sizes = [
         (max(1, round(height / scale_factor**k)), max(1, round(width / scale_factor**k)))
@@ -51,10 +51,10 @@ def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) ->
         corners.append((shelf[0], shelf[2]))
         shelf[2] += w
     scales = tuple((width / w, height / h) for h, w in sizes)
-    return Atlas(tuple(sizes), tuple(corners), scales, max(bottom, MIN_SIDE), max(width, MIN_SIDE))
+    return PackedPyramid(tuple(sizes), tuple(corners), scales, max(bottom, MIN_SIDE), max(width, MIN_SIDE))
 
 
-def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:
+def build_levels(images: Tensor, atlas: PackedPyramid) -> list[Tensor]:
     """The pyramid in grey values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
 
     images: (B, 1, H, W) in [0, 1]. Returns one (B, 1, h, w) per level; cutting off what follows the point rounds.
@@ -65,7 +65,7 @@ def build_levels(images: Tensor, atlas: Atlas) -> list[Tensor]:
     return levels
 
 
-def fill_atlas(levels: list[Tensor], atlas: Atlas) -> Tensor:
+def fill_atlas(levels: list[Tensor], atlas: PackedPyramid) -> Tensor:
     """Levels rounded to bytes at their places: (B, rows, stride) uint8."""
     filled = torch.zeros(
         levels[0].shape[0], atlas.rows, atlas.stride, dtype=torch.uint8, device=levels[0].device

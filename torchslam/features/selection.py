@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchslam.features.pyramid import Atlas
+from torchslam.features.pyramid import PackedPyramid
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Grid:
 
 @lru_cache(maxsize=8)
 def plan_grid(
-    atlas: Atlas, num_keypoints: int, per_cell: int, border: int, threshold: int, device: torch.device
+    atlas: PackedPyramid, num_keypoints: int, per_cell: int, border: int, threshold: int, device: torch.device
 ) -> Grid:
     """Budgets per level and square cells whose share of the budget is about `per_cell` keypoints.
 
@@ -70,7 +70,7 @@ def _runs(flags: Tensor) -> tuple[tuple[int, int], ...]:
     return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _level_budgets(num_keypoints: int, atlas: Atlas, border: int) -> list[int]:
+def _level_budgets(num_keypoints: int, atlas: PackedPyramid, border: int) -> list[int]:
     """Keypoints per level in proportion to its width; levels with no room inside the border get none."""
     shares = [
         1 / x if min(size) > 2 * border else 0.0

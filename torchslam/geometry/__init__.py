@@ -14,7 +14,7 @@ from torchslam.geometry.essential import (
 )
 from torchslam.geometry.gating import (
     CHI_SQUARE_95,
-    Noise,
+    KeypointNoise,
     fits,
     innovation_covariances,
     mahalanobis_squared,
@@ -61,7 +61,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
-from torchslam.geometry.undistorted import Undistorted, Undistortion
+from torchslam.geometry.undistorted import UndistortedKeypoints, Undistortion
 
 register()
 
@@ -69,12 +69,12 @@ __all__ = [
     "CHI_SQUARE_95",
     "AbsolutePose",
     "Camera",
+    "KeypointNoise",
     "MultiViewTriangulation",
-    "Noise",
     "RelativePose",
     "Similarity",
     "Triangulation",
-    "Undistorted",
+    "UndistortedKeypoints",
     "Undistortion",
     "correct_matches",
     "decompose_essential",

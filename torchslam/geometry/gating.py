@@ -1,4 +1,4 @@
-"""Whether a measurement fits a prediction: the one model of what a keypoint's error may be, `Noise`.
+"""Whether a measurement fits a prediction: the one model of what a keypoint's error may be, `KeypointNoise`.
 
 In units of it the squared error of a right match follows a chi-square distribution of two degrees of freedom. Whatever
 weighs a keypoint, or asks whether it fits, asks it: tracking, mapping, adjusting, covariances, the graph of a run.
@@ -26,7 +26,7 @@ the map, which has errors of its own. A scale, where nothing is stated, has that
 
 
 @dataclass(frozen=True)
-class Noise:
+class KeypointNoise:
     """What is known of the errors of keypoints (...).
 
     scales:      (...) pixels, the sizes of their pyramid levels
@@ -39,7 +39,7 @@ class Noise:
     information: Tensor
 
     @classmethod
-    def of(cls, scales: Tensor, information: Tensor | None) -> Noise:
+    def of(cls, scales: Tensor, information: Tensor | None) -> KeypointNoise:
         """Of information (...) or (..., 2, 2) as `Features` has it, or none. Differentiable."""
         return cls(scales, packed_information(information, scales))
 
@@ -65,24 +65,24 @@ class Noise:
             return self.scales
         return self.weights**-0.5 if size == 1 else torch.linalg.det(self.weights) ** -0.25
 
-    def __getitem__(self, rows: Any) -> Noise:
+    def __getitem__(self, rows: Any) -> KeypointNoise:
         """Of some keypoints, as one indexes a tensor."""
-        return Noise(self.scales[rows], self.information[rows])
+        return KeypointNoise(self.scales[rows], self.information[rows])
 
-    def stated(self) -> Noise:
+    def stated(self) -> KeypointNoise:
         """The same noise, stated where it was only known by scale: tests that know MARGIN stay as they are."""
         if self.information.shape[-1]:
             return self
-        return Noise(self.scales, MARGIN**2 * self.scales[..., None] ** -2)
+        return KeypointNoise(self.scales, MARGIN**2 * self.scales[..., None] ** -2)
 
-    def weighed(self, factors: Tensor) -> Noise:
+    def weighed(self, factors: Tensor) -> KeypointNoise:
         """Stated information, multiplied with factors (...)."""
-        return Noise(self.scales, self.information * factors[..., None])
+        return KeypointNoise(self.scales, self.information * factors[..., None])
 
-    def worse(self, other: Noise) -> Noise:
+    def worse(self, other: KeypointNoise) -> KeypointNoise:
         """Of each pair of keypoints that of the one that is known less well."""
         first = self.sigmas >= other.sigmas
-        return Noise(
+        return KeypointNoise(
             torch.maximum(self.scales, other.scales),
             torch.where(first[..., None], self.information, other.information),
         )
@@ -118,7 +118,7 @@ class Noise:
 
 
 def packed_information(information: Tensor | None, like: Tensor) -> Tensor:
-    """Information (...) or (..., 2, 2) of keypoints, or none, as `Noise` has it; like: (...)."""
+    """Information (...) or (..., 2, 2) of keypoints, or none, as `KeypointNoise` has it; like: (...)."""
     if information is None:
         return like.new_zeros(*like.shape, 0)
     return information[..., None] if information.ndim == like.ndim else triangle(information)
@@ -138,7 +138,7 @@ def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera
 
 
 def fits(squared: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
-    """(...) bool: squared errors (...), as `Noise` says them, that keypoints may well have."""
+    """(...) bool: squared errors (...), as `KeypointNoise` says them, that keypoints may well have."""
     return squared < chi_square
 
 

@@ -21,14 +21,14 @@ from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
 from torchslam.geometry.ransac import SUPPORT_WIDTH, sample_minimal_of_all, search
-from torchslam.geometry.undistorted import Undistorted
+from torchslam.geometry.undistorted import UndistortedKeypoints
 
 
 @full_precision
 @torch.no_grad()
 def start_pose(
     points_w: Tensor,
-    undistorted: Undistorted,
+    undistorted: UndistortedKeypoints,
     size: tuple[int, int],
     threshold: float,
     seed: int = 0,
@@ -82,7 +82,7 @@ class _Problem:
     mask: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, undistorted: Undistorted, threshold: float) -> _Problem:
+    def of(cls, points: Tensor, undistorted: UndistortedKeypoints, threshold: float) -> _Problem:
         ones, xy = torch.ones_like(points[:, :1]), undistorted.xy.mT
         scale = undistorted.pixel_scale / threshold
         homogeneous = torch.cat((points, ones), dim=1).mT

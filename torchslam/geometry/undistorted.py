@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.gating import Noise
+from torchslam.geometry.gating import KeypointNoise
 from torchslam.geometry.whitening import whitening
 
 _NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
@@ -18,7 +18,7 @@ _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some tho
 
 
 @dataclass(frozen=True)
-class Undistorted:
+class UndistortedKeypoints:
     """Keypoints (N,) of a camera, undistorted once; coordinates come first in memory.
 
     xy:    (2, N) undistorted image coordinates, x/z and y/z
@@ -29,7 +29,7 @@ class Undistorted:
     slope: Tensor
 
     @classmethod
-    def of(cls, pixels: Tensor, camera: Camera) -> Undistorted:
+    def of(cls, pixels: Tensor, camera: Camera) -> UndistortedKeypoints:
         """Of pixels (N, 2) of one camera, exactly."""
         xy = camera.normalize(pixels)
         if camera.model == "pinhole":
@@ -39,9 +39,9 @@ class Undistorted:
             slope = J[..., :2].permute(2, 1, 0)
         return cls(xy.mT.contiguous(), slope.contiguous())
 
-    def __getitem__(self, rows: Tensor) -> Undistorted:
+    def __getitem__(self, rows: Tensor) -> UndistortedKeypoints:
         """Some of the keypoints, by index (n,)."""
-        return Undistorted(self.xy.index_select(1, rows), self.slope.index_select(2, rows))
+        return UndistortedKeypoints(self.xy.index_select(1, rows), self.slope.index_select(2, rows))
 
     @property
     def pixel_scale(self) -> Tensor:
@@ -49,7 +49,7 @@ class Undistorted:
         (a, b), (c, d) = self.slope[0].unbind(0), self.slope[1].unbind(0)
         return torch.addcmul(a * d, b, c, value=-1).abs_().sqrt_()
 
-    def whitened(self, noise: Noise) -> Tensor:
+    def whitened(self, noise: KeypointNoise) -> Tensor:
         """(2, 2, N) slopes in units of the noise (N,) of the keypoints: times an error in xy, to first order, they are
         an error of covariance one. Noise whose inverse covariance is not definite gives zero."""
         if noise.information.shape[-1] < 3:
@@ -67,16 +67,16 @@ class Undistortion:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
 
-    def __call__(self, pixels: Tensor) -> Undistorted:
+    def __call__(self, pixels: Tensor) -> UndistortedKeypoints:
         """Of pixels (N, 2)."""
         if self.camera.model == "pinhole":
-            return Undistorted.of(pixels, self.camera)
+            return UndistortedKeypoints.of(pixels, self.camera)
         last = self._size - 1
         at = (pixels.mT / self._step).round_().clamp_(torch.zeros_like(last), last)
         node = (at[1] * self._size[0] + at[0]).long()
         xy, slope, inverse = self._table.index_select(0, node).mT.contiguous().split((2, 4, 4))
         off = torch.addcmul(pixels.mT, at, self._step, value=-1)
-        return Undistorted(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
+        return UndistortedKeypoints(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
 
     def prepare(self) -> None:
         """Make the table, so that nobody waits for it later."""
@@ -105,7 +105,7 @@ class Undistortion:
         """(n, 10) of the nodes, row by row: xy, slope and its inverse, d xy / d pixel."""
         columns, rows = (torch.arange(int(count), device=self._step.device) for count in self._size)
         nodes = torch.cartesian_prod(rows, columns).flip(1) * self._step
-        exact = Undistorted.of(nodes, self.camera)
+        exact = UndistortedKeypoints.of(nodes, self.camera)
         # slope[j, i] to inverse[i, j]
         inverse, failed = torch.linalg.inv_ex(exact.slope.permute(2, 1, 0))
         # Beyond the monotone part of the distortion all pixels get its edge.

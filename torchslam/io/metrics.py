@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from torchslam.calibration.auto import judged
+from torchslam.calibration.auto import camera_remark
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate
@@ -16,8 +16,8 @@ from torchslam.types import Trajectory
 Errors = TypeVar("Errors")
 
 
-def figures_of(
-    finished: Run, sequence: Sequence, camera: str, told: Callable[[str], None] = lambda words: None
+def compute_metrics(
+    finished: Run, sequence: Sequence, camera: str, log: Callable[[str], None] = lambda words: None
 ) -> dict[str, Any]:
     """The figures of a run, against ground truth where there is one and the run has poses to compare.
 
@@ -30,7 +30,7 @@ def figures_of(
         try:
             return measure(sequence.groundtruth)
         except TrajectoryError as error:
-            told(f"no evaluation: {error}")
+            log(f"no evaluation: {error}")
             return None
 
     figures = metrics(
@@ -38,4 +38,4 @@ def figures_of(
         measured(lambda truth: evaluate(finished.trajectory, truth)),
         measured(lambda truth: ate_apart(finished.online_parts, truth)),
     )
-    return figures | {"camera": judged(finished, camera), "dropped": sequence.dropped}
+    return figures | {"camera": camera_remark(finished, camera), "dropped": sequence.dropped}

@@ -59,7 +59,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
         trajectory, keyframes, truth = evaluation.aligned, aligned(keyframes, S), _truth(results)
         title += f", ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
     unit = "" if truth is None else "m"
-    ids = results.map.living_points()
+    ids = results.map.valid_points()
     points_w = transform(S, results.map.positions_w[ids])
     certainty = [
         S[:3, :3] @ covariances_w @ S[:3, :3].mT
@@ -105,11 +105,11 @@ def _truth(results: Results) -> Trajectory | None:
 
 
 def _errors(evaluation: Evaluation, results: Results) -> Figure:
-    estimated, true = evaluation.matched.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
+    estimated, true = evaluation.run_matcher.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
     errors_rad = so3_log(true.mT @ estimated).norm(dim=-1)
     title = f"Error against ground truth, aligned by a similarity (scale {evaluation.scale:.4g})"
     return plots.plot_errors(
-        evaluation.matched.timestamps, evaluation.errors_m, errors_rad, results.frames, title
+        evaluation.run_matcher.timestamps, evaluation.errors_m, errors_rad, results.frames, title
     )
 
 

@@ -83,7 +83,7 @@ def quality(run: Run) -> dict[str, float | None]:
     return found
 
 
-def doubts(figures: Mapping[str, Any]) -> list[str]:
+def result_warnings(figures: Mapping[str, Any]) -> list[str]:
     """What speaks against a run that went well, in words."""
     keyframes, posed = figures["keyframes"], figures["posed"]
     if posed < FEW or 2 * keyframes < posed:
@@ -135,7 +135,7 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
     frames, skipped = figures["frames"], len(figures["skipped"])
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
     if figures.get("dropped"):
-        rows["dropped"] = f"{figures['dropped']} frames that came while there was no time for them"
+        rows["dropped"] = f"{figures['dropped']} frames (processing too slow)"
     if latency := figures.get("latency_ms"):
         rows["latency"] = f"{latency['median']:.0f} ms in the median, {latency['p95']:.0f} ms at 95 %"
     if figures["initialised_at"] is None:

@@ -21,9 +21,9 @@ from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.frames_file import read_frames, write_frames
-from torchslam.map.file import read_worlds, write_worlds
+from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.types import StepResult, Trajectory
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
@@ -64,7 +64,7 @@ class Results:
     groundtruth: Trajectory | None
     others: dict[int, Trajectory]
     map: Map
-    worlds: tuple[World, ...]
+    worlds: tuple[Submap, ...]
     camera: Camera
     frames: list[StepResult]
     metrics: dict[str, Any]
@@ -93,7 +93,7 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
     write_trajectory(directory / KEYFRAMES, run.keyframes)
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
-    write_worlds(directory / MAP, run.worlds, run.camera, run.sessions)
+    write_atlas(directory / MAP, run.worlds, run.camera, run.sessions)
     write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
@@ -105,7 +105,7 @@ def read_results(directory: Path) -> Results:
     """The results in a folder. Raises ResultsError, TrajectoryError or FrameError for what is missing or damaged."""
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
-    saved, figures = read_worlds(directory / MAP), read_metrics(directory)
+    saved, figures = read_atlas(directory / MAP), read_metrics(directory)
     main = [world.map for world in saved.worlds if world.number == figures["world"]]
     beside = {world.number: directory / OTHER_TRAJECTORY.format(world.number) for world in saved.worlds}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE

@@ -1,7 +1,7 @@
 """A kit to train with through SLAM: clips of sequences, poses of clips, losses, and trainings that can be resumed."""
 
 from torchslam.learning.clip import ClipGraph, ClipLoss, ClipPoses, ClipSLAM, clip_loss, clip_mean
-from torchslam.learning.clips import Batches, Clip, Clips, Looking, collate, frames_in, parallax
+from torchslam.learning.clips import Batches, Clip, Clips, GraphCache, collate, frames_in, parallax
 from torchslam.learning.losses import (
     clip_reprojection,
     epipolar_loss,
@@ -22,8 +22,8 @@ __all__ = [
     "ClipPoses",
     "ClipSLAM",
     "Clips",
+    "GraphCache",
     "Log",
-    "Looking",
     "Training",
     "clip_loss",
     "clip_mean",

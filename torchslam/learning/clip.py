@@ -1,8 +1,8 @@
 """SLAM of short clips as a module to train: images in, poses out, gradients back into whatever found the keypoints.
 
-The system decides what is discrete (which keypoints match, which frames are keyframes) without gradient: it looks,
-once. What it leaves behind is a least-squares problem whose pixels are read anew from the features, with their
-gradients, as often as one likes; the poses are its minimiser, differentiated by the implicit function theorem.
+The system makes the discrete decisions (which keypoints match, which frames are keyframes) once, without gradient. The
+result is a graph: a least-squares problem whose pixels are read from the features, with their gradients, in every step.
+The poses are its minimizer, differentiated by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchslam.config import Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import check_features
-from torchslam.geometry import Camera, Noise
+from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.whitening import times
 from torchslam.map.posed_frames import RunGraph
 from torchslam.optim.run_graph import GraphSolution
@@ -140,10 +140,10 @@ class ClipSLAM(nn.Module):
             clip_loss(poses, T_cw_groundtruth, on_failure=1.0).loss.backward()
             optimizer.step()
 
-    A call looks and poses. Where keypoints only move or are weighed anew while they learn, look once and keep what was
-    seen; then a step takes about a tenth of a second without the front end:
+    A call builds the graph and solves it for the poses. If training only moves or reweights keypoints, build the graph
+    once and reuse it; a step then takes about a tenth of a second without the front end:
 
-        graph = clip_slam.look(images, camera)
+        graph = clip_slam.build_graph(images, camera)
         ...
         poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, features)
 
@@ -159,19 +159,19 @@ class ClipSLAM(nn.Module):
     def __init__(
         self,
         extractor: nn.Module,
-        weigh: Callable[[Features], Tensor] | None = None,
+        keypoint_weight: Callable[[Features], Tensor] | None = None,
         config: Config | None = None,
     ) -> None:
         super().__init__()
         self.extractor = extractor
-        self.weigh = weigh
+        self.keypoint_weight = keypoint_weight
         self.config = config or Config()
 
     def forward(self, images: Tensor, camera: Camera, graph: ClipGraph | None = None) -> ClipPoses:
         """Poses of a clip (T, 1, H, W), or of each of several clips (B, T, 1, H, W), floats in [0, 1].
 
         camera: of all, or with params (B, K) of each clip its own
-        graph:  what `look` saw of these images before; it looks anew if None
+        graph:  of these images, as `build_graph` made it; built anew if None
 
         The front end works where the images are, everything behind it where the camera is. World and unit are
         arbitrary, and without gradient: take a loss that does not depend on them, as `clip_loss`. A clip in which no
@@ -179,7 +179,7 @@ class ClipSLAM(nn.Module):
         shape, FrameError for images that have not the size that the camera has.
         """
         features = self.extract(images)
-        graph = self.look(images, camera, features) if graph is None else graph
+        graph = self.build_graph(images, camera, features) if graph is None else graph
         return self.pose(graph, features, camera)
 
     def extract(self, images: Tensor) -> Features | list[Features]:
@@ -189,7 +189,7 @@ class ClipSLAM(nn.Module):
         return [self.extractor(clip) for clip in images] if images.ndim == 5 else self.extractor(images)
 
     @torch.no_grad()
-    def look(
+    def build_graph(
         self, images: Tensor, camera: Camera, features: Features | Sequence[Features] | None = None
     ) -> ClipGraph:
         """What the system makes of a clip or of several, without gradient: matches, keyframes, correspondences.
@@ -203,8 +203,8 @@ class ClipSLAM(nn.Module):
         # A copy: parameters may move in place while they learn.
         camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
         cameras = _cameras(camera, len(clips))
-        looked = (self._look(*one) for one in zip(clips, seen, cameras, strict=True))
-        runs, reasons = zip(*looked, strict=True)
+        found = (self._build_graph(*one) for one in zip(clips, seen, cameras, strict=True))
+        runs, reasons = zip(*found, strict=True)
         return ClipGraph(runs, cameras, clips.shape[1], batched, reasons)
 
     def pose(
@@ -212,9 +212,9 @@ class ClipSLAM(nn.Module):
     ) -> ClipPoses:
         """The poses that a graph has with these features, differentiable with respect to them and to the camera.
 
-        features: of the clip, or one per clip: the same keypoints in the same rows as when it was looked, moved as may
-                  be. A row whose mask is False by now does not count.
-        camera:   as in `forward`; the one that was looked through, without gradient, if None
+        features: of the clip, or one per clip: the same keypoints in the same rows as when the graph was built,
+                  possibly moved. A row whose mask is False by now does not count.
+        camera:   as in `forward`; that of the graph, without gradient, if None
         """
         seen = _per_clip(features)
         cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
@@ -225,15 +225,18 @@ class ClipSLAM(nn.Module):
             )
         cameras = tuple(camera.to(torch.float64) for camera in cameras)
         seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
-        worth = [torch.ones_like(each.scores) if self.weigh is None else self.weigh(each) for each in seen]
+        keypoint_weights = [
+            torch.ones_like(each.scores) if self.keypoint_weight is None else self.keypoint_weight(each)
+            for each in seen
+        ]
         graphs = tuple(
-            None if run is None else _as_seen(run, each, worth_of, own)
-            for run, each, worth_of, own in zip(graph.runs, seen, worth, cameras, strict=True)
+            None if run is None else _as_seen(run, each, weights_of, own)
+            for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
         )
-        there = [each for each in graphs if each is not None]
-        found = iter(solve_each(there, iterations=_ITERATIONS, tolerance=_TOLERANCE))
+        solvable = [each for each in graphs if each is not None]
+        found = iter(solve_each(solvable, iterations=_ITERATIONS, tolerance=_TOLERANCE))
         solutions = tuple(None if each is None else next(found) for each in graphs)
-        clips = [_posed(*one) for one in zip(graphs, solutions, seen, worth, cameras, strict=True)]
+        clips = [_posed(*one) for one in zip(graphs, solutions, seen, keypoint_weights, cameras, strict=True)]
         T_cw, posed = (torch.stack(each) for each in zip(*clips, strict=True))
         settled = [each is not None and bool((each.converged | ~each.success).all()) for each in solutions]
         success = (posed.sum(-1) >= MIN_POSES) & torch.tensor(settled, device=posed.device)
@@ -244,7 +247,7 @@ class ClipSLAM(nn.Module):
         row = slice(None) if graph.batched else 0
         return ClipPoses(T_cw[row], posed[row], success[row], tuple(reasons), graphs, solutions)
 
-    def _look(self, images: Tensor, features: Features, camera: Camera) -> tuple[RunGraph | None, str]:
+    def _build_graph(self, images: Tensor, features: Features, camera: Camera) -> tuple[RunGraph | None, str]:
         """What the system makes of the features of one clip; None where no map starts, and why."""
         check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
@@ -272,14 +275,14 @@ def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
     return tuple(camera[row] for row in range(clips))
 
 
-def _as_seen(run: RunGraph, features: Features, worth: Tensor, camera: Camera) -> RunGraph:
+def _as_seen(run: RunGraph, features: Features, keypoint_weights: Tensor, camera: Camera) -> RunGraph:
     """The graph of a clip with the pixels and weights that its features have by now; worth (T, N) of the keypoints."""
     run = _still_seen(run, features.mask)
     rows = (run.frame_ids[run.frame_index], run.keypoint_index)
     weights = run.weights
     if features.information is not None:
-        weights = Noise.of(features.scales[rows], features.information[rows]).weights.double()
-    weights = times(weights, worth[rows])
+        weights = KeypointNoise.of(features.scales[rows], features.information[rows]).weights.double()
+    weights = times(weights, keypoint_weights[rows])
     return replace(run, pixels=features.keypoints[rows].double(), weights=weights, camera=camera)
 
 
@@ -287,12 +290,12 @@ def _posed(
     graph: RunGraph | None,
     solution: GraphSolution | None,
     features: Features,
-    worth: Tensor,
+    keypoint_weights: Tensor,
     camera: Camera,
 ) -> tuple[Tensor, Tensor]:
     """The poses (T, 4, 4) of a clip, and which frames have one (T,)."""
     # Zero times all that poses depend on: where there is no pose, there is a gradient all the same.
-    nothing = features.keypoints.sum() + worth.sum() + camera.params.sum()
+    nothing = features.keypoints.sum() + keypoint_weights.sum() + camera.params.sum()
     nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
     frames, device = len(features.mask), nothing.device
     T_cw = torch.eye(4, dtype=torch.float64, device=device) + nothing.expand(frames, 1, 1)

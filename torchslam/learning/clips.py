@@ -202,8 +202,8 @@ class Batches(Sampler[list[int]]):
             yield rows
 
 
-class Looking:
-    """Graphs of clips of a data set, each looked at once, by a copy of the front end as it is now.
+class GraphCache:
+    """Graphs of the clips of a data set, each built once, by a copy of the front end as it is now.
 
     So what is seen of a clip does not depend on when in a training it first came: one that is resumed, with a front end
     that begins as it did, sees the same.
@@ -218,7 +218,7 @@ class Looking:
         numbers = clips.number.tolist()
         for row, number in enumerate(numbers):
             if number not in self._graphs:
-                self._graphs[number] = self._clip_slam.look(clips.images[row], clips.camera[row])
+                self._graphs[number] = self._clip_slam.build_graph(clips.images[row], clips.camera[row])
         return ClipGraph.stack([self._graphs[number] for number in numbers])
 
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from torchslam.loop_closing.keyframe_database import Places
+from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 
-__all__ = ["Places"]
+__all__ = ["KeyframeDatabase"]

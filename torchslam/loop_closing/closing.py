@@ -13,10 +13,10 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.essential_graph import essential_edges
-from torchslam.loop_closing.loop_detector import Recognition
+from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.loop_closing.relative_sim3 import neighbourhood
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.mapping.fusion import find_in, merge
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.optim import PoseGraph, pose_graph_optimize
@@ -25,14 +25,14 @@ _ITERATIONS = 20
 _SIDE = 20  # keyframes on either side of a seam that are searched for the other's points: what a visit has
 
 
-def close_loop(found: Recognition, camera: Camera, config: Config) -> None:
+def close_loop(found: LoopCandidate, camera: Camera, config: Config) -> None:
     """Bend a world so that a keyframe lies to a place as it was recognised to; the first keyframe stays."""
     world = found.world
     world.correct(corrected(found))
     weld(world, found.keyframe, found.place, camera, config)
 
 
-def corrected(found: Recognition) -> Tensor:
+def corrected(found: LoopCandidate) -> Tensor:
     """(K, 4, 4) similarities, world to keyframe, in which the loop is closed and the ways between bend least."""
     T_cw = found.world.map.T_cw
     edges = essential_edges(found.world.map)
@@ -44,7 +44,7 @@ def corrected(found: Recognition) -> Tensor:
     return pose_graph_optimize(graph, backward="detached", iterations=_ITERATIONS).S_cw
 
 
-def join(found: Recognition, camera: Camera, config: Config) -> tuple[World, int]:
+def join(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Submap, int]:
     """Make one world of two: the younger one moves to where the older one has the place.
 
     Returns the older one and the row of the keyframe in it. The camera stays where it was last.
@@ -63,7 +63,7 @@ def join(found: Recognition, camera: Camera, config: Config) -> tuple[World, int
     return world, found.keyframe
 
 
-def weld(world: World, keyframe: int, place: int, camera: Camera, config: Config) -> None:
+def weld(world: Submap, keyframe: int, place: int, camera: Camera, config: Config) -> None:
     """Merge the points that the surroundings of a keyframe and of a place both see, and adjust the whole map.
 
     Then once more: where the map was bent, points lie too far from their keypoints to be found, and adjusted they do
@@ -72,13 +72,13 @@ def weld(world: World, keyframe: int, place: int, camera: Camera, config: Config
     here = neighbourhood(world.map, keyframe, _SIDE)
     there = neighbourhood(world.map, place, _SIDE)
     sew(world.map, here, there, camera, config)
-    if config.loops.adjust and config.bundle.enabled:
-        adjust_all(world.map, camera, config.bundle)
+    if config.loop_closing.global_bundle_adjustment and config.bundle_adjustment.local:
+        adjust_all(world.map, camera, config.bundle_adjustment)
         sew(world.map, here, there, camera, config)
-        adjust_all(world.map, camera, config.bundle)
+        adjust_all(world.map, camera, config.bundle_adjustment)
 
 
-def sew_on(world: World, keyframe: int, camera: Camera, config: Config) -> None:
+def sew_on(world: Submap, keyframe: int, camera: Camera, config: Config) -> None:
     """Merge what a keyframe sees with what is seen by those that were here at another time.
 
     For after a loop was closed: the way goes on over the seam, and what tracking and mapping find by the keyframes that

@@ -24,7 +24,7 @@ _FIRST_CAPACITY = 64
 _MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
 
 
-class Places:
+class KeyframeDatabase:
     """Keyframes, named by keys of the caller, as words and codes; asked for those that look like a frame.
 
     Rows of descriptors are in order of falling strength, as the extractors give them. Floats (N, D) of unit length

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchslam.config import Config, LoopsConfig
+from torchslam.config import Config, LoopClosingConfig
 from torchslam.geometry import Camera, se3_inverse, sim3_scale
 from torchslam.geometry.motion import rotation_angle
-from torchslam.loop_closing.keyframe_database import Places
-from torchslam.loop_closing.relative_sim3 import Relation, confirms, neighbourhood, relate
-from torchslam.map.atlas import Worlds
+from torchslam.loop_closing.keyframe_database import KeyframeDatabase
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, confirms, neighbourhood, relate
+from torchslam.map.atlas import Atlas
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 
 _AROUND = 20  # keyframes that share most points with the asking one: what they see is no news
 _CONFIRMERS = 5  # keyframes beside it that are asked
@@ -23,18 +23,18 @@ _SAME_SCALE, _SAME_DEG, _SAME_SHARE = 1.2, 5.0, 0.1  # between two relations tha
 
 
 @dataclass(frozen=True)
-class Recognition:
+class LoopCandidate:
     """A keyframe shows the place of another one.
 
     world, keyframe: the one that asked; other, place: the one that was recognised, in the same world or another
     relation: of the asking world, where the keyframe is, to the other world
     """
 
-    world: World
+    world: Submap
     keyframe: int
-    other: World
+    other: Submap
     place: int
-    relation: Relation
+    relation: RelativeSim3
 
     @property
     def is_loop(self) -> bool:
@@ -42,15 +42,15 @@ class Recognition:
         return self.world is self.other
 
     @property
-    def recall(self) -> Recall:
+    def recall(self) -> LoopClosureRecord:
         """What remains of it when the map has changed."""
         frame = int(self.world.map.keyframes["frame_index"][self.keyframe])
         place = int(self.other.map.keyframes["frame_index"][self.place])
-        return Recall(frame, place, self.world.number, self.other.number)
+        return LoopClosureRecord(frame, place, self.world.number, self.other.number)
 
 
 @dataclass(frozen=True)
-class Recall:
+class LoopClosureRecord:
     """That a place was recognised, for the record: the frames of the two keyframes and the numbers of their worlds."""
 
     frame: int
@@ -59,19 +59,19 @@ class Recall:
     other: int
 
 
-class Recognizer:
+class LoopDetector:
     """Asks for every new keyframe whether its place is known."""
 
-    def __init__(self, camera: Camera, config: Config, worlds: Worlds, places: Places) -> None:
+    def __init__(self, camera: Camera, config: Config, worlds: Atlas, places: KeyframeDatabase) -> None:
         self.camera = camera
         self.config = config
         self.worlds = worlds
         self.places = places
 
-    def recognize(self, world: World, keyframe: int) -> Recognition | None:
+    def recognize(self, world: Submap, keyframe: int) -> LoopCandidate | None:
         """The place that a keyframe shows, if it is certain; None where it is new, or where two places might be it."""
         found = [
-            Recognition(world, keyframe, other, place, relation)
+            LoopCandidate(world, keyframe, other, place, relation)
             for other, place in self._candidates(world, keyframe)
             if (relation := self._relation(world, keyframe, other, place)) is not None
         ]
@@ -79,15 +79,15 @@ class Recognizer:
             return None
         return found[0]
 
-    def _candidates(self, world: World, keyframe: int) -> Iterator[tuple[World, int]]:
+    def _candidates(self, world: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
         """Keyframes that look like this one but share nothing with it, the likeliest first, one of each place."""
         slam_map = world.map
         known = two_steps_around(slam_map, keyframe)
         keys, _ = self.places.like(slam_map.key(keyframe))
-        taken: list[tuple[World, Tensor]] = [(world, known)]
-        for key in keys[: 4 * self.config.loops.candidates].tolist():
+        taken: list[tuple[Submap, Tensor]] = [(world, known)]
+        for key in keys[: 4 * self.config.loop_closing.max_candidates].tolist():
             found = self.worlds.find(key)
-            if found is None or len(taken) > self.config.loops.candidates:
+            if found is None or len(taken) > self.config.loop_closing.max_candidates:
                 continue
             other, place = found
             if any(other is one and bool((near == place).any()) for one, near in taken):
@@ -95,12 +95,14 @@ class Recognizer:
             taken.append((other, neighbourhood(other.map, place)))
             yield other, place
 
-    def _relation(self, world: World, keyframe: int, other: World, place: int) -> Relation | None:
+    def _relation(self, world: Submap, keyframe: int, other: Submap, place: int) -> RelativeSim3 | None:
         """How a keyframe lies to a place, if keyframes beside it confirm that and a drift may be the reason."""
         relation = relate(world.map, keyframe, other.map, place, self.camera, self.config)
         if relation is None:
             return None
-        if world is other and not may_have_drifted(world, keyframe, place, relation, self.config.loops):
+        if world is other and not may_have_drifted(
+            world, keyframe, place, relation, self.config.loop_closing
+        ):
             return None
         near = neighbourhood(other.map, place)
         beside = world.map.covisible(keyframe, _CONFIRMERS)
@@ -108,7 +110,7 @@ class Recognizer:
             confirms(relation, world.map, one, other.map, near, self.camera, self.config)
             for one in beside.tolist()
         )
-        return relation if sure >= self.config.loops.min_confirming else None
+        return relation if sure >= self.config.loop_closing.min_confirming_keyframes else None
 
 
 def two_steps_around(slam_map: Map, keyframe: int) -> Tensor:
@@ -119,7 +121,7 @@ def two_steps_around(slam_map: Map, keyframe: int) -> Tensor:
 
 
 def may_have_drifted(
-    world: World, keyframe: int, place: int, relation: Relation, settings: LoopsConfig
+    world: Submap, keyframe: int, place: int, relation: RelativeSim3, settings: LoopClosingConfig
 ) -> bool:
     """Whether so long a way can have drifted by what a loop says: places that only look alike lie further apart.
 
@@ -143,7 +145,7 @@ def may_have_drifted(
     )
 
 
-def agree(one: Recognition, other: Recognition) -> bool:
+def agree(one: LoopCandidate, other: LoopCandidate) -> bool:
     """Whether two recognitions by the same keyframe say the same; of different worlds nothing can be said."""
     if one.other is not other.other:
         return True

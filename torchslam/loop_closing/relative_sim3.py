@@ -34,7 +34,7 @@ WIDER = 2.0  # times the noise: a similarity has its own
 
 
 @dataclass(frozen=True)
-class Relation:
+class RelativeSim3:
     """A keyframe of one map seen from another map.
 
     S_21:    (4, 4) similarity from the world of map 1 to that of map 2
@@ -50,7 +50,7 @@ class Relation:
 
 def relate(
     map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
-) -> Relation | None:
+) -> RelativeSim3 | None:
     """The similarity between two maps by a keyframe of each; None where they do not show the same for certain.
 
     The two may be one map: then keyframe 1 is seen from the place where keyframe 2 is.
@@ -60,14 +60,14 @@ def relate(
         return None
     points_2 = map_2.points_seen_by(neighbourhood(map_2, keyframe_2))
     ids, keypoints = find(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
-    settings = config.loops
+    settings = config.loop_closing
     if len(ids) < settings.min_matches:
         return None
     T_12, agrees = _refined(map_2, ids, T_12, map_1, keyframe_1, keypoints, camera)
     ids, keypoints = ids[agrees], keypoints[agrees]
     own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
     ids, own = ids[own >= 0], own[own >= 0]
-    if int(agrees.sum()) < settings.min_matches or len(ids) < settings.min_pairs:
+    if int(agrees.sum()) < settings.min_matches or len(ids) < settings.min_sim3_points:
         return None
     T_11 = map_1.T_cw[keyframe_1]
     # How much longer the unit of map 1 is: the depths of the same points tell, as one pose alone does not.
@@ -80,16 +80,22 @@ def relate(
     back, _ = agreeing(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
     if len(back) < settings.min_matches // 2:
         return None
-    return Relation(S_21, int(agrees.sum()), len(back), len(own))
+    return RelativeSim3(S_21, int(agrees.sum()), len(back), len(own))
 
 
 def confirms(
-    relation: Relation, map_1: Map, other: int, map_2: Map, near_2: Tensor, camera: Camera, settings: Config
+    relation: RelativeSim3,
+    map_1: Map,
+    other: int,
+    map_2: Map,
+    near_2: Tensor,
+    camera: Camera,
+    settings: Config,
 ) -> bool:
     """Whether another keyframe of map 1 sees the points around keyframes near_2 (k,) of map 2 where it should."""
     T_o2 = seen_from(map_1.T_cw[other], sim3_inverse(relation.S_21))
     ids, _ = agreeing(map_2, map_2.points_seen_by(near_2), T_o2, map_1, other, camera, settings)
-    return len(ids) >= settings.loops.min_matches // 2
+    return len(ids) >= settings.loop_closing.min_matches // 2
 
 
 def neighbourhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
@@ -133,7 +139,7 @@ def agreeing(
     view = other.view(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
-    good = fits(errors, WIDER**2 * config.measurement.chi_square)
+    good = fits(errors, WIDER**2 * config.measurement.max_chi_square)
     return ids[good], keypoints[good]
 
 

@@ -1,6 +1,6 @@
 """A world without what it no longer needs: keyframes that others replace, and the rows of dead points.
 
-Rows are renumbered wherever a world refers to them. Whoever keeps rows elsewhere follows by the `Renumbering`.
+Rows are renumbered wherever a world refers to them. Whoever keeps rows elsewhere follows by the `RowRemap`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from torch import Tensor
 
 from torchslam.geometry import se3_inverse
 from torchslam.map.map import NO_POINT, Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 
 LEAST_DEAD = 4096  # rows of dead points that are not worth the trouble
 _PRICE = 64  # rows of the history that may be rewritten per row of a dead point
 
 
 @dataclass(frozen=True)
-class Renumbering:
+class RowRemap:
     """Where rows went.
 
     keyframes: (K,) new row of every old keyframe; points: (L,) likewise; -1 where it is gone
@@ -30,16 +30,16 @@ class Renumbering:
     points: Tensor
     heirs: Tensor
 
-    def then(self, later: Renumbering) -> Renumbering:
+    def then(self, later: RowRemap) -> RowRemap:
         """Both, one after the other."""
-        return Renumbering(
+        return RowRemap(
             torch.where(self.keyframes >= 0, later.keyframes[self.keyframes], -1),
             torch.where(self.points >= 0, later.points[self.points], -1),
             later.heirs[self.heirs],
         )
 
 
-def remove_keyframes(world: World, keyframes: Tensor) -> Renumbering:
+def remove_keyframes(world: Submap, keyframes: Tensor) -> RowRemap:
     """Take keyframes (k,) out of the map; their frames stay in the history, with what the map knew of them last.
 
     A frame that referred to one of them refers to the nearest keyframe that shares points with it, at the same place.
@@ -62,11 +62,11 @@ def remove_keyframes(world: World, keyframes: Tensor) -> Renumbering:
     kept = torch.nonzero(~goes)[:, 0]
     rows = torch.where(goes, -1, torch.cumsum(~goes, 0) - 1)
     slam_map.keyframes.keep(kept)
-    slam_map.points["born"][:] = rows[heirs][slam_map.points["born"]]
+    slam_map.points["first_keyframe"][:] = rows[heirs][slam_map.points["first_keyframe"]]
     slam_map.reindex()
     if len(history):
-        history.frames["reference"][:] = rows[history.frames["reference"]]
-    alive, track = slam_map.points["alive"], world.track
+        history.frames["reference_keyframe"][:] = rows[history.frames["reference_keyframe"]]
+    alive, track = slam_map.points["is_valid"], world.track
     local = rows[track.local_keyframes]
     world.track = replace(
         track,
@@ -75,7 +75,7 @@ def remove_keyframes(world: World, keyframes: Tensor) -> Renumbering:
         local_points=track.local_points[alive[track.local_points]],
         seen_last=track.seen_last[alive[track.seen_last]],
     )
-    return Renumbering(rows, torch.arange(len(slam_map.points), device=device), rows[heirs])
+    return RowRemap(rows, torch.arange(len(slam_map.points), device=device), rows[heirs])
 
 
 def stand_in(slam_map: Map, keyframe: int, goes: Tensor, count: int = 8) -> int:
@@ -93,29 +93,29 @@ def _leave_points(slam_map: Map, goes: Tensor, heirs: Tensor) -> None:
     gone = torch.nonzero(goes)[:, 0]
     seen = slam_map.observations(gone)
     slam_map.drop(seen, torch.ones_like(seen.point_index, dtype=torch.bool))
-    orphans = torch.nonzero(goes[slam_map.points["born"]])[:, 0]
+    orphans = torch.nonzero(goes[slam_map.points["first_keyframe"]])[:, 0]
     observers, _ = slam_map.scales_of(orphans)
     first = torch.where(observers >= 0, observers, len(goes)).amin(1)
-    born = slam_map.points["born"][orphans]
-    slam_map.points["born"][orphans] = torch.where(first < len(goes), first, heirs[born])
+    first_keyframe = slam_map.points["first_keyframe"][orphans]
+    slam_map.points["first_keyframe"][orphans] = torch.where(first < len(goes), first, heirs[first_keyframe])
 
 
-def compact(world: World) -> Renumbering | None:
+def compact(world: Submap) -> RowRemap | None:
     """Give back the rows of dead points where that is worth it; returns where rows went, None if they stay."""
     return drop_dead_points(world) if is_worth_compacting(world) else None
 
 
-def is_worth_compacting(world: World) -> bool:
+def is_worth_compacting(world: Submap) -> bool:
     """Whether so many rows are dead that dropping them costs a fixed amount for each of them."""
     rows, living = len(world.map.points), world.map.num_points
     dead = rows - living
     return dead > LEAST_DEAD and dead > living and _PRICE * dead > len(world.history.observations)
 
 
-def drop_dead_points(world: World) -> Renumbering:
+def drop_dead_points(world: Submap) -> RowRemap:
     """Give back the rows of dead points; what the history saw of merged points is seen of their heirs from now on."""
     slam_map, track = world.map, world.track
-    alive = slam_map.points["alive"]
+    alive = slam_map.points["is_valid"]
     kept = torch.nonzero(alive)[:, 0]
     rows = torch.where(alive, torch.cumsum(alive, 0) - 1, NO_POINT)
     world.history.renumber_points(slam_map, rows)
@@ -126,4 +126,4 @@ def drop_dead_points(world: World) -> Renumbering:
     local, last = rows[track.local_points], rows[track.seen_last]
     world.track = replace(track, local_points=local[local >= 0], seen_last=last[last >= 0])
     everyone = torch.arange(slam_map.num_keyframes, device=rows.device)
-    return Renumbering(everyone, rows, everyone)
+    return RowRemap(everyone, rows, everyone)

@@ -18,18 +18,16 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map.atlas import Worlds
+from torchslam.map.atlas import Atlas
 from torchslam.map.map import Map
 from torchslam.map.schema import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.map.table import Table
 from torchslam.map.validation import check_camera, check_keys, check_world
 from torchslam.utils.atomic_write import write_whole
 from torchslam.utils.bounded_read import check_regular, parse_json
 
-FORMAT = 5  # 1 had no covariances, 2 a single map without the frames between keyframes
-# Are read as well: points have the colours of a map that has seen no image, keypoints are known to their scales.
-WITHOUT_COLORS, WITHOUT_INFORMATION = 3, 4
+FORMAT = 1
 TABLES: dict[str, Schema] = {
     "points": POINTS,
     "keyframes": KEYFRAMES,
@@ -48,12 +46,12 @@ class Saved:
     sessions: how many runs over the map are in it; the next one has this number
     """
 
-    worlds: Worlds
+    worlds: Atlas
     camera: Camera
     sessions: int
 
 
-def write_worlds(path: str | Path, worlds: Iterable[World], camera: Camera, sessions: int = 1) -> None:
+def write_atlas(path: str | Path, worlds: Iterable[Submap], camera: Camera, sessions: int = 1) -> None:
     """Write all of the worlds, dead points included, and their camera, whole or not at all; same worlds, same bytes.
 
     sessions: frames of sessions from this number on were only localised, and are left out
@@ -61,8 +59,8 @@ def write_worlds(path: str | Path, worlds: Iterable[World], camera: Camera, sess
     write_tensors(path, *pack(worlds, camera, sessions))
 
 
-def read_worlds(path: str | Path, device: torch.device | str = "cpu") -> Saved:
-    """What `write_worlds` wrote.
+def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> Saved:
+    """What `write_atlas` wrote.
 
     Raises ResultsError for a missing or damaged file, one of another program or format, and one whose tables do not
     fit their schema or each other; the message names the file and what is wrong.
@@ -74,15 +72,15 @@ def read_worlds(path: str | Path, device: torch.device | str = "cpu") -> Saved:
 def read_map(path: str | Path) -> tuple[Map, Camera]:
     """The map of the world in which most frames are posed, empty where there is none, and the camera.
 
-    Raises ResultsError as `read_worlds` does.
+    Raises ResultsError as `read_atlas` does.
     """
-    saved = read_worlds(path)
+    saved = read_atlas(path)
     main = saved.worlds.main()
     return Map() if main is None else main.map, saved.camera
 
 
 def pack(
-    worlds: Iterable[World], camera: Camera, sessions: int, begun: int | None = None
+    worlds: Iterable[Submap], camera: Camera, sessions: int, begun: int | None = None
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and description of worlds; `begun`: how many ever began, by default up to the last that is left."""
     tensors, numbers = {CAMERA: camera.params}, []
@@ -126,7 +124,7 @@ def unpack(
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
-    return Saved(Worlds.of(worlds, begun, like), camera.with_params(like), sessions)
+    return Saved(Atlas.of(worlds, begun, like), camera.with_params(like), sessions)
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
@@ -162,35 +160,12 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         found = about["format"]
     except (ValueError, KeyError, TypeError):
         raise ResultsError(f"{path}: a safetensors file, but not a torchslam map") from None
-    if found in (WITHOUT_COLORS, WITHOUT_INFORMATION):
-        tensors |= _without_information(tensors)
-        tensors |= _without_colors(tensors) if found == WITHOUT_COLORS else {}
-    elif found != FORMAT:
+    if found != FORMAT:
         raise ResultsError(f"{path}: map format {found}, this version reads format {FORMAT}: run again")
     return tensors, about
 
 
-def _without_colors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The columns of colours that a file of before lacks: unknown."""
-    positions = ".points.positions_w"
-    return {
-        name.removesuffix(positions) + ".points.colors": torch.zeros((*rows.shape[:1], 3), dtype=torch.uint8)
-        for name, rows in tensors.items()
-        if name.endswith(positions)
-    }
-
-
-def _without_information(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The columns of information that a file of before lacks: none."""
-    scales = ".scales"
-    return {
-        name.removesuffix(scales) + ".information": rows.new_zeros(*rows.shape, 0)
-        for name, rows in tensors.items()
-        if name.endswith(scales)
-    }
-
-
-def _tables(world: World) -> dict[str, Table]:
+def _tables(world: Submap) -> dict[str, Table]:
     """All tables of a world by their names in a file."""
     slam_map, history = world.map, world.history
     return dict(
@@ -198,7 +173,7 @@ def _tables(world: World) -> dict[str, Table]:
     )
 
 
-def _kept(name: str, columns: dict[str, Tensor], world: World, sessions: int) -> dict[str, Tensor]:
+def _kept(name: str, columns: dict[str, Tensor], world: Submap, sessions: int) -> dict[str, Tensor]:
     """The columns without the frames of sessions that are not kept; those come last."""
     if name not in ("frames", "observations") or not columns:
         return columns
@@ -207,7 +182,7 @@ def _kept(name: str, columns: dict[str, Tensor], world: World, sessions: int) ->
         return columns
     if not bool(kept.any()):
         return {}
-    kept = kept if name == "frames" else kept[columns["row"]]
+    kept = kept if name == "frames" else kept[columns["frame_row"]]
     return {column: rows[kept] for column, rows in columns.items()}
 
 
@@ -226,9 +201,9 @@ def _numbers(about: dict[str, Any]) -> tuple[list[int], int, int]:
 
 def _world(
     number: int, tensors: dict[str, Tensor], camera: Camera, sessions: int, device: torch.device | str
-) -> World:
+) -> Submap:
     """One world of its columns `points.positions_w`, ..., which are checked."""
-    world = World.empty(number, camera.params.to(device))
+    world = Submap.empty(number, camera.params.to(device))
     columns: dict[str, dict[str, Tensor]] = {name: {} for name in TABLES}
     for name, rows in tensors.items():
         owner, _, column = name.partition(".")

@@ -9,16 +9,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Noise, se3_inverse
-from torchslam.map.observation_index import Observers, first_of_each, most
+from torchslam.geometry import KeypointNoise, se3_inverse
+from torchslam.map.observation_index import ObservationIndex, first_of_each, most
 from torchslam.map.schema import KEYFRAMES, POINTS
 from torchslam.map.table import Table
 from torchslam.optim import Marginals
-from torchslam.types import Features, Observations, View
+from torchslam.types import Features, FrameFeatures, Observations
 from torchslam.utils.indexing import distinct, ranks_among
 
 NO_POINT = -1
-NO_KEYPOINT = -1  # of what a frame without features sees
 MIN_SHARED = 15  # points that two keyframes see, to count as neighbours
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 
@@ -30,7 +29,7 @@ class Map:
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
         self.images: dict[int, Tensor] = {}  # of keyframes, by key, where a matcher wants them; saved nowhere
-        self._index: Observers | None = None  # of what the tables hold; None: not made yet
+        self._index: ObservationIndex | None = None  # of what the tables hold; None: not made yet
 
     @property
     def num_keyframes(self) -> int:
@@ -38,8 +37,8 @@ class Map:
 
     @property
     def num_points(self) -> int:
-        """How many points are alive."""
-        return int(self.points["alive"].sum()) if len(self.points) else 0
+        """The number of valid points."""
+        return int(self.points["is_valid"].sum()) if len(self.points) else 0
 
     @property
     def T_cw(self) -> Tensor:
@@ -72,21 +71,21 @@ class Map:
         rows = torch.nonzero(self.keys == key)
         return int(rows[0]) if len(rows) else -1
 
-    def living_points(self) -> Tensor:
-        """(L',) ids of the points that are alive."""
-        return torch.nonzero(self.points["alive"])[:, 0]
+    def valid_points(self) -> Tensor:
+        """(L',) ids of the valid points."""
+        return torch.nonzero(self.points["is_valid"])[:, 0]
 
     def point_features(self, point_ids: Tensor) -> Features:
         """The points (n,) as a batch of one of features without a place in an image, for matching by descriptor."""
         points = self.points
-        ones = torch.ones_like(points["reach"][point_ids])[None]
+        ones = torch.ones_like(points["scale_distance"][point_ids])[None]
         return Features(
             keypoints=ones.new_zeros(1, len(point_ids), 2),
             scores=ones,
             scales=ones,
             angles=points["angles"][point_ids][None],
             descriptors=points["descriptors"][point_ids][None],
-            mask=points["alive"][point_ids][None],
+            mask=points["is_valid"][point_ids][None],
         )
 
     def features(self, keyframes: Tensor, rows: Tensor | None = None) -> Features:
@@ -96,10 +95,12 @@ class Map:
         keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
 
-    def noise(self, keyframes: Tensor, keypoints: Tensor) -> Noise:
+    def noise(self, keyframes: Tensor, keypoints: Tensor) -> KeypointNoise:
         """Of keypoints (n,) of a keyframe each, (n,)."""
         table = self.keyframes
-        return Noise(table["scales"][keyframes, keypoints], table["information"][keyframes, keypoints])
+        return KeypointNoise(
+            table["scales"][keyframes, keypoints], table["information"][keyframes, keypoints]
+        )
 
     def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """(k, 1), (k, 1) the finest and the coarsest scale among the keypoints of keyframes (k,)."""
@@ -112,7 +113,7 @@ class Map:
         R_cw = self.T_cw[:, :3, :3]
         return R_cw.mT @ self.keyframes["covariances"][:, :3, :3] @ R_cw
 
-    def add_keyframe(self, view: View, T_cw: Tensor) -> int:
+    def add_keyframe(self, view: FrameFeatures, T_cw: Tensor) -> int:
         """Add a keyframe that observes nothing yet and whose covariance is unknown; returns its index."""
         if view.image is not None:
             self.images[(view.session << SESSION_BITS) + view.index] = view.image
@@ -138,12 +139,12 @@ class Map:
         descriptors: Tensor,
         keyframe: int,
         covariances_w: Tensor | None = None,
-        from_start: bool = False,
+        from_initialization: bool = False,
     ) -> Tensor:
         """Add points (n, 3) with descriptors (n, D), first seen in a keyframe; returns their ids (n,).
 
         covariances_w: (n, 3, 3) of the positions, zero where unknown; all unknown if None
-        from_start: whether they come from the two views that start the map
+        from_initialization: whether they come from the two views that start the map
 
         Their view directions and scales are set by `refresh`, once they are observed.
         """
@@ -154,16 +155,16 @@ class Map:
             covariances_w=like.new_zeros(n, 3, 3) if covariances_w is None else covariances_w,
             descriptors=descriptors,
             colors=torch.zeros(n, 3, dtype=torch.uint8, device=like.device),
-            normals_w=like.new_zeros(n, 3),
-            reach=like.new_zeros(n),
+            view_directions_w=like.new_zeros(n, 3),
+            scale_distance=like.new_zeros(n),
             angles=like.new_zeros(n),
-            last_seen=frame_index,
-            born=torch.full((n,), keyframe, device=like.device),
-            from_start=torch.full((n,), from_start, device=like.device),
+            last_seen_frame=frame_index,
+            first_keyframe=torch.full((n,), keyframe, device=like.device),
+            from_initialization=torch.full((n,), from_initialization, device=like.device),
             times_observed=torch.zeros(n, dtype=torch.int64, device=like.device),
             times_visible=torch.ones(n, dtype=torch.int64, device=like.device),
             times_found=torch.ones(n, dtype=torch.int64, device=like.device),
-            alive=torch.ones(n, dtype=torch.bool, device=like.device),
+            is_valid=torch.ones(n, dtype=torch.bool, device=like.device),
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
 
@@ -191,9 +192,9 @@ class Map:
         return self.keyframes["point_ids"].shape[1]
 
     @property
-    def _index_of_points(self) -> Observers:
+    def _index_of_points(self) -> ObservationIndex:
         if self._index is None:
-            self._index = Observers(self.keyframes["point_ids"])
+            self._index = ObservationIndex(self.keyframes["point_ids"])
         return self._index
 
     @property
@@ -232,11 +233,11 @@ class Map:
         keyframes = torch.where(places >= 0, places // self._keypoints, NO_POINT)
         return keyframes, self.keyframes["scales"][keyframes, places % self._keypoints]
 
-    def view(self, keyframe: int) -> View:
+    def view(self, keyframe: int) -> FrameFeatures:
         """What a keyframe saw."""
         row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
         names = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
-        return View(
+        return FrameFeatures(
             index=int(row["frame_index"]),
             timestamp=float(row["timestamp"]),
             session=int(row["session"]),
@@ -299,7 +300,7 @@ class Map:
         keyframes, points = len(self.keyframes), len(self.points)
         self.images |= other.images
         rows = other.points.columns()
-        rows["born"] = rows["born"] + keyframes
+        rows["first_keyframe"] = rows["first_keyframe"] + keyframes
         rows["replaced_by"] = torch.where(rows["replaced_by"] >= 0, rows["replaced_by"] + points, NO_POINT)
         self.points.append(**rows)
         rows = other.keyframes.columns()
@@ -314,21 +315,21 @@ class Map:
 
     # --- changing --------------------------------------------------------------------------------------------
 
-    def kill(self, point_ids: Tensor) -> None:
+    def invalidate(self, point_ids: Tensor) -> None:
         """Mark points (n,) dead and drop their observations."""
         if len(point_ids) == 0:
             return
         _, places = self._index_of_points.of(point_ids)
         self._index_of_points.clear(point_ids)
         self._observations.scatter_(0, places, NO_POINT)
-        self.points["alive"][point_ids] = False
+        self.points["is_valid"][point_ids] = False
         self.points["times_observed"][point_ids] = 0
 
     def drop(self, seen: Observations, wrong: Tensor) -> None:
         """Forget the observations that are `wrong` (O,), and kill points that fewer than two keyframes still see."""
         self.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
         touched = torch.unique(seen.point_index[wrong])
-        self.kill(touched[self.points["times_observed"][touched] < 2])
+        self.invalidate(touched[self.points["times_observed"][touched] < 2])
 
     def replace(self, old: Tensor, new: Tensor) -> None:
         """Merge points: every observation of old (n,) becomes one of new (n,); old are dead from now on.
@@ -349,7 +350,7 @@ class Map:
         places, inherited = places[order], new[which[order]]
         wanted = (places // self._keypoints) * count + inherited
         kept = first_of_each(wanted) & ~torch.isin(wanted, taken)
-        self.kill(old)
+        self.invalidate(old)
         self._observations.scatter_(0, places[kept], inherited[kept])
         index.add(inherited[kept], places[kept])
         self._count(inherited[kept], 1)
@@ -368,7 +369,7 @@ class Map:
     def refresh(self, keyframes: Tensor) -> None:
         """Take direction, scale and descriptor of the points that keyframes (k,) see from their newest observation.
 
-        `reach` is distance times keypoint scale: from distance d the point is expected at scale reach / d.
+        `scale_distance` is keypoint scale times distance: from distance d the point is expected at scale_distance / d.
         """
         seen = self.observations(torch.sort(keyframes).values)  # the newest keyframe comes last and wins
         if len(seen) == 0:
@@ -381,15 +382,15 @@ class Map:
         centres_w = se3_inverse(self.T_cw[keyframe])[:, :3, 3]
         rays_w = self.positions_w[ids] - centres_w
         distance = torch.linalg.vector_norm(rays_w, dim=-1)
-        self.points["normals_w"][ids] = rays_w / distance[:, None].clamp(min=1e-12)
-        self.points["reach"][ids] = distance * seen.scales[row]
+        self.points["view_directions_w"][ids] = rays_w / distance[:, None].clamp(min=1e-12)
+        self.points["scale_distance"][ids] = distance * seen.scales[row]
         self.points["angles"][ids] = self.keyframes["angles"][keyframe, keypoint]
         self.points["descriptors"][ids] = self.keyframes["descriptors"][keyframe, keypoint]
 
     def forget_frames(self) -> None:
         """Frames are numbered anew: no point was seen by one of them yet."""
         if len(self.points):
-            self.points["last_seen"][:] = -1
+            self.points["last_seen_frame"][:] = -1
 
     def take_covariances(self, keyframes: Tensor, point_ids: Tensor, marginals: Marginals) -> None:
         """Note how certain keyframes (k,) and points (n,) are; those the marginals hold no answer for keep theirs."""

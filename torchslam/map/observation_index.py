@@ -14,7 +14,7 @@ NOWHERE = -1
 _LEAST_ROWS, _LEAST_WIDTH = 64, 4
 
 
-class Observers:
+class ObservationIndex:
     """For every point the places (keyframe row * N + keypoint) that see it, in rows that are filled from the left.
 
     A point takes a row when it is seen first and gives it back when nobody sees it: memory goes with the points that

@@ -8,12 +8,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchslam.geometry import CHI_SQUARE_95, Camera, Noise, fits, se3_inverse, transform
-from torchslam.map.map import NO_KEYPOINT, Map, key_of
+from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, fits, se3_inverse, transform
+from torchslam.map.map import Map, key_of
 from torchslam.map.schema import FRAMES, OBSERVATIONS
 from torchslam.map.table import Table
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
-from torchslam.types import Tracked, Trajectory, View
+from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
 _ASTRAY = 4.0 * CHI_SQUARE_95  # twice as far off as a fit may be: the final adjustment moves frames by less
 _MOST = 0.75  # of what a frame saw, which must agree before the rest is forgotten
@@ -28,7 +28,6 @@ class RunGraph(ObservationGraph):
     sessions:       (F,) which run over the map saw them
     point_ids:      (P,) rows of the points of the map of their world
     keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
-                    NO_KEYPOINT where a patch was followed
     """
 
     frame_ids: Tensor
@@ -44,14 +43,14 @@ class RunGraph(ObservationGraph):
     }
 
 
-class History:
+class PosedFrames:
     """Poses relative to a keyframe, so that they follow when the map is adjusted; observations as flat rows."""
 
     def __init__(self) -> None:
         self.frames = Table(FRAMES)
         self.observations = Table(OBSERVATIONS)
 
-    def add(self, view: View, tracked: Tracked, T_cr: Tensor, reference: int) -> None:
+    def add(self, view: FrameFeatures, tracked: PoseEstimate, T_cr: Tensor, reference: int) -> None:
         """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
         device, view = T_cr.device, view.weighed(tracked.keypoints, tracked.weights)
         row = self.frames.append(
@@ -59,14 +58,12 @@ class History:
             session=torch.tensor([view.session], device=device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=device),
             T_cr=T_cr[None],
-            reference=torch.tensor([reference], device=device),
+            reference_keyframe=torch.tensor([reference], device=device),
         )
         self.observations.append(
-            row=row.expand(tracked.inliers),
+            frame_row=row.expand(tracked.inliers),
             point_ids=tracked.point_ids,
-            keypoints=tracked.keypoints
-            if view.has_features
-            else torch.full_like(tracked.keypoints, NO_KEYPOINT),
+            keypoint_index=tracked.keypoints,
             pixels=view.keypoints[tracked.keypoints],
             scales=view.scales[tracked.keypoints],
             information=view.information[tracked.keypoints],
@@ -88,7 +85,7 @@ class History:
 
     def T_cw(self, slam_map: Map) -> Tensor:
         """(F, 4, 4) poses of the frames in the order they were added, by the map as it is now."""
-        return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference"]]
+        return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference_keyframe"]]
 
     def trajectory(self, slam_map: Map, session: int | None = None) -> Trajectory:
         """Camera to world, ordered by time; the frames of one session, or of all."""
@@ -104,22 +101,22 @@ class History:
     def rescale(self, factors: Tensor) -> None:
         """The unit of length around each keyframe changes by factors (K,): what refers to it follows."""
         if len(self):
-            self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference"]][:, None]
+            self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference_keyframe"]][:, None]
 
-    def append(self, other: History, keyframes: int, points: int) -> None:
+    def append(self, other: PosedFrames, keyframes: int, points: int) -> None:
         """Add the frames of another history whose keyframe and point rows moved by these numbers."""
         if len(other) == 0:
             return
         frames, seen = other.frames.columns(), other.observations.columns()
-        seen["row"] = seen["row"] + len(self)
+        seen["frame_row"] = seen["frame_row"] + len(self)
         seen["point_ids"] = seen["point_ids"] + points
-        frames["reference"] = frames["reference"] + keyframes
+        frames["reference_keyframe"] = frames["reference_keyframe"] + keyframes
         self.frames.append(**frames)
         self.observations.append(**seen)
 
     def refer(self, heirs: Tensor, slam_map: Map) -> None:
         """Let frames that refer to keyframe i refer to heirs (K,)[i] from now on, without moving them."""
-        old = self.frames["reference"]
+        old = self.frames["reference_keyframe"]
         moves = torch.nonzero(heirs[old] != old)[:, 0]
         new = heirs[old[moves]]
         T_rr = slam_map.T_cw[old[moves]] @ se3_inverse(slam_map.T_cw[new])
@@ -134,16 +131,16 @@ class History:
         kept = slam_map.keyframes
         rows = torch.cat([self._frame_of(slam_map, keyframe) for keyframe in keyframes.tolist()])
         self.frames["T_cr"][rows] = kept["T_cw"][keyframes] @ se3_inverse(
-            slam_map.T_cw[self.frames["reference"][rows]]
+            slam_map.T_cw[self.frames["reference_keyframe"][rows]]
         )
         is_kept = torch.zeros(len(self), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
         seen = slam_map.observations(keyframes)
         self._overwrite(
-            torch.nonzero(is_kept[self.observations["row"]])[:, 0],
-            row=row_of[seen.keyframe_index],
+            torch.nonzero(is_kept[self.observations["frame_row"]])[:, 0],
+            frame_row=row_of[seen.keyframe_index],
             point_ids=seen.point_index,
-            keypoints=seen.keypoint_index,
+            keypoint_index=seen.keypoint_index,
             pixels=seen.pixels,
             scales=seen.scales,
             information=seen.information,
@@ -151,7 +148,7 @@ class History:
 
     def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
         """Put fresh observations in the place of stale rows (n,), ascending: nothing is copied as long as they fit."""
-        count = min(len(stale), len(fresh["row"]))
+        count = min(len(stale), len(fresh["frame_row"]))
         for name, values in fresh.items():
             self.observations[name][stale[:count]] = values[:count]
         if count < len(stale):
@@ -169,7 +166,7 @@ class History:
         if len(row):
             return row
         eye = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)[None]
-        return self.frames.append(T_cr=eye, reference=slam_map.ids(keyframe), **own)
+        return self.frames.append(T_cr=eye, reference_keyframe=slam_map.ids(keyframe), **own)
 
     def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
         """Points got the rows (L,), negative where they are gone: merged ones count as their heirs, dead ones not."""
@@ -186,7 +183,7 @@ class History:
         One such observation would pull a frame off its place that few points hold. Where many of a frame's do not
         agree, they stay: it may be the frame that is off its place.
         """
-        T_cw, seen_by = self.T_cw(slam_map), self.observations["row"]
+        T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
         every = torch.arange(len(seen_by), device=T_cw.device)
         agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_AT_ONCE)])
         count = torch.bincount(seen_by, minlength=len(self))
@@ -199,8 +196,8 @@ class History:
         """(n,) whether observations, by row (n,), are not far from where frames at T_cw (F, 4, 4) have their points."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
         points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
-        points_c = transform(T_cw[seen["row"]], points_w[:, None])[:, 0]
-        noise = Noise(seen["scales"], seen["information"])
+        points_c = transform(T_cw[seen["frame_row"]], points_w[:, None])[:, 0]
+        noise = KeypointNoise(seen["scales"], seen["information"])
         return fits(noise.squared_reprojection(points_c, seen["pixels"], camera), _ASTRAY)
 
     def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
@@ -217,7 +214,7 @@ class History:
         # A flag per point: `isin` would sort all that was ever seen.
         is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
         is_seen[point_ids] = True
-        rows = torch.nonzero((slot[self.observations["row"]] >= 0) & is_seen[heirs])[:, 0]
+        rows = torch.nonzero((slot[self.observations["frame_row"]] >= 0) & is_seen[heirs])[:, 0]
         keyframes = slam_map.keyframes
 
         def with_own(values: Tensor, name: str) -> Tensor:
@@ -228,10 +225,12 @@ class History:
             timestamps=torch.cat([keyframes["timestamp"], self.frames["timestamp"][between]]),
             T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
             points_w=slam_map.positions_w[point_ids],
-            frame_index=torch.cat([seen.keyframe_index, slot[self.observations["row"][rows]]]),
+            frame_index=torch.cat([seen.keyframe_index, slot[self.observations["frame_row"][rows]]]),
             point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
             pixels=with_own(seen.pixels, "pixels"),
-            weights=Noise(with_own(seen.scales, "scales"), with_own(seen.information, "information")).weights,
+            weights=KeypointNoise(
+                with_own(seen.scales, "scales"), with_own(seen.information, "information")
+            ).weights,
             camera=camera,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
@@ -239,7 +238,7 @@ class History:
             world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
             sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
             point_ids=point_ids,
-            keypoint_index=with_own(seen.keypoint_index, "keypoints"),
+            keypoint_index=with_own(seen.keypoint_index, "keypoint_index"),
         )
 
     def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
@@ -253,5 +252,5 @@ class History:
         keys = key_of(graph.sessions, graph.frame_ids)
         order = torch.argsort(keys)
         solved = order[torch.searchsorted(keys[order], self.keys)]
-        T_rw = slam_map.T_cw[self.frames["reference"]]
+        T_rw = slam_map.T_cw[self.frames["reference_keyframe"]]
         self.frames["T_cr"][:] = solution.T_cw[solved] @ se3_inverse(T_rw)

@@ -1,9 +1,8 @@
-"""The columns of a world's tables: what they hold, in which shape and which unit.
+"""The columns of a submap's tables, which are also those of a map file: shapes, types and units.
 
-A letter in a shape is a size that the first row of a table decides: N keypoints a frame, D numbers a descriptor, I
-numbers that a front end says of a keypoint's error. Kinds:
-"float" is the floating-point type of the geometry, "int" int64, "bool" bool, "byte" uint8, "descriptor" bytes or
-floats.
+A letter in a shape is a size that the first row of a table fixes: N keypoints per frame, D numbers per descriptor, I
+numbers of keypoint information (0, 1 or 3). Kinds: "float" is the floating-point type of the geometry, "int" int64,
+"bool" bool, "byte" uint8, "descriptor" bytes or floats.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Column:
-    """The shape of one row, the kind of its numbers, and what they mean."""
+    """The shape of one row, the kind of its numbers, and a description."""
 
     shape: tuple[int | str, ...]
     kind: str
     about: str
 
-    def why_not(self, values: Tensor) -> str:
-        """What is wrong with a column of values, in words; empty where it fits."""
+    def mismatch(self, values: Tensor) -> str:
+        """Describe how values violate the column; empty if they fit."""
         row = tuple(values.shape[1:])
         fits = len(row) == len(self.shape) and all(
             isinstance(wanted, str) or wanted == size for wanted, size in zip(self.shape, row, strict=True)
@@ -46,55 +45,59 @@ _KINDS = {
 Schema = dict[str, Column]
 
 POINTS: Schema = {
-    "positions_w": Column((3,), "float", "in the world"),
-    "covariances_w": Column((3, 3), "float", "of the position; zero where unknown"),
-    "descriptors": Column(("D",), "descriptor", "of the newest observation"),
+    "positions_w": Column((3,), "float", "position in the submap's frame"),
+    "covariances_w": Column((3, 3), "float", "covariance of the position; zero where unknown"),
+    "descriptors": Column(("D",), "descriptor", "descriptor of the newest observation"),
     "colors": Column((3,), "byte", "red, green, blue in the images; black where unknown"),
-    "normals_w": Column((3,), "float", "unit direction from the newest observer to the point"),
-    "reach": Column(
-        (), "float", "distance times keypoint scale of the newest observation: px times map units"
+    "view_directions_w": Column(
+        (3,), "float", "unit direction from the newest observing keyframe to the point"
     ),
-    "angles": Column((), "float", "radians, of the newest observation"),
-    "last_seen": Column((), "int", "frame that tracked it last"),
-    "born": Column((), "int", "row of the keyframe that made it"),
-    "from_start": Column((), "bool", "made by the two views that started the map"),
-    "times_observed": Column((), "int", "by keyframes"),
-    "times_visible": Column((), "int", "frames that should have seen it"),
-    "times_found": Column((), "int", "frames that did"),
-    "alive": Column((), "bool", "dead rows keep their number until the map is compacted"),
-    "replaced_by": Column((), "int", "row of the point it was merged into, or -1"),
+    "scale_distance": Column(
+        (), "float", "keypoint scale times distance in the newest observation: px times map units"
+    ),
+    "angles": Column((), "float", "keypoint orientation of the newest observation, radians"),
+    "last_seen_frame": Column((), "int", "index of the last frame that tracked the point"),
+    "first_keyframe": Column((), "int", "row of the keyframe that created the point"),
+    "from_initialization": Column((), "bool", "created by the two-view initialization"),
+    "times_observed": Column((), "int", "number of keyframes that observe the point"),
+    "times_visible": Column((), "int", "number of frames in which the point should have been visible"),
+    "times_found": Column((), "int", "number of frames in which the point was matched"),
+    "is_valid": Column((), "bool", "false for removed points, whose rows stay until the submap is compacted"),
+    "replaced_by": Column((), "int", "row of the point that this one was merged into, or -1"),
 }
 
 KEYFRAMES: Schema = {
-    "T_cw": Column((4, 4), "float", "world to camera"),
-    "covariances": Column((6, 6), "float", "of the pose's left perturbation; zero where unknown"),
-    "session": Column((), "int", "which run over this map saw it, from 0"),
-    "frame_index": Column((), "int", "in the sequence of its session"),
+    "T_cw": Column((4, 4), "float", "pose, world to camera"),
+    "covariances": Column((6, 6), "float", "covariance of the pose's left perturbation; zero where unknown"),
+    "session": Column((), "int", "session that observed the keyframe, from 0"),
+    "frame_index": Column((), "int", "index in the sequence of its session"),
     "timestamp": Column((), "float", "seconds"),
     "keypoints": Column(("N", 2), "float", "pixels"),
     "scales": Column(("N",), "float", "pixels"),
     "angles": Column(("N",), "float", "radians"),
-    "descriptors": Column(("N", "D"), "descriptor", "of the keypoints"),
-    "mask": Column(("N",), "bool", "which rows are keypoints"),
+    "descriptors": Column(("N", "D"), "descriptor", "descriptors of the keypoints"),
+    "mask": Column(("N",), "bool", "true for valid keypoints"),
     "information": Column(
-        ("N", "I"), "float", "px^-2, of their errors: I = 0: by scale, 1, or 3: xx, xy, yy"
+        ("N", "I"),
+        "float",
+        "information of the keypoints, px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy",
     ),
-    "point_ids": Column(("N",), "int", "rows of the points that the keypoints observe, or -1"),
+    "point_ids": Column(("N",), "int", "row of the point that each keypoint observes, or -1"),
 }
 
 FRAMES: Schema = {
-    "frame_index": Column((), "int", "in the sequence of its session"),
-    "session": Column((), "int", "which run over this map saw it, from 0"),
+    "frame_index": Column((), "int", "index in the sequence of its session"),
+    "session": Column((), "int", "session that observed the frame, from 0"),
     "timestamp": Column((), "float", "seconds"),
-    "T_cr": Column((4, 4), "float", "from the camera of its reference keyframe, in the units of the world"),
-    "reference": Column((), "int", "row of that keyframe"),
+    "T_cr": Column((4, 4), "float", "pose relative to the reference keyframe, in map units"),
+    "reference_keyframe": Column((), "int", "row of the reference keyframe"),
 }
 
 OBSERVATIONS: Schema = {
-    "row": Column((), "int", "row of the frame"),
+    "frame_row": Column((), "int", "row of the frame"),
     "point_ids": Column((), "int", "row of the point"),
-    "keypoints": Column((), "int", "row of the frame's features"),
+    "keypoint_index": Column((), "int", "row among the frame's keypoints, or -1 for a tracked patch"),
     "pixels": Column((2,), "float", "pixels"),
     "scales": Column((), "float", "pixels"),
-    "information": Column(("I",), "float", "px^-2, as of the keypoints"),
+    "information": Column(("I",), "float", "px^-2, as for the keypoints"),
 }

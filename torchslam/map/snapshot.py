@@ -14,7 +14,7 @@ CHANGES = ("T_cw", "covariances", "information", "point_ids")
 
 
 @dataclass(frozen=True)
-class Bookmark:
+class MapSnapshot:
     """What of a map later keyframes may change: columns of its points and keyframes, copied. It knows its map's rows,
     so that these must not be renumbered until it is returned to."""
 
@@ -23,7 +23,7 @@ class Bookmark:
 
     @classmethod
     @torch.inference_mode(False)
-    def of(cls, slam_map: Map) -> Bookmark:
+    def of(cls, slam_map: Map) -> MapSnapshot:
         """A map with at least one keyframe, as it is now."""
         points, keyframes = slam_map.points, slam_map.keyframes
         return cls(
@@ -40,7 +40,7 @@ class Bookmark:
         """Put the map to where it was."""
         for key in slam_map.keys[self.num_keyframes :].tolist():
             slam_map.images.pop(key, None)
-        slam_map.points.cut(len(self.points["alive"]))
+        slam_map.points.cut(len(self.points["is_valid"]))
         slam_map.keyframes.cut(self.num_keyframes)
         for table, columns in ((slam_map.points, self.points), (slam_map.keyframes, self.keyframes)):
             for name, column in columns.items():

@@ -14,13 +14,13 @@ from torchslam.geometry.correction import (
     without_scale,
 )
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import History
-from torchslam.map.tracking_state import Track
+from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.tracking_state import TrackingState
 from torchslam.types import Trajectory
 
 
 @dataclass
-class World:
+class Submap:
     """A map, the frames that were posed in it, and where the camera was last.
 
     number: what it is called, from 0 in the order in which the worlds of a run began
@@ -28,15 +28,15 @@ class World:
     """
 
     number: int
-    track: Track
+    track: TrackingState
     map: Map = field(default_factory=Map)
-    history: History = field(default_factory=History)
+    history: PosedFrames = field(default_factory=PosedFrames)
     asked: int = 0
 
     @classmethod
-    def empty(cls, number: int, like: Tensor) -> World:
+    def empty(cls, number: int, like: Tensor) -> Submap:
         """A world without anything in it; device and floating-point type of `like`."""
-        return cls(number, Track.nowhere(like))
+        return cls(number, TrackingState.nowhere(like))
 
     @property
     def T_cw(self) -> Tensor:
@@ -47,7 +47,7 @@ class World:
         """Every posed frame, of one session or of all, by the map as it is now."""
         return self.history.trajectory(self.map, session)
 
-    def aside(self) -> World:
+    def aside(self) -> Submap:
         """The same map and history with a track of its own: to follow another camera, or the same one backwards."""
         return replace(self, track=replace(self.track))
 
@@ -57,15 +57,15 @@ class World:
         Its scale says how large a map unit is around the keyframe. Points follow the keyframe that made them, frames
         the one they refer to, and so does the track.
         """
-        points, born, scale = self.map.points, self.map.points["born"], sim3_scale(S_cw)
-        points["positions_w"][:], points["covariances_w"][:], points["normals_w"][:] = carry_points(
+        points, first_keyframe, scale = self.map.points, self.map.points["first_keyframe"], sim3_scale(S_cw)
+        points["positions_w"][:], points["covariances_w"][:], points["view_directions_w"][:] = carry_points(
             points["positions_w"],
             points["covariances_w"],
-            points["normals_w"],
-            self.map.T_cw[born],
-            S_cw[born],
+            points["view_directions_w"],
+            self.map.T_cw[first_keyframe],
+            S_cw[first_keyframe],
         )
-        points["reach"][:] /= scale[born]
+        points["scale_distance"][:] /= scale[first_keyframe]
         covariances = self.map.keyframes["covariances"]
         covariances[:] = covariances_with_unit(covariances, scale)
         self.map.keyframes["T_cw"][:] = without_scale(S_cw)
@@ -80,7 +80,7 @@ class World:
         """Give the world another frame and unit: points p become S_ba p, S_ba (4, 4) a similarity."""
         self.correct(self.map.T_cw @ sim3_inverse(S_ba))
 
-    def absorb(self, other: World, S_ab: Tensor) -> None:
+    def absorb(self, other: Submap, S_ab: Tensor) -> None:
         """Take over everything of another world, moved by S_ab (4, 4) into this one; the other is empty afterwards.
 
         Rows of the other's keyframes, points and frames are appended to this one's. The camera stays where it was
@@ -97,4 +97,4 @@ class World:
             local_keyframes=track.local_keyframes + keyframes,
             local_points=track.local_points + points,
         )
-        other.map, other.history = Map(), History()
+        other.map, other.history = Map(), PosedFrames()

@@ -74,7 +74,7 @@ class Table:
         if len(set(counts.values())) != 1:
             raise ValueError(f"the columns of one append differ in length: {counts}")
         for name, values in rows.items():
-            wrong = self.schema[name].why_not(values)
+            wrong = self.schema[name].mismatch(values)
             if wrong:
                 raise ValueError(f"column {name}: {wrong}")
 

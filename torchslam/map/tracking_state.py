@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass
-class Track:
+class TrackingState:
     """The camera's way through a map, up to the last frame.
 
     T_cr:            (4, 4) the last frame from its reference keyframe, so that it moves with the map
@@ -34,7 +34,7 @@ class Track:
     explained: float = 1.0
 
     @classmethod
-    def nowhere(cls, like: Tensor) -> Track:
+    def nowhere(cls, like: Tensor) -> TrackingState:
         """Before there is a keyframe to follow; device and floating-point type of `like`."""
         nobody = torch.empty(0, dtype=torch.int64, device=like.device)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)

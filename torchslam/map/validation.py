@@ -8,15 +8,25 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera
-from torchslam.map.map import NO_KEYPOINT, Map
+from torchslam.map.map import Map
 from torchslam.map.schema import Schema
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; no columns at all where a table is empty."""
 
 # What everything else is computed from.
-FINITE = ("T_cw", "T_cr", "positions_w", "timestamp", "keypoints", "scales", "pixels", "reach", "information")
+FINITE = (
+    "T_cw",
+    "T_cr",
+    "positions_w",
+    "timestamp",
+    "keypoints",
+    "scales",
+    "pixels",
+    "scale_distance",
+    "information",
+)
 
 
 def check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
@@ -55,7 +65,7 @@ def check_keys(maps: list[Map]) -> None:
         raise ValueError("two keyframes are of the same frame")
 
 
-def why_not_alike(slam_map: Map, view: View, to_map: bool) -> str:
+def why_not_alike(slam_map: Map, view: FrameFeatures, to_map: bool) -> str:
     """Why a frame's features cannot be compared with the map's, in words; empty where they can.
 
     to_map: whether frames are to become keyframes, which all have room for the same number of keypoints
@@ -96,7 +106,7 @@ def _check_table(
     lengths = {len(rows) for rows in columns.values() if rows.ndim}
     for name, rows in columns.items():
         column = schema[name]
-        wrong = column.why_not(rows)
+        wrong = column.mismatch(rows)
         if wrong:
             raise ValueError(f"{name}: {wrong}")
         if len(lengths) > 1:
@@ -123,17 +133,17 @@ def _check_rows(columns: Columns, sessions: int) -> None:
         len(next(iter(table.values()), ())) for table in (points, keyframes, frames)
     )
     ranges = (
-        (points, "born", 0, num_keyframes),
+        (points, "first_keyframe", 0, num_keyframes),
         (points, "replaced_by", -1, num_points),
         (keyframes, "point_ids", -1, num_points),
         (keyframes, "session", 0, sessions),
         (keyframes, "frame_index", 0, None),
         (frames, "session", 0, sessions),
         (frames, "frame_index", 0, None),
-        (frames, "reference", 0, num_keyframes),
-        (seen, "row", 0, num_frames),
+        (frames, "reference_keyframe", 0, num_keyframes),
+        (seen, "frame_row", 0, num_frames),
         (seen, "point_ids", 0, num_points),
-        (seen, "keypoints", NO_KEYPOINT, None),
+        (seen, "keypoint_index", 0, None),
     )
     for table, name, low, end in ranges:
         rows = table.get(name)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from torchslam.config import BundleConfig
+from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import Camera
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import Adjusted, Part, around, solve_around, take
@@ -28,7 +28,7 @@ def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> An
 
 
 @dataclass(frozen=True)
-class Asked:
+class AdjustmentRequest:
     """An adjustment around a keyframe, to be taken over after frame `due`, or, without one, before the next frame."""
 
     due: int | None
@@ -37,14 +37,14 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Begun:
+class RunningAdjustment:
     """What is adjusted, and what waits for the outcome; neither where there is nothing to adjust."""
 
     part: Part | None
     answer: Answer | None
 
 
-class Adjusting:
+class AsyncBundleAdjustment:
     """One adjustment at a time; the map must stay as it is, but for what frames count in it, until it is taken over.
 
     solver: may find it elsewhere; the outcome is the same
@@ -52,17 +52,17 @@ class Adjusting:
 
     solver: Solver = staticmethod(solve_here)
 
-    def __init__(self, camera: Camera, settings: BundleConfig, covariances: bool) -> None:
+    def __init__(self, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool) -> None:
         self.camera, self.settings, self.covariances = camera, settings, covariances
-        self._asked: Asked | None = None
-        self._begun: Begun | None = None
+        self._asked: AdjustmentRequest | None = None
+        self._begun: RunningAdjustment | None = None
 
     def __bool__(self) -> bool:
         """Whether there is one to be taken over."""
         return self._asked is not None
 
     @property
-    def is_due_first(self) -> bool:
+    def due_before_next_frame(self) -> bool:
         """Whether the outcome is to be taken over before the next frame is tracked."""
         return self._asked is not None and self._asked.due is None
 
@@ -75,7 +75,7 @@ class Adjusting:
         """Whether the outcome is to be taken over after a frame."""
         return self._asked is not None and (self._asked.due is None or frame >= self._asked.due)
 
-    def hurry(self, frame: int) -> None:
+    def set_deadline(self, frame: int) -> None:
         """Take the outcome over after this frame already: the map is to change."""
         if self._asked is not None:
             self._asked = replace(self._asked, due=frame)
@@ -83,7 +83,7 @@ class Adjusting:
     def ask(self, slam_map: Map, keyframe: int, due: int | None) -> None:
         """Have what is around a keyframe adjusted, to be taken over after frame `due`; None: before the next one."""
         assert self._asked is None  # the map was to stay as it is
-        self._asked = Asked(due, slam_map, keyframe)
+        self._asked = AdjustmentRequest(due, slam_map, keyframe)
 
     def begin(self) -> None:
         """Have the solver begin with what was asked for, if it has not: it is all the same when, as the map stays."""
@@ -91,8 +91,10 @@ class Adjusting:
             return
         part = around(self._asked.slam_map, self._asked.keyframe, self.camera, self.settings)
         find = self.solver
-        answer = None if part is None else find(part.problem, self.settings.iterations, self.covariances)
-        self._begun = Begun(part, answer)
+        answer = (
+            None if part is None else find(part.problem, self.settings.local_iterations, self.covariances)
+        )
+        self._begun = RunningAdjustment(part, answer)
 
     def take_over(self, slam_map: Map) -> None:
         """Put the map to where it belongs, if that was asked for."""

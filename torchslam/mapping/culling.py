@@ -15,9 +15,9 @@ from torch import Tensor
 from torchslam.config import KeyframesConfig
 from torchslam.geometry import transform
 from torchslam.geometry.motion import apart
-from torchslam.map.compaction import Renumbering, remove_keyframes
+from torchslam.map.compaction import RowRemap, remove_keyframes
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 
 SHARE, OTHERS = 0.9, 3  # of a keyframe's points that so many others must see
 COARSER = 1.25  # seen one level of the pyramid (a factor of 1.2) coarser is seen as well
@@ -28,7 +28,7 @@ AROUND = 20  # keyframes that are asked around each new one
 _LEAST_BATCH, _BATCH_SHARE = 8, 16
 
 
-def cull_keyframes(world: World, settings: KeyframesConfig) -> Renumbering | None:
+def cull_keyframes(world: Submap, settings: KeyframesConfig) -> RowRemap | None:
     """Take redundant keyframes out of the world, a batch at a time; returns where rows went, None if they stay.
 
     The first keyframe, the newest ones and the track's reference always stay.
@@ -42,7 +42,7 @@ def cull_keyframes(world: World, settings: KeyframesConfig) -> Renumbering | Non
     return renumbering
 
 
-def around_new_ones(world: World) -> Tensor:
+def around_new_ones(world: Submap) -> Tensor:
     """(k,) keyframes that share points with those that were not there at the last culling, the newest first."""
     slam_map = world.map
     candidates = slam_map.around(slam_map.ids(*range(world.asked, slam_map.num_keyframes)), AROUND)
@@ -50,7 +50,7 @@ def around_new_ones(world: World) -> Tensor:
     return candidates[may_go & (candidates != world.track.reference)].flip(0)
 
 
-def redundant(world: World, candidates: Tensor, settings: KeyframesConfig) -> Tensor:
+def redundant(world: Submap, candidates: Tensor, settings: KeyframesConfig) -> Tensor:
     """(K,) bool, which of the candidates (k,) the map can do without, one after the other."""
     goes = torch.zeros(world.map.num_keyframes, dtype=torch.bool, device=candidates.device)
     for keyframe in candidates.tolist():
@@ -84,7 +84,7 @@ def has_near(slam_map: Map, keyframe: int, goes: Tensor, settings: KeyframesConf
     return bool(((translation <= settings.max_translation) & (rotation <= settings.max_rotation_deg)).any())
 
 
-def drop_covered(world: World, covers: Callable[[Tensor], Tensor]) -> None:
+def drop_covered(world: Submap, covers: Callable[[Tensor], Tensor]) -> None:
     """Forget what the keyframes around the camera saw at pixels that do not belong to the scene.
 
     covers: (n, 2) pixels -> (n,) bool

@@ -56,7 +56,7 @@ def find_in(
     errors = slam_map.noise(keyframe, keypoint).squared(
         pixels[which, row] - table["keypoints"][keyframe, keypoint]
     )
-    agrees = fits(errors, config.measurement.chi_square)
+    agrees = fits(errors, config.measurement.max_chi_square)
     ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
     taken = table["point_ids"][keyframe, keypoint]
     is_free = taken < 0

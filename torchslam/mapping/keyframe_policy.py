@@ -6,15 +6,15 @@ import torch
 
 from torchslam.config import KeyframesConfig
 from torchslam.geometry.motion import apart
-from torchslam.map.submap import World
-from torchslam.types import Tracked, View
+from torchslam.map.submap import Submap
+from torchslam.types import FrameFeatures, PoseEstimate
 
 ENOUGH_OVERLAP = 0.4
 """Above it a keyframe is put off for as many frames as a live camera is ahead, since what waits too long is dropped;
 half of the default `min_overlap`, so that tracking stays safe."""
 
 
-def why_keyframe(view: View, tracked: Tracked, world: World, settings: KeyframesConfig) -> str:
+def why_keyframe(view: FrameFeatures, tracked: PoseEstimate, world: Submap, settings: KeyframesConfig) -> str:
     """Why a tracked frame should become a keyframe, in words; empty when it should not.
 
     Because no keyframe around is near it, in translation (as a share of the depth of the scene) and in rotation; or

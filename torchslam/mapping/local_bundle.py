@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchslam.config import BundleConfig
+from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
 from torchslam.map.map import Map
 from torchslam.map.observation_index import most
 from torchslam.optim import BundleProblem, bundle_adjust
-from torchslam.optim.bundle.local_numpy import adjust_window
+from torchslam.optim.bundle.local_numpy import adjust_local_bundle
 from torchslam.optim.bundle.schur import Marginals
 from torchslam.optim.core.levenberg_marquardt import Progress
 from torchslam.types import Observations
@@ -46,36 +46,36 @@ class Adjusted:
 
 
 def adjust(
-    slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig, covariances: bool = False
+    slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool = False
 ) -> None:
     """Adjust what is around a keyframe; if `covariances`, the map learns how certain all this is."""
     part = around(slam_map, keyframe, camera, settings)
     if part is not None:
-        take(slam_map, part, solve_around(part.problem, settings.iterations, covariances), camera)
+        take(slam_map, part, solve_around(part.problem, settings.local_iterations, covariances), camera)
 
 
-def around(slam_map: Map, keyframe: int, camera: Camera, settings: BundleConfig) -> Part | None:
+def around(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> Part | None:
     """A keyframe, the ones that see most of its points, and all points that these see; None where that is nothing.
 
     Other keyframes that see these points take part with fixed poses, and so does the first keyframe of the map.
     """
-    near = slam_map.covisible(keyframe, settings.window - 1)
+    near = slam_map.covisible(keyframe, settings.local_window - 1)
     free = torch.cat([near.new_tensor([keyframe]), near])
     free = free[free != 0]
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
-    return part_of(slam_map, free, most(shared, settings.max_fixed, least=1), camera)
+    return part_of(slam_map, free, most(shared, settings.max_fixed_keyframes, least=1), camera)
 
 
 def solve_around(problem: BundleProblem, iterations: int, covariances: bool) -> Adjusted:
     """Adjust what is around a keyframe, as exactly as the next one leaves it; what is fixed is taken as exact."""
     if covariances:
         return solve(problem, iterations, covariances, tolerance=NEGLIGIBLE)
-    return Adjusted(*adjust_window(problem, HUBER, iterations, NEGLIGIBLE)[:2], None)
+    return Adjusted(*adjust_local_bundle(problem, HUBER, iterations, NEGLIGIBLE)[:2], None)
 
 
 def adjust_all(
-    slam_map: Map, camera: Camera, settings: BundleConfig, progress: Progress | None = None
+    slam_map: Map, camera: Camera, settings: BundleAdjustmentConfig, progress: Progress | None = None
 ) -> None:
     """Adjust the whole map, the first keyframe fixed.
 
@@ -83,7 +83,7 @@ def adjust_all(
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
-        slam_map, everyone[1:], everyone[:1], camera, settings.final_iterations, progress=progress
+        slam_map, everyone[1:], everyone[:1], camera, settings.global_iterations, progress=progress
     )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.mapping.mapper import Mapper
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Start, View
+from torchslam.types import FrameFeatures, TwoViewMap
 
 
-class Founder:
+class MapInitializer:
     """Fills empty worlds."""
 
     def __init__(self, tracker: Tracker, mapper: Mapper, min_explained: float) -> None:
@@ -16,7 +16,7 @@ class Founder:
         self.mapper = mapper
         self.min_explained = min_explained  # share of the frames that a new map must explain
 
-    def found(self, world: World, start: Start, views: list[View]) -> str:
+    def found(self, world: Submap, start: TwoViewMap, views: list[FrameFeatures]) -> str:
         """Make the first map of two views, pose the frames from one to the other, and go on from the second.
 
         Returns why the map is not to be believed, in words; empty when it is.
@@ -29,7 +29,7 @@ class Founder:
             return f"bad start: it explains {sum(explained)} of {len(explained)} frames"
         return ""
 
-    def _explains(self, world: World, view: View) -> bool:
+    def _explains(self, world: Submap, view: FrameFeatures) -> bool:
         """Pose a frame that was seen before there was a map; whether most of its matches agree with the map."""
         tracked = self.tracker.track(world, view)
         if tracked is None:

@@ -7,15 +7,15 @@ import torch
 from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_covariance
-from torchslam.map.compaction import Renumbering, compact
+from torchslam.map.compaction import RowRemap, compact
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.mapping.async_bundle import Adjusting
+from torchslam.map.submap import Submap
+from torchslam.mapping.async_bundle import AsyncBundleAdjustment
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.tracking.matcher import Matcher
-from torchslam.types import Start, Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
 YOUNG = 3  # keyframes after its own for which a point is on trial
@@ -36,11 +36,13 @@ class Mapper:
         self.camera = camera
         self.config = config
         self.clock = clock
-        self.adjusting = Adjusting(camera, config.bundle, config.measurement.gate == "mahalanobis")
+        self.adjusting = AsyncBundleAdjustment(
+            camera, config.bundle_adjustment, config.measurement.gate == "mahalanobis"
+        )
         self.matcher = matcher
         self.undistortion = undistortion or Undistortion(camera)
 
-    def start(self, slam_map: Map, start: Start) -> tuple[int, int]:
+    def start(self, slam_map: Map, start: TwoViewMap) -> tuple[int, int]:
         """Make the first map of two views, at the configured scale; returns the two keyframes."""
         factor = world_scale(start, self.config.scale)
         T_cw = start.T_cw.clone()
@@ -53,13 +55,15 @@ class Mapper:
         first = slam_map.add_keyframe(start.reference, T_1w)
         second = slam_map.add_keyframe(start.view, T_cw)
         descriptors = start.view.descriptors[start.keypoints_2]
-        ids = slam_map.add_points(points_w, descriptors, second, covariances_w, from_start=True)
+        ids = slam_map.add_points(points_w, descriptors, second, covariances_w, from_initialization=True)
         slam_map.observe(first, start.keypoints_1, ids)
         slam_map.observe(second, start.keypoints_2, ids)
         slam_map.refresh(slam_map.ids(first, second))
         return first, second
 
-    def insert(self, slam_map: Map, view: View, tracked: Tracked, delay: int | None = None) -> int:
+    def insert(
+        self, slam_map: Map, view: FrameFeatures, tracked: PoseEstimate, delay: int | None = None
+    ) -> int:
         """Make a tracked frame a keyframe; returns its index.
 
         delay: frames that are tracked before the adjustment around it is taken over, which has to be before the map
@@ -71,10 +75,10 @@ class Mapper:
             slam_map.observe(keyframe, tracked.keypoints, tracked.point_ids)
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
-            neighbours = slam_map.covisible(keyframe, 2 * settings.neighbours)
-            last = range(keyframe - 1, max(keyframe - 1 - settings.neighbours, -1), -1)
-            partners = neighbours if settings.partners == "covisible" else slam_map.ids(*last)
-            partners = partners[: settings.neighbours]
+            neighbours = slam_map.covisible(keyframe, 2 * settings.num_partners)
+            last = range(keyframe - 1, max(keyframe - 1 - settings.num_partners, -1), -1)
+            partners = neighbours if settings.triangulation_partners == "covisible" else slam_map.ids(*last)
+            partners = partners[: settings.num_partners]
             normalize = self.undistortion.normalize
             triangulate_against(
                 slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
@@ -82,7 +86,7 @@ class Mapper:
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbours, self.camera, self.config)
-        if self.config.bundle.enabled:
+        if self.config.bundle_adjustment.local:
             with self.clock("bundle"):
                 self.adjusting.ask(slam_map, keyframe, view.index + delay if delay else None)
                 if not delay:
@@ -96,7 +100,7 @@ class Mapper:
         with self.clock("bundle"):
             self.adjusting.take_over(slam_map)
 
-    def tidy(self, world: World) -> Renumbering | None:
+    def tidy(self, world: Submap) -> RowRemap | None:
         """Take out what the world can do without: redundant keyframes, rows of dead points; returns where rows went.
 
         To be called when a keyframe was inserted and nobody holds rows of the map: after the frame went into the
@@ -112,16 +116,16 @@ class Mapper:
     def cull_recent_points(self, slam_map: Map, keyframe: int) -> None:
         """Kill young points that are rarely found where they should be visible, or that nobody else has seen."""
         points = slam_map.points
-        young = torch.nonzero(points["born"] >= keyframe - YOUNG)[:, 0]
-        young = young[points["alive"][young]]
-        age = keyframe - points["born"][young]
-        least = self.config.mapping.min_found_share
+        young = torch.nonzero(points["first_keyframe"] >= keyframe - YOUNG)[:, 0]
+        young = young[points["is_valid"][young]]
+        age = keyframe - points["first_keyframe"][young]
+        least = self.config.mapping.min_found_ratio
         is_rarely_found = points["times_found"][young] < least * points["times_visible"][young]
-        is_lonely = (age >= 2) & (points["times_observed"][young] < 3) & ~points["from_start"][young]
-        slam_map.kill(young[is_rarely_found | is_lonely])
+        is_lonely = (age >= 2) & (points["times_observed"][young] < 3) & ~points["from_initialization"][young]
+        slam_map.invalidate(young[is_rarely_found | is_lonely])
 
 
-def world_scale(start: Start, kind: str) -> float:
+def world_scale(start: TwoViewMap, kind: str) -> float:
     """The factor from the unit baseline of a start to the lengths of the world.
 
     unit: the median depth in the first camera is one. groundtruth: the baseline has its true length.

@@ -22,8 +22,8 @@ from torchslam.geometry import (
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
-from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Prior, matched, max_distance
-from torchslam.types import View
+from torchslam.tracking.matcher import DescriptorMatcher, Matcher, MatchPrior, max_distance, run_matcher
+from torchslam.types import FrameFeatures
 
 
 def triangulate_against(
@@ -78,12 +78,12 @@ def _match(
 ) -> Matches:
     """Along epipolar lines, by descriptors or by a matcher of one's own."""
     T_21 = slam_map.T_cw[neighbours] @ se3_inverse(slam_map.T_cw[keyframe])
-    epipolar_px = config.mapping.epipolar_px
+    epipolar_px = config.mapping.max_epipolar_px
     if matcher is None or isinstance(matcher, DescriptorMatcher):
         limit = max_distance(here.features.descriptors, config.matching)
         return Matches(*match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None)
     views = [free_view(slam_map, row) for row in (keyframe, *neighbours.tolist())]
-    prior = Prior(T_21=T_21, camera=camera, epipolar_px=epipolar_px)
+    prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=epipolar_px)
     return Matches(*match_each(matcher, views, here, there, prior))
 
 
@@ -98,7 +98,7 @@ def _triangulate(
     config: Config,
 ) -> None:
     """Add the points of those matches that show one. Every match is a pair of views of its own, with one point."""
-    settings, limit = config.mapping, config.measurement.chi_square
+    settings, limit = config.mapping, config.measurement.max_chi_square
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours][found.which]
     seen_1, seen_2 = (0, found.at_1, None), (found.which, found.at_2, None)
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
@@ -135,14 +135,14 @@ def _observe(
         slam_map.weigh(keyframes, rows, weights)
 
 
-def free_view(slam_map: Map, keyframe: int) -> View:
+def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
     """What a keyframe saw, of which keypoints that see no point yet may match."""
     view = slam_map.view(keyframe)
     return replace(view, mask=view.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))
 
 
 def match_each(
-    matcher: Matcher, views: list[View], here: FreeKeypoints, there: FreeKeypoints, prior: Prior
+    matcher: Matcher, views: list[FrameFeatures], here: FreeKeypoints, there: FreeKeypoints, prior: MatchPrior
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """As `match_along_epipolar_lines` of the first view with each of the others, by a matcher; and the weights (m,).
 
@@ -151,7 +151,7 @@ def match_each(
     assert prior.T_21 is not None
     parts, weights = [], []
     for row, (view, T_21) in enumerate(zip(views[1:], prior.T_21, strict=True)):
-        pairs = matched(matcher, views[0], view, replace(prior, T_21=T_21))
+        pairs = run_matcher(matcher, views[0], view, replace(prior, T_21=T_21))
         at_1, at_2 = places(here.rows[0])[pairs.first], places(there.rows[row])[pairs.second]
         order = torch.argsort(at_1 * len(view.mask) + at_2)
         parts.append(torch.stack([torch.full_like(at_1, row), at_1, at_2])[:, order])

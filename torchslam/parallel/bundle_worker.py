@@ -17,13 +17,13 @@ from torchslam.mapping.async_bundle import Answer
 from torchslam.mapping.local_bundle import Adjusted, solve_around
 from torchslam.optim import BundleProblem
 from torchslam.optim.bundle.schur import Marginals
-from torchslam.parallel.worker import WithWorker, attempt, outcome, questions, reply, task
+from torchslam.parallel.worker import WithWorker, pack_task, requests, send_result, try_call, unwrap
 
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
 """What tells one problem around a keyframe from another of the same run."""
 
 
-class Beside(WithWorker):
+class BundleWorker(WithWorker):
     """Solves with another process, see `mapping.adjusting.Solver`; here until it has started, or where it was ended.
 
     There is a process while this is entered.
@@ -49,7 +49,7 @@ class Beside(WithWorker):
         if not self._worker.is_there():
             return None
         if not self._has_task:
-            self._has_task = self._worker.send(task(self._camera))
+            self._has_task = self._worker.send(pack_task(self._camera))
         self._number += 1
         arrays = {name: getattr(problem, name).numpy() for name in SENT}
         message = pickle.dumps((self._number, arrays, iterations, covariances))
@@ -60,7 +60,7 @@ class Beside(WithWorker):
         while (answer := self._worker.receive()) is not None:
             answered, found = answer
             if answered == number:
-                return _adjusted(outcome(found))
+                return _adjusted(unwrap(found))
         return None
 
 
@@ -82,5 +82,5 @@ def _work(connection: Connection, camera: Camera) -> None:
         columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
         return _arrays(solve_around(BundleProblem(camera=camera, **columns), iterations, covariances))
 
-    for number, *problem in questions(connection):
-        reply(connection, (number, attempt("adjusts", solve, *problem)))
+    for number, *problem in requests(connection):
+        send_result(connection, (number, try_call("adjusts", solve, *problem)))

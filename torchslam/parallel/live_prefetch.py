@@ -17,14 +17,14 @@ from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError
 from torchslam.geometry import Camera
-from torchslam.parallel.serialization import Arrays, packed, unpacked
-from torchslam.parallel.worker import WithWorker, attempt, outcome, questions, reply, task
+from torchslam.parallel.serialization import Arrays, pack_features, unpack_features
+from torchslam.parallel.worker import WithWorker, pack_task, requests, send_result, try_call, unwrap
 from torchslam.system.front_end import check_size, image_extractor
-from torchslam.types import Features, Frame
+from torchslam.types import Frame
 from torchslam.utils.timing import Stopwatch
 
 
-class LiveAhead(WithWorker):
+class LivePrefetcher(WithWorker):
     """The frames of a live source; each is to be asked for once, in order.
 
     There is a process while this is entered; what it has not done, or where it was ended, is done by who tracks.
@@ -35,7 +35,7 @@ class LiveAhead(WithWorker):
     def __init__(self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch) -> None:
         super().__init__(_work)
         self._sequence, self._camera, self._clock = sequence, camera, clock
-        self._task = task(config)
+        self._task = pack_task(config)
         self._has_task = False
         self._next: Frame | FrameError | None = None  # what was taken from the source before its turn
         self._is_sent = False  # whether that is being looked at
@@ -54,8 +54,8 @@ class LiveAhead(WithWorker):
     def _with_features(self, frame: Frame) -> Frame:
         self._is_sent = False
         with self._clock("features"):
-            answer = outcome(self._worker.receive())
-        return frame if answer is None else replace(frame, features=unpacked(Features, answer))
+            answer = unwrap(self._worker.receive())
+        return frame if answer is None else replace(frame, features=unpack_features(answer))
 
     def _look_ahead(self, index: int) -> None:
         """Have the next frame looked at, if it has come and there is somebody to do it."""
@@ -83,7 +83,7 @@ def _work(connection: Connection, config: Config) -> None:
         frame = Frame(0, 0.0, torch.from_numpy(image))
         if mask is not None:
             frame = replace(frame, mask=torch.from_numpy(mask))
-        return packed(extract(frame))
+        return pack_features(extract(frame))
 
-    for question in questions(connection):
-        reply(connection, attempt("reads ahead", look, *question))
+    for question in requests(connection):
+        send_result(connection, try_call("reads ahead", look, *question))

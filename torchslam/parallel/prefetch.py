@@ -14,8 +14,8 @@ from types import TracebackType
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
-from torchslam.parallel.serialization import Arrays, as_arrays, from_arrays
-from torchslam.parallel.worker import Worker, attempt, outcome, questions, reply, task
+from torchslam.parallel.serialization import Arrays, pack_frame, unpack_frame
+from torchslam.parallel.worker import Worker, pack_task, requests, send_result, try_call, unwrap
 from torchslam.system.front_end import check_size, image_extractor
 from torchslam.types import Frame
 from torchslam.utils.timing import Stopwatch
@@ -26,7 +26,7 @@ GIVES_WAY = 5
 """By how much nicer a process that reads ahead is than this one, and than the one whose adjustment is waited for."""
 
 
-class Ahead:
+class FeaturePrefetcher:
     """The frames of a sequence with their features; each is to be asked for once, in the order of its index.
 
     Until a process has started its frames are read here, and so they are where one is ended by somebody else. There are
@@ -41,13 +41,13 @@ class Ahead:
         self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch, processes: int = 1
     ) -> None:
         self._sequence, self._clock, self._count = sequence, clock, processes
-        self._task = task(sequence, camera, config)
+        self._task = pack_task(sequence, camera, config)
         self._workers: list[Worker] = []
         self._busy: set[Worker] = set()  # those that have the task
         self._asked: dict[int, Worker] = {}
         self._next: int | None = None  # first frame of which nobody was asked yet
 
-    def __enter__(self) -> Ahead:
+    def __enter__(self) -> FeaturePrefetcher:
         self._workers = [Worker(_work) for _ in range(self._count)]
         return self
 
@@ -68,9 +68,9 @@ class Ahead:
         worker = self._asked.pop(index, None)
         if worker is not None:
             with self._clock("features"):
-                answer = outcome(worker.receive())
+                answer = unwrap(worker.receive())
             if answer is not None:
-                return from_arrays(answer)
+                return unpack_frame(answer)
         return self._sequence[index]
 
     def _ask(self, index: int) -> None:
@@ -94,7 +94,7 @@ def _work(connection: Connection, sequence: Sequence, camera: Camera, config: Co
     def read(index: int) -> Arrays:
         frame = sequence[index]
         check_size(frame, camera)
-        return as_arrays(frame, None, extract(frame))
+        return pack_frame(frame, extract(frame))
 
-    for index in questions(connection):
-        reply(connection, attempt("reads ahead", read, index))
+    for index in requests(connection):
+        send_result(connection, try_call("reads ahead", read, index))

@@ -1,42 +1,41 @@
-"""Frames and what is known of them as arrays, for the way between processes: tensors are slow to pickle."""
+"""Serialization of frames and features to dictionaries of NumPy arrays: tensors are slow to pickle."""
 
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.types import Anchor, Features, Followed, Frame
+from torchslam.types import Features, Frame
 
-Value = TypeVar("Value", Anchor, Followed, Features)
 Arrays = dict[str, Any]
 
 
-def packed(value: Value | None) -> Arrays | None:
-    """The fields of a value, as arrays: tensors are slow to pickle."""
-    if value is None:
+def pack_features(features: Features | None) -> Arrays | None:
+    """The fields of features as arrays."""
+    if features is None:
         return None
-    columns = {each.name: getattr(value, each.name) for each in fields(value)}
+    columns = {each.name: getattr(features, each.name) for each in fields(features)}
     return {
         name: column.numpy() if isinstance(column, Tensor) else column for name, column in columns.items()
     }
 
 
-def unpacked(kind: type[Value], arrays: Arrays | None) -> Value | None:
-    """What `packed` packed."""
+def unpack_features(arrays: Arrays | None) -> Features | None:
+    """The features that `pack_features` packed."""
     if arrays is None:
         return None
     columns: dict[str, Any] = {
         name: torch.from_numpy(each) if isinstance(each, np.ndarray) else each
         for name, each in arrays.items()
     }
-    return kind(**columns)
+    return Features(**columns)
 
 
-def as_arrays(frame: Frame, followed: Followed | None, features: Features | None) -> Arrays:
+def pack_frame(frame: Frame, features: Features | None) -> Arrays:
     """A frame without its image."""
     truth = None if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth.numpy()
     return {
@@ -44,13 +43,12 @@ def as_arrays(frame: Frame, followed: Followed | None, features: Features | None
         "timestamp": frame.timestamp,
         "name": frame.name,
         "truth": truth,
-        "followed": packed(followed),
-        "features": packed(features),
+        "features": pack_features(features),
     }
 
 
-def from_arrays(arrays: Arrays) -> Frame:
-    """What `as_arrays` packed."""
+def unpack_frame(arrays: Arrays) -> Frame:
+    """The frame that `pack_frame` packed, with an empty image."""
     truth = arrays["truth"]
     return Frame(
         arrays["index"],
@@ -58,6 +56,5 @@ def from_arrays(arrays: Arrays) -> Frame:
         torch.zeros(1, 1, 0, 0),
         arrays["name"],
         None if truth is None else torch.from_numpy(truth),
-        features=unpacked(Features, arrays["features"]),
-        followed=unpacked(Followed, arrays["followed"]),
+        features=unpack_features(arrays["features"]),
     )

@@ -132,7 +132,7 @@ class WithWorker:
 # --- the other end ---------------------------------------------------------------------------------------------
 
 
-def task(*parts: object) -> bytes:
+def pack_task(*parts: object) -> bytes:
     """What a process is to be sent first: `work` is called with the parts, and torch has as many threads as here.
 
     Not by multiprocessing's own pickling, which would move tensors to shared memory.
@@ -151,19 +151,19 @@ def serve(work: Callable[..., None], connection: Connection) -> None:
         return
 
 
-def questions(connection: Connection) -> Iterator[Any]:
+def requests(connection: Connection) -> Iterator[Any]:
     """What is asked, one after the other. Raises EOFError, or OSError, when nobody asks any more."""
     while True:
         yield pickle.loads(connection.recv_bytes())
 
 
-def reply(connection: Connection, answer: object) -> None:
+def send_result(connection: Connection, answer: object) -> None:
     """Send an answer; raises OSError where nobody waits for it."""
     connection.send_bytes(pickle.dumps(answer))
 
 
-def attempt(what: str, answer: Callable[..., object], *question: object) -> Any:
-    """The answer to a question, found in inference mode; an error is an answer too, for `outcome` to raise.
+def try_call(what: str, answer: Callable[..., object], *question: object) -> Any:
+    """The answer to a question, found in inference mode; an error is an answer too, for `unwrap` to raise.
 
     what: the process does, to be said of errors that are not torchslam's own, which say all by themselves
     """
@@ -176,7 +176,7 @@ def attempt(what: str, answer: Callable[..., object], *question: object) -> Any:
         return error
 
 
-def outcome(answer: Any) -> Any:
+def unwrap(answer: Any) -> Any:
     """An answer where it is wanted. Raises what was raised on the other side."""
     if isinstance(answer, BaseException):
         raise answer

@@ -1,7 +1,7 @@
 """What other processes see to while this one tracks and maps: the same bytes with any number of them.
 
-Frames are read, and followed or looked at, ahead of their turn (`ahead`, `scouting`); the adjustment around a keyframe
-is found beside the frames that come after it (`beside`).
+Frames are read and their features found ahead of their turn (`prefetch`, `live_prefetch`); the adjustment around a
+keyframe is computed while the next frames are tracked (`bundle_worker`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from torchslam.data.sequence import Sequence
 from torchslam.mapping.async_bundle import solve_here
-from torchslam.parallel.bundle_worker import Beside
-from torchslam.parallel.live_prefetch import LiveAhead
-from torchslam.parallel.patch_worker import Scouting
-from torchslam.parallel.prefetch import Ahead
+from torchslam.parallel.bundle_worker import BundleWorker
+from torchslam.parallel.live_prefetch import LivePrefetcher
+from torchslam.parallel.prefetch import FeaturePrefetcher
 from torchslam.parallel.worker import starts_at_once
 from torchslam.system.run import Frames
 
@@ -45,7 +44,7 @@ def best_number(sequence: Sequence, start: int) -> int:
 
 
 @contextmanager
-def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
+def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
     """The frames of a sequence from `start` on, for a run that other processes help while this is entered.
 
     processes: how many, this one included; None: what is best. With 2 one reads frames ahead, or adjusts where that
@@ -64,17 +63,17 @@ def helped(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0
             others.enter_context(ahead)
             frames = ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
-            slam.mapper.adjusting.solver = others.enter_context(Beside(slam.camera))
+            slam.mapper.adjusting.solver = others.enter_context(BundleWorker(slam.camera))
             others.callback(setattr, slam.mapper.adjusting, "solver", solve_here)
-        if isinstance(ahead, Ahead):
+        if isinstance(ahead, FeaturePrefetcher):
             ahead.begin(start)
-        slam.prepare()  # while others read
+        slam.precompute_undistortion()  # while the workers read
         yield frames
 
 
 def reader(
     sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
-) -> Ahead | Scouting | LiveAhead | None:
+) -> FeaturePrefetcher | LivePrefetcher | None:
     """What reads the frames of a sequence ahead; None where nothing can, or should."""
     alone = why_alone(sequence, slam)
     if processes == 1 or alone:
@@ -82,10 +81,8 @@ def reader(
             print(f"torchslam: frames are read here: {alone}", file=sys.stderr)
         return None
     if not len(sequence.timestamps):
-        return LiveAhead(sequence, slam.camera, slam.config, slam.clock)
-    if slam.config.patches.enabled:
-        return Scouting(sequence, slam)
-    return Ahead(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
+        return LivePrefetcher(sequence, slam.camera, slam.config, slam.clock)
+    return FeaturePrefetcher(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
 
 
 def why_alone(sequence: Sequence, slam: SLAM) -> str:
@@ -94,8 +91,6 @@ def why_alone(sequence: Sequence, slam: SLAM) -> str:
         return "simulated features need no images"
     if slam.has_own_parts:
         return "a front end or matcher of your own is here alone"
-    if not len(sequence.timestamps) and slam.config.patches.enabled:
-        return "the next frame of a live source is not there to be followed"
     if slam.config.matching.matcher != "descriptors":
         return "the matcher may want images"
     return ""

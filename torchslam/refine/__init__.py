@@ -1,5 +1,5 @@
 """Poses and a camera of another program, made better by the images: matched, triangulated, adjusted, calibrated."""
 
-from torchslam.refine.refine import CameraChoice, Refined, refine
+from torchslam.refine.refine import CameraChoice, Refined, refine_poses
 
-__all__ = ["CameraChoice", "Refined", "refine"]
+__all__ = ["CameraChoice", "Refined", "refine_poses"]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchslam.calibration.keyframes import FOCAL, directions
 from torchslam.config import Config
-from torchslam.geometry import Camera, Noise, fits, transform
+from torchslam.geometry import Camera, KeypointNoise, fits, transform
 from torchslam.map.map import Map
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all
@@ -16,16 +16,16 @@ from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.refine.pairs import Pair
 from torchslam.refine.rotations import average_rotations
 from torchslam.refine.tracks import Tracks, make_map, triangulate_tracks
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 # Where the kernel lets go of a residual, in pixels of its level: given poses are off by tens of them.
-WIDTHS = 20.0, 6.0, 2.45
+KERNEL_WIDTHS = 20.0, 6.0, 2.45
 GATE = 3.0  # of the last width: an observation further off does not go into the map
 ITERATIONS = 20
 TOLERANCE = 1e-4  # share of the cost; the last word has the adjustment of the map
 
 
-def turned(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
+def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
     """(K, 4, 4) the given poses with rotations that the matches agree with; centres stay where they are."""
     known = [pair for pair in pairs if pair.R_21 is not None]
     if not known:
@@ -35,13 +35,13 @@ def turned(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
     device = T_cw.device
     R_cw = average_rotations(T_cw[:, :3, :3], first.to(device), second.to(device), R_21)
     centres_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])
-    turned = T_cw.clone()
-    turned[:, :3, :3], turned[:, :3, 3:] = R_cw, -R_cw @ centres_w
-    return turned
+    align_rotations = T_cw.clone()
+    align_rotations[:, :3, :3], align_rotations[:, :3, 3:] = R_cw, -R_cw @ centres_w
+    return align_rotations
 
 
-def settle(
-    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool
+def adjust_coarse_to_fine(
+    views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool
 ) -> tuple[Tensor, Camera, Tracks, Tensor]:
     """Poses (K, 4, 4), the camera, the tracks that agree with them, and their points (T, 3), from poses far off.
 
@@ -52,9 +52,9 @@ def settle(
         torch.stack([getattr(view, name) for view in views])[tracks.keyframe, tracks.keypoint]
         for name in ("scales", "information")
     )
-    noise = Noise(scales, information)
+    noise = KeypointNoise(scales, information)
     parallax = config.mapping.min_parallax_deg
-    for width in WIDTHS:
+    for width in KERNEL_WIDTHS:
         points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
         rows = good[tracks.track]
         problem = BundleProblem(
@@ -66,33 +66,38 @@ def settle(
             camera,
             weights=noise[rows].weights,
         )
-        free = directions(camera, [FOCAL]) if free_focal and width < WIDTHS[0] else False
+        free = directions(camera, [FOCAL]) if free_focal and width < KERNEL_WIDTHS[0] else False
         solution = bundle_adjust(problem, "cauchy", width, free, "detached", ITERATIONS, TOLERANCE)
         T_cw, camera = solution.T_cw, solution.camera
     points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
     points_c = transform(T_cw[tracks.keyframe], points_w[tracks.track][:, None])[:, 0]
-    near = fits(noise.squared_reprojection(points_c, pixels, camera), (GATE * WIDTHS[-1]) ** 2)
+    near = fits(noise.squared_reprojection(points_c, pixels, camera), (GATE * KERNEL_WIDTHS[-1]) ** 2)
     kept = tracks.of(near & good[tracks.track])
     seen = torch.stack([view.keypoints for view in views])[kept.keyframe, kept.keypoint]
     return T_cw, camera, kept, triangulate_tracks(kept, seen, T_cw, camera, 0.0)[0]
 
 
-def grow(slam_map: Map, camera: Camera, config: Config) -> None:
+def densify(slam_map: Map, camera: Camera, config: Config) -> None:
     """What the first matches missed: new points along epipolar lines, and points found again by their projections."""
     for keyframe in range(slam_map.num_keyframes):
-        neighbours = slam_map.covisible(keyframe, 2 * config.mapping.neighbours)
-        triangulate_against(slam_map, keyframe, neighbours[: config.mapping.neighbours], camera, config)
+        neighbours = slam_map.covisible(keyframe, 2 * config.mapping.num_partners)
+        triangulate_against(slam_map, keyframe, neighbours[: config.mapping.num_partners], camera, config)
         slam_map.refresh(slam_map.ids(keyframe))
         fuse(slam_map, keyframe, neighbours, camera, config)
-    adjust_all(slam_map, camera, config.bundle)
+    adjust_all(slam_map, camera, config.bundle_adjustment)
 
 
-def map_of(
-    views: list[View], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool = False
+def build_map(
+    views: list[FrameFeatures],
+    T_cw: Tensor,
+    tracks: Tracks,
+    camera: Camera,
+    config: Config,
+    free_focal: bool = False,
 ) -> tuple[Map, Camera]:
     """The adjusted map of keyframes whose poses T_cw (K, 4, 4) are only near the truth, and its camera."""
-    T_cw, camera, kept, points_w = settle(views, T_cw, tracks, camera, config, free_focal)
+    T_cw, camera, kept, points_w = adjust_coarse_to_fine(views, T_cw, tracks, camera, config, free_focal)
     made = make_map(views, T_cw, kept, points_w)
-    adjust_all(made, camera, config.bundle)
-    grow(made, camera, config)
+    adjust_all(made, camera, config.bundle_adjustment)
+    densify(made, camera, config)
     return made, camera

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torchslam.geometry import se3_inverse
 
-FAR = 4.0  # times the median: a given position so far off does not count
+MAX_OUTLIER_RATIO = 4.0  # times the median: a given position so far off does not count
 
 
-def back_to_given(T_cw: Tensor, given_cw: Tensor) -> Tensor:
+def align_to_input(T_cw: Tensor, given_cw: Tensor) -> Tensor:
     """S (4, 4) that leads from the world of poses T_cw (N, 4, 4) to that of the given ones (N, 4, 4).
 
     Centres and orientations count alike: centres on a line say nothing of the turn about it, and orientations nothing
@@ -22,7 +22,7 @@ def back_to_given(T_cw: Tensor, given_cw: Tensor) -> Tensor:
         S = _similarity(T_wc[counts], given[counts])
         moved = T_wc[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
         off = torch.linalg.vector_norm(moved - given[:, :3, 3], dim=-1)
-        counts = off <= FAR * off.median().clamp(min=1e-12)
+        counts = off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
     return S
 
 

@@ -48,7 +48,7 @@ def write_refined(folder: Path, refined: Refined) -> Path:
     Poses that were not refined are left out. Returns the file, of COLMAP the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    frames, T_cw = posed_frames(refined)
+    frames, T_cw = refined_poses(refined)
     given = refined.given
     _write_covariances(folder / COVARIANCES, refined)
     if given.kind == COLMAP:
@@ -65,7 +65,7 @@ def write_refined(folder: Path, refined: Refined) -> Path:
     return path
 
 
-def posed_frames(refined: Refined) -> tuple[Tensor, Tensor]:
+def refined_poses(refined: Refined) -> tuple[Tensor, Tensor]:
     """(n,) the frames of the sequence that have a refined pose, ascending, and (n, 4, 4) T_cw."""
     history, slam_map = refined.run.history, refined.run.map
     frames = history.frames["frame_index"].cpu()

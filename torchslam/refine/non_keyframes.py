@@ -11,19 +11,19 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import History, RunGraph
-from torchslam.map.submap import World
+from torchslam.map.posed_frames import PosedFrames, RunGraph
+from torchslam.map.submap import Submap
 from torchslam.tracking.correspondences import match_keyframe
-from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import why_doubt
 from torchslam.tracking.relocalization import alone
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import State, StepResult, Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult
 
-NEAREST = 3  # keyframes in time that a frame is compared with that was lost
+NUM_NEAREST = 3  # keyframes in time that a frame is compared with that was lost
 
 
-class Poser:
+class FramePoser:
     """Poses the views of a sequence in a map that has some of them as keyframes."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
@@ -31,7 +31,7 @@ class Poser:
         self.config = config
 
     @torch.no_grad()
-    def pose(self, world: World, views: list[View], given_cw: Tensor) -> list[StepResult]:
+    def pose(self, world: Submap, views: list[FrameFeatures], given_cw: Tensor) -> list[StepResult]:
         """Fill the history of the world with the views, in their order; a result for each.
 
         given_cw: (N, 4, 4), what the results say as the pose that was there before
@@ -48,12 +48,12 @@ class Poser:
             results.append(replace(result, T_cw=T_cw, world=world.number))
         return results
 
-    def _pass(self, world: World, view: View, keyframe: int) -> StepResult:
+    def _pass(self, world: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
         """A keyframe: it is where the map has it."""
         slam_map = world.map
         self.tracker.follow(world, keyframe)
         world.track.velocity = None
-        own = as_tracked(slam_map, keyframe)
+        own = keyframe_estimate(slam_map, keyframe)
         world.history.add(view, own, world.track.T_cr, keyframe)
         return StepResult(
             view.index,
@@ -65,14 +65,14 @@ class Poser:
             inliers=own.inliers,
         )
 
-    def _track(self, world: World, view: View) -> StepResult:
+    def _track(self, world: Submap, view: FrameFeatures) -> StepResult:
         """A frame between keyframes: from the last one, or else by what the keyframes nearest in time saw."""
         tracked = self.tracker.track(world, view)
         if tracked is None:
             tracked = self._find(world, view)
         if tracked is None:
             return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
-        doubt = why_doubt(tracked, None, alone(world.track, tracked), self.config.judge)
+        doubt = why_doubt(tracked, None, alone(world.track, tracked), self.config.pose_validation)
         world.history.add(view, tracked, world.track.T_cr, world.track.reference)
         return StepResult(
             view.index,
@@ -85,10 +85,10 @@ class Poser:
             reason=doubt,
         )
 
-    def _find(self, world: World, view: View) -> Tracked | None:
+    def _find(self, world: Submap, view: FrameFeatures) -> PoseEstimate | None:
         slam_map = world.map
         away = (slam_map.keyframes["frame_index"] - view.index).abs()
-        nearest = torch.argsort(away, stable=True)[:NEAREST]
+        nearest = torch.argsort(away, stable=True)[:NUM_NEAREST]
         tracked = self.tracker.localizer.locate(
             slam_map, view, self._candidates(slam_map, view, nearest), slam_map.points_seen_by(nearest)
         )
@@ -96,24 +96,24 @@ class Poser:
             self.tracker.start_at(world, view, tracked)
         return tracked
 
-    def _candidates(self, slam_map: Map, view: View, nearest: Tensor) -> Iterator[Pairs]:
+    def _candidates(self, slam_map: Map, view: FrameFeatures, nearest: Tensor) -> Iterator[MatchIndices]:
         for keyframe in nearest.tolist():
             yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
 
 
-def as_tracked(slam_map: Map, keyframe: int) -> Tracked:
+def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
     """A keyframe as a frame that sees what it sees."""
     table = slam_map.keyframes["point_ids"][keyframe]
     keypoints = torch.nonzero(table >= 0)[:, 0]
     seen, T_cw = table[keypoints], slam_map.T_cw[keyframe]
     depth = float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()) if len(seen) else 0.0
-    return Tracked(T_cw, seen, keypoints, len(seen), slam_map.keyframes["covariances"][keyframe], depth)
+    return PoseEstimate(T_cw, seen, keypoints, len(seen), slam_map.keyframes["covariances"][keyframe], depth)
 
 
 def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
     """What the keyframes of a map saw, without any frames between."""
-    history = History()
+    history = PosedFrames()
     for keyframe in range(slam_map.num_keyframes):
         T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
-        history.add(slam_map.view(keyframe), as_tracked(slam_map, keyframe), T_cr, keyframe)
+        history.add(slam_map.view(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
     return history.graph(slam_map, camera)

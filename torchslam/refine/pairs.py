@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
-from torchslam.loop_closing.keyframe_database import Places
+from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.tracking.correspondences import match_views
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 # A view becomes a keyframe where its matches with the last one moved by this share of the image's width, or where
 # this share of the matches is lost that the first view after it had.
@@ -46,7 +46,7 @@ class Pair:
     R_21: Tensor | None
 
 
-def choose_keyframes(views: list[View], width: int, config: Config) -> list[int]:
+def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> list[int]:
     """Rows of the views that are apart enough, in their order: told by the images alone."""
     chosen, first_matches = [0], 0
     for row in range(1, len(views)):
@@ -61,7 +61,7 @@ def choose_keyframes(views: list[View], width: int, config: Config) -> list[int]
     return chosen
 
 
-def find_pairs(views: list[View], T_cw: Tensor, camera: Camera, config: Config) -> list[Pair]:
+def find_pairs(views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config) -> list[Pair]:
     """The pairs of keyframes that see the same things.
 
     T_cw: (K, 4, 4) of the views, as given
@@ -77,9 +77,9 @@ def find_pairs(views: list[View], T_cw: Tensor, camera: Camera, config: Config) 
     return pairs
 
 
-def candidates(views: list[View], T_cw: Tensor) -> list[tuple[int, int]]:
+def candidates(views: list[FrameFeatures], T_cw: Tensor) -> list[tuple[int, int]]:
     """Pairs (lower row first, ascending) near in time, or alike and turned to the same side by the given poses."""
-    places = Places()
+    places = KeyframeDatabase()
     for row, view in enumerate(views):
         places.add(row, view.descriptors, view.mask)
     axes_w = T_cw[:, 2, :3]  # viewing directions
@@ -96,7 +96,7 @@ def candidates(views: list[View], T_cw: Tensor) -> list[tuple[int, int]]:
 
 def _verified(
     found: list[tuple[int, int, Tensor, Tensor]],
-    views: list[View],
+    views: list[FrameFeatures],
     T_cw: Tensor,
     camera: Camera,
     config: Config,

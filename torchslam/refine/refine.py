@@ -16,28 +16,27 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchslam.calibration.intrinsics import Refinement
-from torchslam.calibration.intrinsics import refine as refine_camera
+from torchslam.calibration.intrinsics import Refinement, estimate_intrinsics
 from torchslam.calibration.report import contradiction
-from torchslam.calibration.rounds import MOST_ROUNDS, SETTLED, SETTLED_SHARE
+from torchslam.calibration.rounds import MAX_ROUNDS, MIN_CHANGE, MIN_CHANGE_IN_STD
 from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, TrajectoryError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.map.map import Map
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.optim.run_graph import solve
-from torchslam.refine.adjustment import map_of, turned
-from torchslam.refine.alignment import back_to_given
-from torchslam.refine.non_keyframes import Poser, graph_of
+from torchslam.refine.adjustment import align_rotations, build_map
+from torchslam.refine.alignment import align_to_input
+from torchslam.refine.non_keyframes import FramePoser, graph_of
 from torchslam.refine.pairs import Pair, choose_keyframes, find_pairs
 from torchslam.refine.tracks import join_matches
 from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
 from torchslam.system.run import Run
-from torchslam.types import State, StepResult, Trajectory, View
+from torchslam.types import FrameFeatures, State, StepResult, Trajectory
 
-FEWEST = 2  # keyframes of a map
+MIN_KEYFRAMES = 2  # keyframes of a map
 
 
 class CameraChoice(Enum):
@@ -48,7 +47,7 @@ class CameraChoice(Enum):
     FIXED:  it stays as it is
     """
 
-    JUDGED = "judged"
+    IF_CONTRADICTED = "if_contradicted"
     FREE = "free"
     FIXED = "fixed"
 
@@ -82,15 +81,15 @@ class Refined:
         return int((self.rows < 0).sum())
 
 
-def refine(
+def refine_poses(
     sequence: Sequence,
     poses: GivenPoses | Trajectory | str | Path,
     config: Config | None = None,
-    choice: CameraChoice = CameraChoice.JUDGED,
+    choice: CameraChoice = CameraChoice.IF_CONTRADICTED,
     radial: int = 0,
     device: torch.device | str = "cpu",
     extractor: FrontEnd | None = None,
-    told: Callable[[str], None] | None = None,
+    on_progress: Callable[[str], None] | None = None,
 ) -> Refined:
     """Make somebody else's poses of the images of a sequence better.
 
@@ -102,56 +101,56 @@ def refine(
     Frames without a pose are left out, so are poses without an image. A run without a map says why (`Run.failure`).
     Raises TrajectoryError where no pose is that of an image, CalibrationError where there is no camera.
     """
-    config, say = config or Config(), told or (lambda words: None)
+    config, log = config or Config(), on_progress or (lambda words: None)
     given = _as_given(poses)
     rows = given.rows(sequence)
     camera = sequence.camera.to(device).to(torch.float64)
-    looked = source(sequence, config, camera)
-    extract = None if looked.brings_features else image_extractor(config, device, extractor)
-    views, skipped = _look(looked, rows, camera, extract)
+    source_frames = source(sequence, config, camera)
+    extract = None if source_frames.brings_features else image_extractor(config, device, extractor)
+    views, skipped = _extract_features(source_frames, rows, camera, extract)
     frames = torch.tensor([view.index for view in views], dtype=torch.int64)
     T_cw = given.T_cw[rows[frames]].to(camera.params)
-    say(f"{len(views)} images with poses")
+    log(f"{len(views)} images with poses")
     scaled = config.for_size(camera.size)  # what is told to the steps, as in a run
     chosen, pairs, failure = _connected(views, T_cw, camera, scaled)
     if failure:
         return Refined(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
-    say(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
+    log(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
     keyframes = [views[row] for row in chosen]
     slam_map, camera, refined, rounds = _rounds(
-        keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, say
+        keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, log
     )
-    world = World.empty(0, camera.params)
+    world = Submap.empty(0, camera.params)
     world.map = slam_map
-    results = Poser(camera, scaled).pose(world, views, T_cw)
-    _conclude(world, camera, frames, T_cw)
+    results = FramePoser(camera, scaled).pose(world, views, T_cw)
+    _finalize(world, camera, frames, T_cw)
     run = _run((world,), camera, config, views, results, skipped, "")
     return Refined(run, given, rows, refined, rounds)
 
 
 def _connected(
-    views: list[View], T_cw: Tensor, camera: Camera, config: Config
+    views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config
 ) -> tuple[list[int], list[Pair], str]:
     """The rows of the keyframes, the pairs of these that see the same, and why there are none, in words."""
-    if len(views) < FEWEST:
+    if len(views) < MIN_KEYFRAMES:
         return [], [], f"no map: {len(views)} images with a pose are too few"
     chosen = choose_keyframes(views, camera.width, config)
-    if len(chosen) < FEWEST:
+    if len(chosen) < MIN_KEYFRAMES:
         return [], [], f"no map: nothing moves in the {len(views)} images"
     pairs = find_pairs([views[row] for row in chosen], T_cw[chosen], camera, config)
     if not pairs:
         return [], [], f"no map: no two of {len(chosen)} keyframes see the same"
-    connected = largest_part(pairs, len(chosen))
+    connected = largest_connected_part(pairs, len(chosen))
     return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
 
 
-def _conclude(world: World, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
+def _finalize(world: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
     """Everything once more as one graph, with covariances, and back to where the given poses T_cw of the frames are."""
     graph = world.history.graph(world.map, camera)
     world.history.take(solve(graph, backward="detached"), graph, world.map)
     row_of = {index: row for row, index in enumerate(frames.tolist())}
     posed = [row_of[index] for index in world.history.frames["frame_index"].tolist()]
-    world.move(back_to_given(world.history.T_cw(world.map), T_cw[posed]))
+    world.move(align_to_input(world.history.T_cw(world.map), T_cw[posed]))
 
 
 def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
@@ -162,9 +161,9 @@ def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
     return poses if isinstance(poses, GivenPoses) else read_poses(poses)
 
 
-def _look(
+def _extract_features(
     sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor | None
-) -> tuple[list[View], list[str]]:
+) -> tuple[list[FrameFeatures], list[str]]:
     """The views of the frames that have a pose, and those that could not be read, in words."""
     views, skipped = [], []
     for index in torch.nonzero(rows >= 0)[:, 0].tolist():
@@ -178,44 +177,44 @@ def _look(
         with torch.inference_mode():
             features = frame.features if extractor is None else extractor(frame)
             assert features is not None
-        views.append(View.of(frame, features, camera.params))
+        views.append(FrameFeatures.of(frame, features, camera.params))
     return views, skipped
 
 
 def _rounds(
-    keyframes: list[View],
+    keyframes: list[FrameFeatures],
     T_cw: Tensor,
     pairs: list[Pair],
     camera: Camera,
     config: Config,
     choice: CameraChoice,
     radial: int,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> tuple[Map, Camera, Refinement | None, int]:
     """A map with the camera as known, the camera from the map, and again: a wrong one chooses its matches wrongly."""
-    given, T_cw = camera, turned(T_cw, pairs)
+    given, T_cw = camera, align_rotations(T_cw, pairs)
     tracks = join_matches(pairs, len(keyframes), len(keyframes[0].mask))
     rounds, refined = 0, None
     while True:
         is_free = choice is not CameraChoice.FIXED and camera is not given
-        slam_map, camera = map_of(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
+        slam_map, camera = build_map(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
         rounds += 1
         T_cw = slam_map.T_cw.clone()
-        say(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
+        log(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
         if choice is CameraChoice.FIXED:
             return slam_map, camera, None, rounds
-        refined = refine_camera(graph_of(slam_map, camera), given, radial)
-        if not refined.is_determined or rounds == MOST_ROUNDS:
+        refined = estimate_intrinsics(graph_of(slam_map, camera), given, radial)
+        if not refined.is_determined or rounds == MAX_ROUNDS:
             return slam_map, camera, refined, rounds
-        if choice is CameraChoice.JUDGED and not is_free and not contradiction(given, refined):
+        if choice is CameraChoice.IF_CONTRADICTED and not is_free and not contradiction(given, refined):
             return slam_map, camera, refined, rounds
         change = abs(math.log(float(refined.camera.focal) / float(camera.focal)))
-        if is_free and change < max(SETTLED, SETTLED_SHARE * refined.std):
+        if is_free and change < max(MIN_CHANGE, MIN_CHANGE_IN_STD * refined.std):
             return slam_map, camera, refined, rounds
         camera = refined.camera
 
 
-def largest_part(pairs: list[Pair], count: int) -> list[int]:
+def largest_connected_part(pairs: list[Pair], count: int) -> list[int]:
     """The largest set of keyframes, ascending, that pairs connect; of equals the one with the first keyframe."""
     label = list(range(count))
     for _ in range(count):
@@ -239,10 +238,10 @@ def _renumbered(pairs: list[Pair], kept: list[int]) -> list[Pair]:
 
 
 def _run(
-    worlds: tuple[World, ...],
+    worlds: tuple[Submap, ...],
     camera: Camera,
     config: Config,
-    views: list[View],
+    views: list[FrameFeatures],
     results: list[StepResult],
     skipped: list[str],
     failure: str,

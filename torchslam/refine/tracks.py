@@ -11,7 +11,7 @@ from torch import Tensor
 from torchslam.geometry import Camera, triangulate_many
 from torchslam.map.map import Map
 from torchslam.refine.pairs import Pair
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 VIEWS = 8  # of a track that its point is triangulated from, spread over it
 _AT_ONCE = 4096  # tracks
@@ -95,7 +95,7 @@ def triangulate_tracks(
     return torch.cat(points), torch.cat(good)
 
 
-def make_map(views: list[View], T_cw: Tensor, tracks: Tracks, points_w: Tensor) -> Map:
+def make_map(views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, points_w: Tensor) -> Map:
     """A map of keyframes at T_cw (K, 4, 4) and points (T, 3) that they see as the tracks say."""
     made = Map()
     for view, T in zip(views, T_cw, strict=True):

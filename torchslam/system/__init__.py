@@ -1,6 +1,5 @@
 """What becomes of a frame, stage by stage; `torchslam.system.slam` says which stage has its turn.
 
-patches      -> between keyframes, patches of an earlier frame tell where the camera is (`tracking.patch_tracking`)
 following    -> the world at hand: track, judge, believe or hold back (`following`)
 mapping      -> a believed frame enters the world, a keyframe grows its map (`local_mapping`)
 on trial     -> of frames that are held back too, until they are confirmed or the camera is lost (`on_trial`)

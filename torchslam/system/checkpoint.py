@@ -3,7 +3,7 @@
 It is a map file with more in it: the results so far, where the camera is, and which pixels stay in place. What is not
 in it: frames that still wait for a pose, which stay without one, and the frame that the next one would be compared
 with in search of pixels that stay. A world that is hardly begun, held-back frames and the search for a start are not in
-it either, since no checkpoint is taken while there are any (`SLAM.is_settled`).
+it either, since no checkpoint is taken while there are any (`SLAM.can_checkpoint`).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from torch import Tensor
 from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
-from torchslam.loop_closing.loop_detector import Recall
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.file import Saved, pack, read_tensors, unpack, write_tensors
-from torchslam.map.tracking_state import Track
+from torchslam.map.tracking_state import TrackingState
 from torchslam.system.front_end import FrontEnd
-from torchslam.system.run import Progressed
+from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
@@ -35,13 +35,13 @@ TRACK = "run.track."
 UNKNOWN = "not a whole checkpoint"
 
 
-def write_checkpoint(path: str | Path, slam: SLAM, so_far: Progressed, sequence: Sequence) -> None:
-    """Write the state after a frame, whole or not at all. The system must be settled (`SLAM.is_settled`)."""
+def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
+    """Write the state after a frame, whole or not at all. The system must be settled (`SLAM.can_checkpoint`)."""
     world = slam.world
-    if world is None or not slam.is_settled:
+    if world is None or not slam.can_checkpoint:
         raise ValueError("a checkpoint needs a world that is followed and nothing that is held back")
     tensors, about = pack(slam.worlds, slam.camera, slam.session.count, slam.worlds.begun)
-    whole = {column.name: getattr(world.track, column.name) for column in fields(Track)}
+    whole = {column.name: getattr(world.track, column.name) for column in fields(TrackingState)}
     track = {TRACK + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
     about["run"] = {
@@ -69,7 +69,7 @@ def read_checkpoint(
     config: Config,
     device: torch.device | str = "cpu",
     extractor: FrontEnd | None = None,
-) -> tuple[SLAM, Progressed]:
+) -> tuple[SLAM, RunProgress]:
     """The system and what it had done when the checkpoint was taken.
 
     Raises ResultsError for a file that is missing or damaged, or of a run over another sequence or with another
@@ -87,7 +87,7 @@ def read_checkpoint(
     saved = unpack(path, tensors, about, device)
     slam = SLAM(saved.camera, config, extractor)
     try:
-        so_far = Progressed(run["next"], _results(own, run, device), run["skipped"])
+        so_far = RunProgress(run["next"], _results(own, run, device), run["skipped"])
         _go_on(slam, saved, own, run, device)
     except (
         KeyError,
@@ -118,7 +118,7 @@ def _go_on(
     columns: dict[str, Any] = {
         name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
     }
-    world.track = track = Track(**run["track"], **columns)
+    world.track = track = TrackingState(**run["track"], **columns)
     _check_track(track)
     for rows, count in (
         (track.seen_last, len(world.map.points)),
@@ -132,8 +132,8 @@ def _go_on(
         each.asked = int(asked)
     index, timestamp = run["last_frame"]
     session = Session(saved.camera, saved.worlds, saved.sessions - 1)
-    slam.enter(session, world, (int(index), float(timestamp)))
-    slam.memory.recalls += [Recall(*recall) for recall in run["recalls"]]
+    slam.start_session(session, world, (int(index), float(timestamp)))
+    slam.memory.recalls += [LoopClosureRecord(*recall) for recall in run["recalls"]]
     slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
     if run["adjusting"]:  # of the newest keyframe, around which the map is as it was then
         due = None if run["due"] is None else int(run["due"])
@@ -143,7 +143,7 @@ def _go_on(
         slam.memory.looks_known = int(key), bool(looks_known)
 
 
-def _check_track(track: Track) -> None:
+def _check_track(track: TrackingState) -> None:
     """Raises ValueError, or TypeError for what is no tensor, where it is not the way of a camera."""
     for T in (track.T_cr, track.velocity):
         if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):

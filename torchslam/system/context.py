@@ -6,29 +6,28 @@ from dataclasses import dataclass
 
 from torchslam.config import Config
 from torchslam.geometry import Camera
-from torchslam.loop_closing.loop_closer import Memory
-from torchslam.map.submap import World
+from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.map.submap import Submap
 from torchslam.mapping.mapper import Mapper
 from torchslam.system.session import Session
-from torchslam.tracking.dynamic.non_static_filter import Foreign
+from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
 from torchslam.tracking.matcher import Matcher
-from torchslam.tracking.patch_tracking import PatchTracking
-from torchslam.tracking.pose_confirmation import Probation
+from torchslam.tracking.pose_confirmation import PoseConfirmation
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import State, Tracked
+from torchslam.types import PoseEstimate, State
 from torchslam.utils.timing import Stopwatch
 
 
 @dataclass
-class Whereabouts:
+class ActiveMap:
     """The world that is followed, None where there is none, and in what state; changed as soon as it changes."""
 
-    world: World | None
+    world: Submap | None
     state: State
 
 
 @dataclass(frozen=True)
-class Parts:
+class SystemContext:
     """What the stages of one session work with.
 
     config: for images of the camera's size (`Config.for_size`)
@@ -41,11 +40,10 @@ class Parts:
     tracker: Tracker
     mapper: Mapper
     session: Session
-    memory: Memory
-    foreign: Foreign
-    patches: PatchTracking
-    probation: Probation
-    here: Whereabouts
+    memory: LoopCloser
+    foreign: NonStaticFilter
+    probation: PoseConfirmation
+    here: ActiveMap
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,6 @@ class Outcome:
     """What became of a frame: without a world it has no pose, and `reason` says why."""
 
     reason: str
-    world: World | None = None
-    tracked: Tracked | None = None
+    world: Submap | None = None
+    tracked: PoseEstimate | None = None
     is_keyframe: bool = False

@@ -141,9 +141,9 @@ class Simulated:
             depth_near=settings.depth_near,
             depth_far=settings.depth_far,
             noise_px=settings.noise_px,
-            outliers=settings.outliers,
-            dropout=settings.dropout,
-            scales=settings.scales,
+            outliers=settings.outlier_ratio,
+            dropout=settings.dropout_ratio,
+            scales=settings.with_scales,
             seed=config.seed,
         )
 

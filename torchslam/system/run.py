@@ -14,18 +14,18 @@ from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError, InitializationError, TorchslamError
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.loop_closing.loop_closer import Memory
-from torchslam.loop_closing.loop_detector import Recall
+from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import main_of
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import History, RunGraph
-from torchslam.map.submap import World
+from torchslam.map.posed_frames import PosedFrames, RunGraph
+from torchslam.map.submap import Submap
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.optim.core.levenberg_marquardt import Progress
 from torchslam.optim.run_graph import join, solve
 from torchslam.system.front_end import source
 from torchslam.system.session import Session
-from torchslam.types import Frame, State, StepResult, Trajectory
+from torchslam.types import Frame, Reason, State, StepResult, Trajectory
 
 
 class System(Protocol):
@@ -34,16 +34,16 @@ class System(Protocol):
     camera: Camera
     config: Config
     session: Session
-    memory: Memory
+    memory: LoopCloser
     last_frame: tuple[int, float] | None
 
     def step(self, frame: Frame) -> StepResult: ...
 
-    def conclude(self) -> None: ...
+    def finalize(self) -> None: ...
 
 
 class Frames(Protocol):
-    """Where a run takes its frames from, each once, in the order of its index: a sequence, or `ahead.Ahead`."""
+    """Where a run takes its frames from, each once, in the order of its index: a sequence, or `ahead.FeaturePrefetcher`."""
 
     def __getitem__(self, index: int) -> Frame: ...
 
@@ -62,19 +62,19 @@ class Run:
     sessions:    how many sessions the map has; one that was only localised is none of them
     """
 
-    worlds: tuple[World, ...]
+    worlds: tuple[Submap, ...]
     camera: Camera
     config: Config
     results: list[StepResult]
     skipped: list[str]
     interrupted: bool
     failure: str
-    recalls: tuple[Recall, ...] = ()
+    recalls: tuple[LoopClosureRecord, ...] = ()
     session: int = 0
     sessions: int = 1
 
     @property
-    def main(self) -> World | None:
+    def main(self) -> Submap | None:
         """The world in which most frames of the run are posed; None where there is no map."""
         return main_of(self.worlds, self.session)
 
@@ -84,9 +84,9 @@ class Run:
         return Map() if self.main is None else self.main.map
 
     @property
-    def history(self) -> History:
+    def history(self) -> PosedFrames:
         """Poses and observations of the frames of the main world."""
-        return History() if self.main is None else self.main.history
+        return PosedFrames() if self.main is None else self.main.history
 
     @property
     def trajectory(self) -> Trajectory:
@@ -140,7 +140,7 @@ class Run:
 
 
 @dataclass
-class Progressed:
+class RunProgress:
     """How far a run has come.
 
     next:    index of the frame that comes next
@@ -156,7 +156,7 @@ def run_sequence(
     slam: System,
     sequence: Sequence,
     progress: Callable[[StepResult], None] | None = None,
-    so_far: Progressed | None = None,
+    so_far: RunProgress | None = None,
     adjusting: Progress | None = None,
     frames: Frames | None = None,
 ) -> Run:
@@ -176,7 +176,7 @@ def run_sequence(
             "this SLAM has processed frames already: call reset() to begin anew, "
             "or save() its worlds and SLAM.load() them to go on there"
         )
-    so_far = Progressed() if so_far is None else so_far
+    so_far = RunProgress() if so_far is None else so_far
     sequence = source(sequence, slam.config, slam.camera)
     frames = sequence if frames is None else frames
     interrupted = False
@@ -208,11 +208,15 @@ def finish(
 ) -> Run:
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.inference_mode():
-        slam.conclude()
+        slam.finalize()
     try:
         for world in slam.session.worlds:
-            if slam.session.mapping and slam.config.bundle.enabled and slam.config.bundle.final:
-                adjust_all(world.map, slam.camera, slam.config.bundle, adjusting)
+            if (
+                slam.session.mapping
+                and slam.config.bundle_adjustment.local
+                and slam.config.bundle_adjustment.global_at_end
+            ):
+                adjust_all(world.map, slam.camera, slam.config.bundle_adjustment, adjusting)
                 world.history.forget_strays(world.map, slam.camera)
                 graph = world.history.graph(world.map, slam.camera)
                 world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
@@ -268,7 +272,7 @@ def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
     attempts = [
         result.reason
         for result in results
-        if result.state is State.INITIALIZING and "reference" not in result.reason
+        if result.state is State.INITIALIZING and result.reason != Reason.NEW_REFERENCE
     ]
     if not attempts:
         return f"no map was initialised: {len(results)} frames are too few, two with parallax are needed"

@@ -12,8 +12,8 @@ import torch
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map.atlas import Worlds
-from torchslam.map.file import read_worlds, write_worlds
+from torchslam.map.atlas import Atlas
+from torchslam.map.file import read_atlas, write_atlas
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Session:
     """
 
     camera: Camera
-    worlds: Worlds
+    worlds: Atlas
     number: int = 0
     mapping: bool = True
 
@@ -37,7 +37,7 @@ class Session:
 
         Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
         """
-        saved = read_worlds(path, device)
+        saved = read_atlas(path, device)
         if not mapping and len(saved.worlds) == 0:
             raise ResultsError(f"{path}: there is no world in it to localise in")
         for world in saved.worlds if mapping else ():
@@ -46,7 +46,7 @@ class Session:
 
     def save(self, path: str | Path) -> None:
         """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
-        write_worlds(path, self.worlds, self.camera, self.count)
+        write_atlas(path, self.worlds, self.camera, self.count)
 
     @property
     def count(self) -> int:

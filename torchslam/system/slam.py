@@ -2,7 +2,6 @@
 
 frame -> features -> follow the world at hand (track, judge) -> keyframe? -> map -> seen before? -> StepResult
                   -> or find one: a known place, or the beginning of a new world
-      -> or only patches of an earlier frame, where these will do (configured) -> StepResult
 """
 
 from __future__ import annotations
@@ -19,26 +18,25 @@ from torchslam.data.arrays import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
-from torchslam.loop_closing.loop_closer import Memory
-from torchslam.map.atlas import Worlds
+from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.map.atlas import Atlas
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import History
-from torchslam.map.submap import World
+from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.submap import Submap
 from torchslam.map.validation import why_not_alike
 from torchslam.mapping.mapper import Mapper
-from torchslam.parallel.workers import helped
-from torchslam.system.context import Outcome, Parts, Whereabouts
+from torchslam.parallel.workers import with_workers
+from torchslam.system.context import ActiveMap, Outcome, SystemContext
 from torchslam.system.front_end import FrontEnd, check_order, check_size, image_extractor, source
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import Session
-from torchslam.system.tracking_state import Following
-from torchslam.tracking.dynamic.non_static_filter import Foreign
-from torchslam.tracking.matcher import Matcher, as_wanted, matcher_of
-from torchslam.tracking.patch_tracking import PatchTracking
-from torchslam.tracking.pose_confirmation import Probation
-from torchslam.tracking.provisional_map import Youth
+from torchslam.system.state_machine import StateMachine
+from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
+from torchslam.tracking.matcher import Matcher, make_matcher, prepare_view
+from torchslam.tracking.pose_confirmation import PoseConfirmation
+from torchslam.tracking.provisional_map import ProvisionalMap
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Frame, State, StepResult, Trajectory, View
+from torchslam.types import Frame, FrameFeatures, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
 
 
@@ -48,7 +46,7 @@ class SLAM:
     It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
     `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
 
-    Settings in pixels are those of images as `features.image_pixels` reduces them, and grow with larger ones.
+    Settings in pixels are those of images as `features.max_image_pixels` reduces them, and grow with larger ones.
 
     extractor: front end, from images to `Features`, such as ORB(); the configured one if None. Frames that bring
                features of their own, as those of `front_end.Simulated`, are not shown to it.
@@ -70,7 +68,7 @@ class SLAM:
         self.has_own_parts = extractor is not None or matcher is not None  # which other processes do not have
         self.clock = Stopwatch()
         scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
-        self.matcher = matcher_of(scaled.matching, matcher)
+        self.matcher = make_matcher(scaled.matching, matcher)
         self.tracker = Tracker(self.camera, scaled, self.matcher)
         undistorted = self.tracker.localizer.undistorted
         self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, undistorted)
@@ -78,7 +76,7 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget everything and wait for a new start."""
-        self.enter(Session(self.camera, Worlds(self.camera.params)))
+        self.start_session(Session(self.camera, Atlas(self.camera.params)))
 
     @classmethod
     def load(
@@ -98,15 +96,15 @@ class SLAM:
         """
         session = Session.load(path, mapping, device)
         slam = cls(session.camera, config, extractor, matcher)
-        slam.enter(session)
+        slam.start_session(session)
         return slam
 
     def save(self, path: str | Path) -> None:
         """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
         self.session.save(path)
 
-    def enter(
-        self, session: Session, world: World | None = None, last_frame: tuple[int, float] | None = None
+    def start_session(
+        self, session: Session, world: Submap | None = None, last_frame: tuple[int, float] | None = None
     ) -> None:
         """Begin a session, lost at first; or go on in one of its worlds, from where the camera was in `last_frame`.
 
@@ -116,14 +114,13 @@ class SLAM:
         self.last_frame = last_frame
         self.tracker.counts = session.mapping
         self.mapper.adjusting.drop()
-        self.memory = Memory(self.camera, self.scaled, self.worlds)
-        self.foreign = Foreign(self.camera, self.scaled)
-        self.patches = PatchTracking(self.camera, self.scaled)
+        self.memory = LoopCloser(self.camera, self.scaled, self.worlds)
+        self.foreign = NonStaticFilter(self.camera, self.scaled)
         state = State.LOST if len(self.worlds) else State.INITIALIZING
-        self._here = Whereabouts(world, state if world is None else State.TRACKING)
-        self._probation = Probation(self.scaled)
-        self._following = Following(
-            Parts(
+        self._here = ActiveMap(world, state if world is None else State.TRACKING)
+        self._probation = PoseConfirmation(self.scaled)
+        self._states = StateMachine(
+            SystemContext(
                 camera=self.camera,
                 config=self.scaled,
                 clock=self.clock,
@@ -133,14 +130,13 @@ class SLAM:
                 session=session,
                 memory=self.memory,
                 foreign=self.foreign,
-                patches=self.patches,
                 probation=self._probation,
                 here=self._here,
             )
         )
 
     @property
-    def world(self) -> World | None:
+    def world(self) -> Submap | None:
         """The one that is followed; None where none is."""
         return self._here.world
 
@@ -150,12 +146,12 @@ class SLAM:
         return self._here.state
 
     @property
-    def youth(self) -> Youth | None:
+    def youth(self) -> ProvisionalMap | None:
         """Of the world that is followed, while it is on trial."""
-        return self._following.beginning.youth
+        return self._states.beginning.youth
 
     @property
-    def is_settled(self) -> bool:
+    def can_checkpoint(self) -> bool:
         """Whether a world is followed that has proved itself, and no frame is held back."""
         return self.world is not None and self.youth is None and not self._probation
 
@@ -171,23 +167,10 @@ class SLAM:
             view, outcome = self._process(frame)
         return self._result(view, outcome)
 
-    def _process(self, frame: Frame) -> tuple[View, Outcome]:
+    def _process(self, frame: Frame) -> tuple[FrameFeatures, Outcome]:
         self._check(frame)
-        followed, scouts = frame.followed, self._scouts(frame)
-        if scouts:
-            with self.clock("patches"):
-                followed = self.patches.scout.follow(frame)
-        if self.world is not None and followed is not None and self.patches.will_do(self.world, followed):
-            self.last_frame = frame.index, frame.timestamp
-            return self._following.go_along(self.world, frame, followed)
         view = self._look(frame)
-        self.patches.expect(view.index)
-        if self.world is None:
-            outcome = self._following.finding.find(view)
-        else:
-            outcome = self._following.follow(self.world, view, followed)
-        self.patches.tell(scouts)
-        return view, outcome
+        return view, self._states.step(view)
 
     def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
         """Process an image of one's own loop: the frame after the last one.
@@ -210,7 +193,7 @@ class SLAM:
         processes: how many, this one included; None: what is best, as on the command line. The result is the same.
         """
         sequence = source(sequence, self.config, self.camera)
-        with helped(sequence, self, processes) as frames:
+        with with_workers(sequence, self, processes) as frames:
             return run_sequence(self, sequence, progress, frames=frames)
 
     def trajectory(self) -> Trajectory:
@@ -225,10 +208,10 @@ class SLAM:
         return Map() if world is None else world.map
 
     @property
-    def history(self) -> History:
+    def history(self) -> PosedFrames:
         """The posed frames of the same world as `map`."""
         world = self.world or self.worlds.main(self.session.number)
-        return History() if world is None else world.history
+        return PosedFrames() if world is None else world.history
 
     @torch.inference_mode()
     def warm_up(self) -> None:
@@ -238,24 +221,19 @@ class SLAM:
             self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
 
     @torch.inference_mode()
-    def prepare(self) -> None:
-        """Make what is looked up of the camera at every frame, so that the first one that is tracked does not wait."""
+    def precompute_undistortion(self) -> None:
+        """Compute the undistortion table of the camera before the first frame is tracked."""
         self.tracker.localizer.undistorted.prepare()
 
     @torch.inference_mode()
-    def settle(self) -> None:
+    def confirm_map(self) -> None:
         """Believe a young world as it is: the frames from before its start get their poses."""
-        self._following.settle()
+        self._states.confirm_map()
 
     @torch.inference_mode()
-    def conclude(self) -> None:
+    def finalize(self) -> None:
         """The last frame has come: what is held back keeps its pose, uncertain as it is."""
-        self._following.conclude()
-
-    def _scouts(self, frame: Frame) -> bool:
-        """Whether the scout goes before this frame: not where something is known of it already."""
-        comes_whole = frame.followed is None and frame.features is None
-        return self.patches.is_enabled and comes_whole and self.extractor is not None
+        self._states.finalize()
 
     def _check(self, frame: Frame) -> None:
         if self.extractor is None and frame.features is None:
@@ -264,23 +242,23 @@ class SLAM:
             )
         check_order(frame, self.last_frame)
         is_whole = frame.image.numel() > 0 or frame.features is None  # else only its features came
-        if is_whole and frame.followed is None:
+        if is_whole:
             check_size(frame, self.camera)
 
-    def _look(self, frame: Frame) -> View:
+    def _look(self, frame: Frame) -> FrameFeatures:
         with self.clock("features"):
             features = frame.features
             if features is None:
                 assert self.extractor is not None  # as `_check` saw to
                 features = self.extractor(frame)
-            view = as_wanted(View.of(frame, features, self.camera.params), frame, self.matcher)
+            view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
             self.seen = replace(view, session=self.session.number)
             if self.last_frame is None:
                 self._check_kind(self.seen)
             self.last_frame = frame.index, frame.timestamp
             return self.foreign.clear_of(self.seen)
 
-    def _check_kind(self, view: View) -> None:
+    def _check_kind(self, view: FrameFeatures) -> None:
         """Raises ConfigError where the front end is another one than that of the worlds."""
         for world in self.worlds:
             wrong = why_not_alike(world.map, view, to_map=self.mapping)
@@ -288,7 +266,7 @@ class SLAM:
                 raise ConfigError(f"the map was made with another front end: {wrong}")
 
     @torch.inference_mode(False)  # poses that leave may become part of a graph
-    def _result(self, view: View, outcome: Outcome) -> StepResult:
+    def _result(self, view: FrameFeatures, outcome: Outcome) -> StepResult:
         world, tracked = outcome.world, outcome.tracked
         return StepResult(
             index=view.index,

@@ -12,8 +12,15 @@ from torchslam.config import MatchingConfig
 from torchslam.features import match
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
-from torchslam.tracking.matcher import DescriptorMatcher, Matcher, Pairs, Prior, matched, max_distance
-from torchslam.types import View
+from torchslam.tracking.matcher import (
+    DescriptorMatcher,
+    Matcher,
+    MatchIndices,
+    MatchPrior,
+    max_distance,
+    run_matcher,
+)
+from torchslam.types import FrameFeatures
 
 
 @dataclass(frozen=True)
@@ -26,9 +33,11 @@ class Projected:
     angles: Tensor
 
 
-def match_views(view_1: View, view_2: View, settings: MatchingConfig) -> tuple[Tensor, Tensor]:
+def match_views(
+    view_1: FrameFeatures, view_2: FrameFeatures, settings: MatchingConfig
+) -> tuple[Tensor, Tensor]:
     """(m,), (m,) keypoints of two views that match by their descriptors: mutual, by ratio, one to one."""
-    pairs = matched(DescriptorMatcher(settings), view_1, view_2)
+    pairs = run_matcher(DescriptorMatcher(settings), view_1, view_2)
     return pairs.first, pairs.second
 
 
@@ -67,35 +76,35 @@ def look_at(
     pixels, valid = camera.project(transform(T_cw, positions_w))
     rays_w = positions_w + (T_cw[..., :3, :3].mT @ T_cw[..., :3, 3:]).mT
     distance = torch.linalg.vector_norm(rays_w, dim=-1).clamp(min=1e-12)
-    cosine = (rays_w * points["normals_w"][ids]).sum(-1) / distance
+    cosine = (rays_w * points["view_directions_w"][ids]).sum(-1) / distance
     least = math.cos(math.radians(max_view_angle_deg))
-    valid &= points["alive"][ids]  # a track may still name points that died since
-    scales = (points["reach"][ids] / distance).clamp(*scale_range)
+    valid &= points["is_valid"][ids]  # a track may still name points that died since
+    scales = (points["scale_distance"][ids] / distance).clamp(*scale_range)
     return pixels, scales, valid & camera.in_image(pixels) & (cosine > least)
 
 
 def match_near(
     slam_map: Map,
     projected: Projected,
-    view: View,
+    view: FrameFeatures,
     radius_px: float,
     matcher: Matcher,
     ratio: float | None,
-) -> Pairs:
+) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
     The radius is in pixels of the pyramid level at which the point is expected.
     """
     if len(projected.ids) == 0:
-        return Pairs(projected.ids, projected.ids)
+        return MatchIndices(projected.ids, projected.ids)
     expected = expected_view(slam_map, projected, view)
-    pairs = matched(matcher, expected, view, Prior(radius_px * projected.scales, ratio))
+    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, ratio))
     return replace(pairs, first=projected.ids[pairs.first])
 
 
-def expected_view(slam_map: Map, projected: Projected, view: View) -> View:
+def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> FrameFeatures:
     """What the map expects a camera to see, as a view: points where they should appear, as they looked last."""
-    return View(
+    return FrameFeatures(
         view.index,
         view.timestamp,
         keypoints=projected.pixels,
@@ -107,24 +116,24 @@ def expected_view(slam_map: Map, projected: Projected, view: View) -> View:
     )
 
 
-def match_points(slam_map: Map, ids: Tensor, view: View, settings: MatchingConfig) -> Pairs:
+def match_points(slam_map: Map, ids: Tensor, view: FrameFeatures, settings: MatchingConfig) -> MatchIndices:
     """Point ids and keypoints that match by descriptor alone, wherever they are in the image."""
     if len(ids) == 0:
-        return Pairs(ids, ids)
+        return MatchIndices(ids, ids)
     matches = match(
         slam_map.point_features(ids),
         view.features,
-        ratio=settings.ratio,
+        ratio=settings.max_ratio,
         mutual=True,
         max_distance=max_distance(view.descriptors, settings),
     )
     found = matches.mask[0]
-    return Pairs(ids[matches.indices_1[0][found]], matches.indices_2[0][found])
+    return MatchIndices(ids[matches.indices_1[0][found]], matches.indices_2[0][found])
 
 
-def match_keyframe(slam_map: Map, keyframe: int, view: View, matcher: Matcher) -> Pairs:
+def match_keyframe(slam_map: Map, keyframe: int, view: FrameFeatures, matcher: Matcher) -> MatchIndices:
     """Points that a keyframe sees and keypoints of a view, matched by the keyframe's own descriptors."""
     seen = slam_map.view(keyframe)
     point_ids = slam_map.keyframes["point_ids"][keyframe]
-    pairs = matched(matcher, replace(seen, mask=seen.mask & (point_ids >= 0)), view)
+    pairs = run_matcher(matcher, replace(seen, mask=seen.mask & (point_ids >= 0)), view)
     return replace(pairs, first=point_ids[pairs.first])

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchslam.features import expand_runs, match_pairs
-from torchslam.geometry import Camera, Noise
+from torchslam.geometry import Camera, KeypointNoise
 from torchslam.map.map import NO_POINT, Map
-from torchslam.types import Features, View
+from torchslam.types import Features, FrameFeatures
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class FreeKeypoints:
     features: Features
     rows: Tensor
     normalized: Tensor
-    noise: Noise
+    noise: KeypointNoise
 
     @classmethod
     def of(cls, slam_map: Map, keyframes: Tensor, normalize: Callable[[Tensor], Tensor]) -> FreeKeypoints:
@@ -99,7 +99,12 @@ def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def match_free(
-    view_1: View, view_2: View, T_21: Tensor, camera: Camera, epipolar_px: float, max_distance: float
+    view_1: FrameFeatures,
+    view_2: FrameFeatures,
+    T_21: Tensor,
+    camera: Camera,
+    epipolar_px: float,
+    max_distance: float,
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) keypoints of two views, of those of their masks, that `match_along_epipolar_lines` finds."""
     one, two = (_of_view(view, camera) for view in (view_1, view_2))
@@ -107,7 +112,7 @@ def match_free(
     return one.rows[0, at_1], two.rows[0, at_2]
 
 
-def _of_view(view: View, camera: Camera) -> FreeKeypoints:
+def _of_view(view: FrameFeatures, camera: Camera) -> FreeKeypoints:
     rows = torch.nonzero(view.mask)[:, 0]
     features = view.features.rows(rows)
     return FreeKeypoints(features, rows[None], camera.normalize(features.keypoints), view.noise[rows[None]])

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam.config import Config, InitializationConfig
 from torchslam.geometry import (
     Camera,
-    Noise,
+    KeypointNoise,
     RelativePose,
     Triangulation,
     epipolar_offsets,
@@ -20,8 +20,8 @@ from torchslam.geometry import (
     triangulate,
 )
 from torchslam.optim import BundleProblem, bundle_adjust
-from torchslam.tracking.matcher import Matcher, matched, matcher_of
-from torchslam.types import Start, View
+from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
+from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
 AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
 STILL_SHARE = 0.1  # of the matches, from which on it is asked whether they belong to the scene
@@ -34,25 +34,25 @@ class Initializer:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
-        self.matcher = matcher_of(config.matching, matcher)
+        self.matcher = make_matcher(config.matching, matcher)
         self.config = config
-        self.views: list[View] = []  # the reference and what came after it
+        self.views: list[FrameFeatures] = []  # the reference and what came after it
         # pixels (n, 2) that the last view showed not to move with the scene
         self.still = camera.params.new_zeros(0, 2)
         self.planar_views = 0  # in which a plane explained the matches with the reference
 
     @property
-    def reference(self) -> View:
+    def reference(self) -> FrameFeatures:
         return self.views[0]
 
-    def step(self, view: View) -> tuple[Start | None, str]:
+    def step(self, view: FrameFeatures) -> tuple[TwoViewMap | None, str]:
         """A start, or None and the reason in words."""
         self.still = self.still[:0]
         if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
             self._refer_to(view)
-            return None, "took a reference frame"
+            return None, Reason.NEW_REFERENCE
         self.views.append(view)
-        pairs = matched(self.matcher, self.reference, view)
+        pairs = run_matcher(self.matcher, self.reference, view)
         first, second = pairs.first, pairs.second
         view = view.weighed(second, pairs.weights)
         least = self.config.initialization.min_matches
@@ -61,12 +61,12 @@ class Initializer:
             return None, f"too few matches with the reference frame: {len(first)}, {least} are needed"
         return self._relate(view, first, second)
 
-    def _refer_to(self, view: View) -> None:
+    def _refer_to(self, view: FrameFeatures) -> None:
         """Begin anew with another reference frame: what an earlier one said of planes is no reason to believe one."""
         self.views = [view]
         self.planar_views = 0
 
-    def _relate(self, view: View, first: Tensor, second: Tensor) -> tuple[Start | None, str]:
+    def _relate(self, view: FrameFeatures, first: Tensor, second: Tensor) -> tuple[TwoViewMap | None, str]:
         """The relative pose of the two views, unless the image stands still."""
         settings = self.config.initialization
         motion = torch.linalg.vector_norm(view.keypoints[second] - self.reference.keypoints[first], dim=-1)
@@ -77,7 +77,7 @@ class Initializer:
                 return None, "some of the image stays in place, and it is not clear what moves"
             return self._relate_moving(view, first[scene], second[scene], scene_only=False)
         if len(first) < GONE_SHARE * int(self.reference.mask.sum()):
-            self.still = view.keypoints[second[motion < settings.still_px]]
+            self.still = view.keypoints[second[motion < settings.max_static_px]]
             self._refer_to(view)
             return None, "what still matches stays in place, the rest has gone: took a new reference frame"
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
@@ -89,8 +89,8 @@ class Initializer:
         return start, reason and f"{share:.0%} of the image stands still, and of the rest: {reason}"
 
     def _relate_moving(
-        self, view: View, first: Tensor, second: Tensor, scene_only: bool
-    ) -> tuple[Start | None, str]:
+        self, view: FrameFeatures, first: Tensor, second: Tensor, scene_only: bool
+    ) -> tuple[TwoViewMap | None, str]:
         """The relative pose from matches that moved.
 
         scene_only: they are a part of all matches, and may be a thing that moves before a camera that stands
@@ -104,22 +104,22 @@ class Initializer:
         if model == "rotation":
             return None, "the camera only turns: a rotation explains the matches"
         self.planar_views += model == "homography"
-        if model == "homography" and self.planar_views < settings.planar_patience:
+        if model == "homography" and self.planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
             return None, "the scene looks planar: a homography explains the matches"
         if not bool(relative.success[0]):
             return None, f"ambiguous motion: the {model} allows several"
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
-        least_share = settings.min_planar_share if model == "homography" else settings.min_good_share
+        least_share = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
         return self._judge(view, relative.T_21[0], first[inliers], second[inliers], least_share)
 
-    def _scene(self, view: View, first: Tensor, second: Tensor, motion: Tensor) -> Tensor | None:
+    def _scene(self, view: FrameFeatures, first: Tensor, second: Tensor, motion: Tensor) -> Tensor | None:
         """(n,) bool, which matches belong to the scene: without those that stay in place, unless the motion of the
         others explains them too, as it does far points and what the camera turns around: on their epipolar lines, and
         not behind the camera. None where nobody can tell.
         """
         everyone = torch.ones_like(motion, dtype=torch.bool)
-        still = motion < self.config.initialization.still_px
+        still = motion < self.config.initialization.max_static_px
         if (
             int(still.sum()) < STILL_SHARE * len(motion)
             or int((~still).sum()) < self.config.initialization.min_matches
@@ -137,7 +137,7 @@ class Initializer:
         self.still = view.keypoints[second[still]]
         return ~still
 
-    def _relative_pose(self, view: View, first: Tensor, second: Tensor) -> RelativePose:
+    def _relative_pose(self, view: FrameFeatures, first: Tensor, second: Tensor) -> RelativePose:
         """The motion from the reference frame to a view by matching keypoints (n,), (n,) of the two."""
         return estimate_relative_pose(
             self.reference.keypoints[first][None],
@@ -151,8 +151,8 @@ class Initializer:
         )
 
     def _judge(
-        self, view: View, T_cw: Tensor, first: Tensor, second: Tensor, least_share: float
-    ) -> tuple[Start | None, str]:
+        self, view: FrameFeatures, T_cw: Tensor, first: Tensor, second: Tensor, least_share: float
+    ) -> tuple[TwoViewMap | None, str]:
         """Triangulate, refine both together, and count the points that are worth something."""
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
@@ -177,7 +177,7 @@ class Initializer:
                 f"too few points survive refinement: {int(accurate.sum())}, {settings.min_points} are needed",
             )
         keep = keep[accurate]
-        return Start(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
+        return TwoViewMap(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
 
 
 def is_good(
@@ -219,7 +219,7 @@ def why_not(
 
 
 def refine_pair(
-    T_cw: Tensor, points_w: Tensor, pixels_1: Tensor, pixels_2: Tensor, noise: Noise, camera: Camera
+    T_cw: Tensor, points_w: Tensor, pixels_1: Tensor, pixels_2: Tensor, noise: KeypointNoise, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Bundle adjustment of two views with the first one fixed.
 

@@ -14,8 +14,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.tracking.matcher import Prior
-from torchslam.types import Matches, View
+from torchslam.tracking.matcher import MatchPrior
+from torchslam.types import FrameFeatures, Matches
 from torchslam.utils.bounded_read import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights
@@ -63,7 +63,9 @@ class LightGlue(nn.Module):
         self.network.eval()
 
     @torch.no_grad()
-    def forward(self, view_1: View, view_2: View, prior: Prior | None = None) -> Matches:
+    def forward(
+        self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
+    ) -> Matches:
         """By descriptors and places alone: the prior is left alone. Raises ConfigError for other descriptors."""
         rows = [torch.nonzero(view.mask)[:, 0] for view in (view_1, view_2)]
         if min(map(len, rows)) == 0:
@@ -81,7 +83,7 @@ class LightGlue(nn.Module):
         one, two = rows[0][first][None], rows[1][second][None]
         return Matches(one, two, (1 - scores).float()[None], good[None], weights=scores[None])
 
-    def _data(self, view: View, rows: Tensor, size: Tensor) -> dict[str, Tensor]:
+    def _data(self, view: FrameFeatures, rows: Tensor, size: Tensor) -> dict[str, Tensor]:
         described = view.descriptors[rows]
         if not described.is_floating_point() or described.shape[-1] != self.size_in:
             raise ConfigError(

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
-    Noise,
-    Undistorted,
+    KeypointNoise,
+    UndistortedKeypoints,
     Undistortion,
     fits,
     innovation_covariances,
@@ -20,12 +20,12 @@ from torchslam.geometry import (
     transform,
 )
 from torchslam.map.map import Map
-from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel
-from torchslam.optim.pose.nearby_pose import nearby_pose
+from torchslam.optim.core.numpy_backend import RobustKernel
+from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, nearby_pose
 from torchslam.tracking.correspondences import Projected, match_near, project_points
 from torchslam.tracking.match_selection import SENIOR, coverage, explained, spread, trusted, voices
-from torchslam.tracking.matcher import DescriptorMatcher, Pairs
-from torchslam.types import Tracked, View
+from torchslam.tracking.matcher import DescriptorMatcher, MatchIndices
+from torchslam.types import FrameFeatures, PoseEstimate
 
 FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 
@@ -39,17 +39,17 @@ class Localizer:
         self.own = DescriptorMatcher(config.matching)  # for what is guided to a few pixels
         self.settings = config.tracking
         self.measurement = config.measurement
-        self.least_share = config.judge.min_inlier_share
+        self.least_share = config.pose_validation.min_inlier_ratio
         self.seed = config.seed
 
     def locate(
         self,
         slam_map: Map,
-        view: View,
-        candidates: Iterator[Pairs],
+        view: FrameFeatures,
+        candidates: Iterator[MatchIndices],
         local_points: Tensor,
         expected_T_cw: Tensor | None = None,
-    ) -> Tracked | None:
+    ) -> PoseEstimate | None:
         """The pose by the first of several sets of matches that gives one, refined against the local points (n,).
 
         local_points:  ascending
@@ -57,7 +57,7 @@ class Localizer:
 
         Where too few of the matches agree with a pose, the next sets are heard too, and most inliers win.
         """
-        best: Tracked | None = None
+        best: PoseEstimate | None = None
         for pairs in candidates:
             tracked = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
             if tracked is not None and (best is None or tracked.inliers > best.inliers):
@@ -69,11 +69,11 @@ class Localizer:
     def _locate(
         self,
         slam_map: Map,
-        view: View,
-        pairs: Pairs,
+        view: FrameFeatures,
+        pairs: MatchIndices,
         local_points: Tensor,
         expected_T_cw: Tensor | None,
-    ) -> Tracked | None:
+    ) -> PoseEstimate | None:
         """PnP over matches, then all local points near their projection, then robust refinement."""
         settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
         if len(point_ids) < settings.min_matches:
@@ -99,13 +99,13 @@ class Localizer:
         if int(inliers.sum()) < settings.min_inliers:
             return None
         T_cw, seen = refined.T_cw, ids[inliers]
-        return Tracked(
+        return PoseEstimate(
             T_cw,
             seen,
             at[inliers],
             matches=len(ids),
             covariance=refined.covariance(),
-            depth=float(refined.sighting.depths[inliers].median()),
+            depth=float(refined.linearization.depths[inliers].median()),
             error=float(errors.median()),
             coverage=coverage(slam_map, near, seen, self.camera.size),
             explained=explained(view, at[inliers], self.camera.size),
@@ -113,13 +113,15 @@ class Localizer:
             expected=near.ids,
         )
 
-    def _start(self, points_w: Tensor, seen: Undistorted, expected_T_cw: Tensor | None) -> Tensor | None:
+    def _start(
+        self, points_w: Tensor, seen: UndistortedKeypoints, expected_T_cw: Tensor | None
+    ) -> Tensor | None:
         """The pose (4, 4) that most matches agree with: the one next to the expected one, or else by RANSAC."""
         threshold = self.settings.threshold_px
         T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
         return start_pose(points_w, seen, self.camera.size, threshold, self.seed) if T_cw is None else T_cw
 
-    def project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: View) -> Projected:
+    def project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: FrameFeatures) -> Projected:
         max_angle = self.settings.max_view_angle_deg
         return project_points(slam_map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
 
@@ -141,8 +143,8 @@ class Localizer:
         T_cw: Tensor,
         ids: Tensor,
         pixels: Tensor,
-        undistorted: Undistorted,
-        noise: Noise,
+        undistorted: UndistortedKeypoints,
+        noise: KeypointNoise,
     ) -> tuple[FramePose, Tensor, Tensor]:
         """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
 
@@ -150,17 +152,17 @@ class Localizer:
         on all that agrees with that.
         """
         problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
-        sighting = problem.see(T_cw)
-        mask = fits(sighting.squared / noise.margin**2, FAR * self.measurement.chi_square)
+        linearization = problem.linearize(T_cw)
+        mask = fits(linearization.squared / noise.margin**2, FAR * self.measurement.max_chi_square)
         old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
         weights = voices(pixels, self.camera.size)
         kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
-            refined = problem.minimize(sighting, weights * mask, kernel)
-            sighting = refined.sighting
-            errors = sighting.squared / noise.margin**2
+            refined = problem.minimize(linearization, weights * mask, kernel)
+            linearization = refined.linearization
+            errors = linearization.squared / noise.margin**2
             mask = self.agrees(slam_map, refined.T_cw, ids, pixels, noise, errors)
             if int(mask.sum()) < 6:
                 break
@@ -172,7 +174,7 @@ class Localizer:
         T_cw: Tensor,
         ids: Tensor,
         pixels: Tensor,
-        noise: Noise,
+        noise: KeypointNoise,
         errors: Tensor | None = None,
     ) -> Tensor:
         """(n,) whether points are seen where they should be, by the configured gate.
@@ -181,7 +183,7 @@ class Localizer:
 
         The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
         """
-        chi_square, points = self.measurement.chi_square, slam_map.points
+        chi_square, points = self.measurement.max_chi_square, slam_map.points
         by_noise = self.measurement.gate == "chi_square"
         if by_noise and errors is not None:
             return fits(errors, chi_square)
@@ -193,7 +195,7 @@ class Localizer:
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
 
-def weights_of(pairs: Pairs, guided: Pairs, keypoints: int) -> Tensor | None:
+def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Tensor | None:
     """(n,) what a matcher gave to those of its pairs that a guided search found as well; None where it gave nothing.
 
     Pairs that the guided search alone found count as the median of the matcher's.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.map.map import Map
 from torchslam.tracking.correspondences import Projected
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 from torchslam.utils.indexing import is_among
 
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
@@ -70,7 +70,7 @@ def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return (CROWD / crowd).clamp(max=1.0)
 
 
-def explained(view: View, keypoints: Tensor, size: tuple[int, int]) -> float:
+def explained(view: FrameFeatures, keypoints: Tensor, size: tuple[int, int]) -> float:
     """The share of the image's cells with several keypoints in which at least one of keypoints (m,) lies."""
     count = CELLS[0] * CELLS[1]
     there = torch.bincount(cells(view.keypoints[view.mask], size), minlength=count) >= 2

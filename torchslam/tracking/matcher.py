@@ -16,11 +16,11 @@ from torchslam.features.matching.by_projection import match_within
 from torchslam.geometry import Camera
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
-from torchslam.types import Frame, Matches, View
+from torchslam.types import Frame, FrameFeatures, Matches
 
 
 @dataclass(frozen=True)
-class Prior:
+class MatchPrior:
     """What is known of two views before they are matched. A matcher may leave it alone: what it finds is tested.
 
     radius_px:   (N,) of the first view's keypoints, which then are predictions: where points of the map should appear
@@ -37,17 +37,17 @@ class Prior:
     epipolar_px: float = 0.0
 
 
-Matcher = Callable[[View, View, Prior | None], Matches]
+Matcher = Callable[[FrameFeatures, FrameFeatures, MatchPrior | None], Matches]
 """Two views, and what is known before, to a batch of one of `Matches`. Only keypoints of `mask` may match, each of the
 second view once.
 
 A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints; one whose
-attribute `wants_images` is true finds (1, 1, H, W) grey in `View.image`, of frames of this run, not of what the map
+attribute `wants_images` is true finds (1, 1, H, W) grey in `FrameFeatures.image`, of frames of this run, not of what the map
 expects to be seen."""
 
 
 @dataclass(frozen=True)
-class Pairs:
+class MatchIndices:
     """Rows (m,), (m,) that match, and what each match counts, (m,); None: all alike."""
 
     first: Tensor
@@ -62,13 +62,15 @@ class DescriptorMatcher:
     def __init__(self, settings: MatchingConfig) -> None:
         self.settings = settings
 
-    def __call__(self, view_1: View, view_2: View, prior: Prior | None = None) -> Matches:
+    def __call__(
+        self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
+    ) -> Matches:
         limit = max_distance(view_2.descriptors, self.settings)
         if prior is None:
             return match(
                 view_1.features,
                 view_2.features,
-                ratio=self.settings.ratio,
+                ratio=self.settings.max_ratio,
                 mutual=True,
                 max_distance=limit,
             )
@@ -99,10 +101,10 @@ def _all_alike(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
     """The threshold for this kind of descriptor: bits, or 1 - cosine."""
-    return settings.max_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
+    return settings.max_hamming_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
 
 
-def matcher_of(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
+def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
     """A matcher of one's own, or the configured one. Raises ConfigError where there is none of its name."""
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
@@ -113,7 +115,7 @@ def matcher_of(settings: MatchingConfig, matcher: Matcher | None = None) -> Matc
     return DescriptorMatcher(settings) if matcher is None else matcher
 
 
-def as_wanted(view: View, frame: Frame, matcher: Matcher) -> View:
+def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFeatures:
     """A view as a matcher wants it: with the image, with stated noise that weights can multiply."""
     if getattr(matcher, "weighs", False):
         view = replace(view, information=view.noise.stated().information)
@@ -122,7 +124,9 @@ def as_wanted(view: View, frame: Frame, matcher: Matcher) -> View:
     return view
 
 
-def matched(matcher: Matcher, view_1: View, view_2: View, prior: Prior | None = None) -> Pairs:
+def run_matcher(
+    matcher: Matcher, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
+) -> MatchIndices:
     """Who matches whom. Raises ConfigError where a matcher's answer is not that of one."""
     found = matcher(view_1, view_2, prior)
     if not isinstance(matcher, DescriptorMatcher):
@@ -131,10 +135,10 @@ def matched(matcher: Matcher, view_1: View, view_2: View, prior: Prior | None = 
     weights = None
     if found.weights is not None and getattr(matcher, "weighs", False):
         weights = found.weights[0][mask].to(view_2.keypoints)
-    return Pairs(found.indices_1[0][mask], found.indices_2[0][mask], weights)
+    return MatchIndices(found.indices_1[0][mask], found.indices_2[0][mask], weights)
 
 
-def check_matches(found: Any, view_1: View, view_2: View, matcher: object) -> None:
+def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matcher: object) -> None:
     """Raises ConfigError where `found` is not `Matches` between two views, each keypoint of the second used once."""
     name = getattr(matcher, "__name__", type(matcher).__name__)
 
@@ -164,7 +168,7 @@ def check_matches(found: Any, view_1: View, view_2: View, matcher: object) -> No
             refuse(f"weights must be positive floats {shape}")
 
 
-def nearest_keypoints(pixels: Tensor, rows: Tensor, view: View, radius_px: float = 1.5) -> Matches:
+def nearest_keypoints(pixels: Tensor, rows: Tensor, view: FrameFeatures, radius_px: float = 1.5) -> Matches:
     """What a dense matcher or optical flow says, as matches of keypoints: pixels (n, 2) in a view of keypoints `rows`
     (n,) of another one belong to the view's nearest keypoint.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.map.tracking_state import Track
-from torchslam.types import Tracked, View
+from torchslam.map.tracking_state import TrackingState
+from torchslam.types import FrameFeatures, PoseEstimate
 
-Held = tuple[View, Tracked, Tensor, int]
+Held = tuple[FrameFeatures, PoseEstimate, Tensor, int]
 """A frame, what was found in it, and its pose T_cr (4, 4) relative to a keyframe."""
 
 
@@ -16,12 +16,12 @@ MOST = 1000
 """Frames held back at a time: none can wait for ever."""
 
 
-class Probation:
+class PoseConfirmation:
     """Holds frames back from the first doubtful one until enough certain ones have followed in a row."""
 
     def __init__(self, config: Config) -> None:
-        self._after_doubt = config.judge.confirmations
-        self._after_return = config.relocalization.confirmations
+        self._after_doubt = config.pose_validation.num_confirming_frames
+        self._after_return = config.relocalization.num_confirming_frames
         self._held: list[Held] = []
         self._needed = 0
         self._doubtful = 0  # frames since the last certain one that is believed
@@ -36,12 +36,19 @@ class Probation:
         """What is waited for."""
         return f"to be confirmed by {self._needed} more frames"
 
-    def come_back(self, view: View, tracked: Tracked, track: Track) -> None:
+    def come_back(self, view: FrameFeatures, tracked: PoseEstimate, track: TrackingState) -> None:
         """Begin with a frame that was relocalised."""
         self._held = [(view, tracked, track.T_cr, track.reference)]
         self._needed, self.came_back = self._after_return, True
 
-    def hold(self, view: View, tracked: Tracked, track: Track, doubt: str, is_mapped: bool = False) -> None:
+    def hold(
+        self,
+        view: FrameFeatures,
+        tracked: PoseEstimate,
+        track: TrackingState,
+        doubt: str,
+        is_mapped: bool = False,
+    ) -> None:
         """Hold a frame back; one without a doubt counts as a confirmation.
 
         is_mapped: the map grew by what is held back and agrees with it for that reason alone: it takes as many certain
@@ -61,7 +68,7 @@ class Probation:
         """Whether no more frames can be held back."""
         return len(self._held) >= MOST
 
-    def views(self) -> list[View]:
+    def views(self) -> list[FrameFeatures]:
         """The frames that are held back, in order."""
         return [held[0] for held in self._held]
 

@@ -7,14 +7,16 @@ import math
 import torch
 from torch import Tensor
 
-from torchslam.config import JudgeConfig
+from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.motion import rotation_angle
-from torchslam.map.tracking_state import Track
-from torchslam.types import Tracked
+from torchslam.map.tracking_state import TrackingState
+from torchslam.types import PoseEstimate
 
 
-def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, settings: JudgeConfig) -> str:
+def why_doubt(
+    tracked: PoseEstimate, predicted_T_cw: Tensor | None, track: TrackingState, settings: PoseValidationConfig
+) -> str:
     """Why a pose should not be built on, in words; empty when it may be.
 
     predicted_T_cw: (4, 4) where the camera was expected; None where nothing was
@@ -23,10 +25,10 @@ def why_doubt(tracked: Tracked, predicted_T_cw: Tensor | None, track: Track, set
     return why_unsound(tracked, predicted_T_cw, settings) or why_strange(tracked, track, settings)
 
 
-def why_unsound(tracked: Tracked, predicted_T_cw: Tensor | None, settings: JudgeConfig) -> str:
+def why_unsound(tracked: PoseEstimate, predicted_T_cw: Tensor | None, settings: PoseValidationConfig) -> str:
     """Why a pose is not even what its own matches say; empty when it is. Arguments as of `why_doubt`."""
     share = tracked.inliers / max(tracked.matches, 1)
-    if share < settings.min_inlier_share:
+    if share < settings.min_inlier_ratio:
         return f"only {share:.0%} of {tracked.matches} matches agree with the pose"
     position, rotation = deviations(tracked)
     if position > settings.max_position_std:
@@ -41,25 +43,25 @@ def why_unsound(tracked: Tracked, predicted_T_cw: Tensor | None, settings: Judge
     return ""
 
 
-def why_strange(tracked: Tracked, track: Track, settings: JudgeConfig) -> str:
+def why_strange(tracked: PoseEstimate, track: TrackingState, settings: PoseValidationConfig) -> str:
     """Why the images of late are not what the map leads to expect; empty when they are."""
-    if track.error > settings.max_error:
+    if track.error > settings.max_squared_error:
         return f"the matches of the last frames are off by {track.error**0.5:.1f} times their noise in the median"
-    if track.explained < settings.min_explained:
+    if track.explained < settings.min_explained_ratio:
         return f"the map explains only {track.explained:.0%} of the image"
-    if tracked.coverage < settings.min_coverage:
+    if tracked.coverage < settings.min_coverage_ratio:
         return f"only {tracked.coverage:.0%} of the image shows what the map expects there"
     return ""
 
 
-def deviations(tracked: Tracked) -> tuple[float, float]:
+def deviations(tracked: PoseEstimate) -> tuple[float, float]:
     """Standard deviations of the position, as a share of the depth of the scene, and of the rotation, in degrees."""
     variances = tracked.covariance.diagonal().tolist()
     position = max(sum(variances[:3]), 0.0) ** 0.5 / max(tracked.depth, 1e-12)
     return position, math.degrees(max(sum(variances[3:]), 0.0) ** 0.5)
 
 
-def jump(tracked: Tracked, predicted_T_cw: Tensor) -> tuple[float, float]:
+def jump(tracked: PoseEstimate, predicted_T_cw: Tensor) -> tuple[float, float]:
     """How far a pose is from where it was expected: in shares of the depth of the scene, and in degrees."""
     motion = tracked.T_cw @ se3_inverse(predicted_T_cw)
     moved = float(torch.linalg.vector_norm(motion[:3, 3])) / max(tracked.depth, 1e-12)

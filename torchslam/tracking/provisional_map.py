@@ -6,10 +6,10 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, epipolar_offsets, se3_inverse
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.matcher import Matcher, matched, matcher_of
-from torchslam.types import Start, View
+from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
+from torchslam.types import FrameFeatures, TwoViewMap
 
 INTERVAL = 5  # frames between two looks: within a few of them, a turning camera has left what it saw first
 # Of the support of the motion that two frames alone tell, what that of the map has at least. On 46 cuts of real
@@ -17,20 +17,20 @@ INTERVAL = 5  # frames between two looks: within a few of them, a turning camera
 LEAST_SUPPORT = 0.5
 
 
-class Youth:
+class ProvisionalMap:
     """A young world and the frames posed in it so far, which wait again if it is taken back."""
 
-    def __init__(self, world: World, views: list[View]) -> None:
+    def __init__(self, world: Submap, views: list[FrameFeatures]) -> None:
         self.world = world
         self.views = views
         self.age = 0  # frames tracked since the start
 
-    def grow(self, view: View) -> None:
+    def grow(self, view: FrameFeatures) -> None:
         """Another frame was posed."""
         self.views.append(view)
         self.age += 1
 
-    def rival(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> Start | None:
+    def rival(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> TwoViewMap | None:
         """A start by the first and the last frame alone, if it contradicts the map.
 
         The map keeps what agrees with it, so its own observations never contradict it: these two frames are matched
@@ -42,7 +42,7 @@ class Youth:
         threshold_px = config.initialization.threshold_px
         T_1w, T_2w = self.world.history.T_cw(self.world.map)[0], self.world.T_cw
         T_21 = T_2w @ se3_inverse(T_1w)
-        pairs = matched(matcher_of(config.matching, matcher), first, last)
+        pairs = run_matcher(make_matcher(config.matching, matcher), first, last)
         pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
         if support(*pixels, T_21, camera, threshold_px) >= LEAST_SUPPORT * len(pairs.first):
             return None  # no motion can have so much more

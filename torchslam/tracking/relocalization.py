@@ -10,15 +10,15 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
 from torchslam.tracking.correspondences import match_keyframe
-from torchslam.tracking.matcher import Pairs
+from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import why_doubt
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 
-Candidate = tuple[World, int]
+Candidate = tuple[Submap, int]
 """A keyframe, by world and row, that may show the same place."""
 
 
@@ -27,15 +27,17 @@ class Relocalizer:
 
     def __init__(self, tracker: Tracker, config: Config) -> None:
         self.tracker = tracker
-        self.judge = config.judge
-        self.tries = config.relocalization.tries
+        self.judge = config.pose_validation
+        self.tries = config.relocalization.max_candidates
 
-    def locate(self, view: View, candidates: Iterable[Candidate]) -> tuple[World, Tracked] | None:
+    def locate(
+        self, view: FrameFeatures, candidates: Iterable[Candidate]
+    ) -> tuple[Submap, PoseEstimate] | None:
         """The frame's pose against the first of the candidates that give one that is to be believed.
 
         Candidates beside one that failed are left out: they see the same.
         """
-        tried: list[tuple[World, Tensor]] = []
+        tried: list[tuple[Submap, Tensor]] = []
         for world, keyframe in candidates:
             if len(tried) == self.tries:
                 return None
@@ -55,10 +57,10 @@ class Relocalizer:
         near = slam_map.covisible(keyframe, self.tracker.settings.local_keyframes)
         return torch.cat([near.new_tensor([keyframe]), near])
 
-    def _matches(self, slam_map: Map, keyframe: int, view: View) -> Iterator[Pairs]:
+    def _matches(self, slam_map: Map, keyframe: int, view: FrameFeatures) -> Iterator[MatchIndices]:
         yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
 
 
-def alone(track: Track, tracked: Tracked) -> Track:
+def alone(track: TrackingState, tracked: PoseEstimate) -> TrackingState:
     """What there is to judge a frame by that no others came before: itself."""
     return replace(track, error=tracked.error, explained=tracked.explained)

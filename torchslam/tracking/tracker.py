@@ -15,12 +15,12 @@ from torchslam.geometry import (
 )
 from torchslam.geometry.motion import reorthonormalized
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.map.tracking_state import Track
+from torchslam.map.submap import Submap
+from torchslam.map.tracking_state import TrackingState
 from torchslam.tracking.correspondences import match_near, match_points
 from torchslam.tracking.localizer import Localizer
-from torchslam.tracking.matcher import Matcher, Pairs, matcher_of
-from torchslam.types import Tracked, View
+from torchslam.tracking.matcher import Matcher, MatchIndices, make_matcher
+from torchslam.types import FrameFeatures, PoseEstimate
 
 MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
 
@@ -37,13 +37,13 @@ class Tracker:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.localizer = Localizer(camera, config)
-        self.matcher = matcher_of(config.matching, matcher)
+        self.matcher = make_matcher(config.matching, matcher)
         self.settings = config.tracking
         self.matching = config.matching
 
     # --- the track -------------------------------------------------------------------------------------------
 
-    def follow(self, world: World, keyframe: int) -> None:
+    def follow(self, world: Submap, keyframe: int) -> None:
         """Go on from a keyframe: the last frame is at its place."""
         T_cw = world.map.T_cw[keyframe]
         seen = world.map.keyframes["point_ids"][keyframe]
@@ -55,19 +55,19 @@ class Tracker:
             explained=world.track.explained,
         )
 
-    def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> Track:
+    def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
         """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
         near = slam_map.covisible(keyframe, self.settings.local_keyframes)
         local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
         recent = self.settings.recent_frames if self.counts else 0
         if recent:
-            last_seen = slam_map.points["last_seen"]
-            local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["alive"])[
+            last_seen = slam_map.points["last_seen_frame"]
+            local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["is_valid"])[
                 :, 0
             ]
         else:
             local_points = slam_map.points_seen_by(local_keyframes)
-        return Track(
+        return TrackingState(
             T_cr=T_cw @ se3_inverse(slam_map.T_cw[keyframe]),
             reference=keyframe,
             reference_size=well_observed(slam_map, keyframe, local_keyframes),
@@ -77,15 +77,15 @@ class Tracker:
             local_points=local_points,
         )
 
-    def predict(self, world: World) -> Tensor:
+    def predict(self, world: Submap) -> Tensor:
         """(4, 4) where the next frame should be: constant velocity."""
-        if world.track.velocity is None or not self.settings.predict:
+        if world.track.velocity is None or not self.settings.motion_model:
             return world.T_cw
         return reorthonormalized(world.track.velocity @ world.T_cw)
 
     # --- one frame -------------------------------------------------------------------------------------------
 
-    def track(self, world: World, view: View, is_sure: bool = True) -> Tracked | None:
+    def track(self, world: Submap, view: FrameFeatures, is_sure: bool = True) -> PoseEstimate | None:
         """Locate the frame that comes after the last one; None when it cannot be located.
 
         is_sure: the last frames are believed, so that the pose is looked for next to where they lead
@@ -101,22 +101,22 @@ class Tracker:
         self.accept(world, view, tracked)
         return tracked
 
-    def _candidates(self, world: World, view: View, T_cw: Tensor) -> Iterator[Pairs]:
+    def _candidates(self, world: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
         slam_map, track, settings = world.map, world.track, self.settings
-        if settings.guided:
-            alive = track.seen_last[slam_map.points["alive"][track.seen_last]]
+        if settings.guided_matching:
+            alive = track.seen_last[slam_map.points["is_valid"][track.seen_last]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_near(slam_map, near, view, settings.radius_px, self.matcher, ratio=0.9)
+            yield match_near(slam_map, near, view, settings.search_radius_px, self.matcher, ratio=0.9)
             local = self.localizer.project(slam_map, track.local_points, T_cw, view)
-            wide = settings.radius_px * settings.wide_radius_factor
+            wide = settings.search_radius_px * settings.wide_radius_factor
             yield match_near(slam_map, local, view, wide, self.matcher, ratio=0.9)
         else:
             local = self.localizer.project(slam_map, track.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
         yield match_points(slam_map, track.local_points, view, self.matching)
 
-    def accept(self, world: World, view: View, tracked: Tracked) -> None:
+    def accept(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
         """Take a frame over into the track: velocity, reference keyframe, counters of the points."""
         slam_map, track = world.map, world.track
         track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
@@ -137,7 +137,7 @@ class Tracker:
                 explained=track.explained,
             )
 
-    def start_at(self, world: World, view: View, tracked: Tracked) -> None:
+    def start_at(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
         """Begin a track anew, wherever in the map: at a frame that was located without one."""
         best = int(world.map.observers(tracked.point_ids).argmax())
         self._count(world.map, view, tracked)
@@ -145,21 +145,21 @@ class Tracker:
             self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
         )
 
-    def expect(self, slam_map: Map, tracked: Tracked) -> None:
+    def expect(self, slam_map: Map, tracked: PoseEstimate) -> None:
         """A frame is believed: the points that it should see were there to be seen."""
         if self.counts:
             expected = tracked.point_ids if tracked.expected is None else tracked.expected
             slam_map.points["times_visible"][expected] += 1
 
-    def vouch(self, slam_map: Map, tracked: Tracked) -> None:
+    def vouch(self, slam_map: Map, tracked: PoseEstimate) -> None:
         """A frame is believed: it speaks for the points that it saw."""
         if self.counts:
             slam_map.points["times_found"][tracked.point_ids] += 1
 
-    def _count(self, slam_map: Map, view: View, tracked: Tracked) -> None:
+    def _count(self, slam_map: Map, view: FrameFeatures, tracked: PoseEstimate) -> None:
         """The points that a frame saw remember when that was."""
         if self.counts:
-            slam_map.points["last_seen"][tracked.point_ids] = view.index
+            slam_map.points["last_seen_frame"][tracked.point_ids] = view.index
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:

@@ -1,4 +1,4 @@
-"""What to say when a library is not installed that pip would have installed, but for somebody's wish."""
+"""Error message for a required library that was deliberately not installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long the stages of a frame take."""
+"""Timing of the stages of a frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up milliseconds per stage; stages do not nest, but in the one that has the rest."""
+    """Milliseconds per stage. Stages must not nest, except inside `rest`."""
 
     def __init__(self) -> None:
         self.ms: dict[str, float] = {}

@@ -16,7 +16,7 @@ import torch
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.formats.trajectory_file import write_trajectory
-from torchslam.parallel.workers import helped
+from torchslam.parallel.workers import with_workers
 from torchslam.system.run import run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
@@ -39,7 +39,7 @@ def main() -> None:
         ends.append(time.perf_counter())
 
     start_up, begin = cpu_seconds(), time.perf_counter()
-    with helped(sequence, slam, arguments.processes) as frames:
+    with with_workers(sequence, slam, arguments.processes) as frames:
         finished = run_sequence(slam, sequence, after_frame, frames=frames)
     write_trajectory(arguments.trajectory, finished.trajectory)
     totals = torch.tensor([result.stage_ms["total"] for result in finished.results])

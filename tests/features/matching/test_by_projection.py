@@ -9,16 +9,16 @@ import torch
 
 from torchslam.features import match_projected
 from torchslam.features.matching.by_projection import match_within
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 
-def view_of(count: int, seed: int, words: int = 8) -> View:
+def view_of(count: int, seed: int, words: int = 8) -> FrameFeatures:
     """Keypoints all over, few distinct descriptors and scales: ties and rivals everywhere."""
     generator = torch.Generator().manual_seed(seed)
     codes = torch.randint(0, 256, (words, 32), generator=generator, dtype=torch.uint8)
     descriptors = codes[torch.randint(0, words, (count,), generator=generator)]
     flips = torch.randint(0, 2, (count, 32), generator=generator, dtype=torch.uint8)
-    return View(
+    return FrameFeatures(
         0,
         0.0,
         keypoints=torch.rand(count, 2, generator=generator, dtype=torch.float64) * 200 - 5,

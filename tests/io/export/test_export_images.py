@@ -110,15 +110,15 @@ def test_a_video_has_colours_at_every_frame(seen: Scene, tmp_path: Path) -> None
 
 def test_a_rendered_sequence_is_grey_three_times() -> None:
     sequence = open_sequence("synthetic:room?frames=2&blank=1").part(1)
-    assert sequence.colour(0).shape == (480, 640, 3)
-    assert sequence.colour(0).unique().tolist() == [128]
+    assert sequence.color(0).shape == (480, 640, 3)
+    assert sequence.color(0).unique().tolist() == [128]
 
 
 def test_a_damaged_image_is_a_frame_error(seen: Scene, folder: Path) -> None:
     sequence = open_sequence(folder, seen.camera)
     (folder / "rgb" / "3.png").write_bytes(b"not an image")
     with pytest.raises(FrameError, match=r"rgb\.txt:4"):
-        sequence.colour(3)
+        sequence.color(3)
     cv2.imwrite(str(folder / "rgb" / "4.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(FrameError, match="10x10"):
-        sequence.colour(4)
+        sequence.color(4)

@@ -10,8 +10,8 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, so3_exp
 from torchslam.io.export.scene import Scene, scene_of
 from torchslam.map.map import Map
-from torchslam.map.submap import World
-from torchslam.types import Tracked
+from torchslam.map.submap import Submap
+from torchslam.types import PoseEstimate
 
 
 def test_errors_are_those_of_the_points(scene: Scene) -> None:
@@ -33,7 +33,7 @@ def facing(slam_map: Map) -> None:
     slam_map.keyframes["T_cw"][:, 2, 3] = 20.0
 
 
-def test_keyframes_and_their_observations(world: World, camera: Camera) -> None:
+def test_keyframes_and_their_observations(world: Submap, camera: Camera) -> None:
     facing(world.map)
     world.map.points["colors"][:] = torch.arange(len(world.map.points))[:, None].to(torch.uint8)
     made = scene_of(world, camera, 0, keyframes_alone=True)
@@ -50,7 +50,7 @@ def test_keyframes_and_their_observations(world: World, camera: Camera) -> None:
     assert torch.equal(twice[made.point_index], seen.point_index[kept])
 
 
-def test_points_behind_a_camera_are_not_seen_by_it(world: World, camera: Camera) -> None:
+def test_points_behind_a_camera_are_not_seen_by_it(world: Submap, camera: Camera) -> None:
     facing(world.map)
     before = scene_of(world, camera, 0, keyframes_alone=True)
     point = int(torch.nonzero(world.map.points["times_observed"] >= 2)[0, 0])
@@ -60,7 +60,7 @@ def test_points_behind_a_camera_are_not_seen_by_it(world: World, camera: Camera)
     assert torch.isfinite(after.errors()).all()
 
 
-def test_all_frames_come_in_order_of_time(world: World, camera: Camera) -> None:
+def test_all_frames_come_in_order_of_time(world: Submap, camera: Camera) -> None:
     facing(world.map)
     made = scene_of(world, camera, 0, keyframes_alone=False)
     assert bool((made.timestamps.diff() > 0).all())
@@ -71,7 +71,7 @@ def test_all_frames_come_in_order_of_time(world: World, camera: Camera) -> None:
     torch.testing.assert_close(made.T_cw[made.is_keyframe], world.map.T_cw)
 
 
-def test_rows_of_the_map_may_stand_in_any_order(world: World, camera: Camera) -> None:
+def test_rows_of_the_map_may_stand_in_any_order(world: Submap, camera: Camera) -> None:
     """Keyframes that were found on the way back come later in the map."""
     facing(world.map)
     before = scene_of(world, camera, 0, keyframes_alone=True)
@@ -82,12 +82,12 @@ def test_rows_of_the_map_may_stand_in_any_order(world: World, camera: Camera) ->
         assert torch.equal(getattr(after, name), getattr(before, name)), name
 
 
-def test_frames_between_bring_their_observations(world: World, camera: Camera) -> None:
+def test_frames_between_bring_their_observations(world: Submap, camera: Camera) -> None:
     facing(world.map)
     point = torch.nonzero(world.map.points["times_observed"] >= 2)[:1, 0]
     view = replace(world.map.view(0), index=29, timestamp=200.0)
     eye = torch.eye(4, dtype=torch.float64)
-    tracked = Tracked(eye, point, torch.tensor([7]), 1, torch.eye(6), 1.0)
+    tracked = PoseEstimate(eye, point, torch.tensor([7]), 1, torch.eye(6), 1.0)
     world.history.add(view, tracked, eye, 0)
     made = scene_of(world, camera, 0, keyframes_alone=False)
     assert torch.equal(made.pixels[-1], view.keypoints[7])
@@ -95,11 +95,11 @@ def test_frames_between_bring_their_observations(world: World, camera: Camera) -
     assert made.frame_index[-1] == len(made.T_cw) - 1
 
 
-def test_other_sessions_have_no_part(world: World, camera: Camera) -> None:
+def test_other_sessions_have_no_part(world: Submap, camera: Camera) -> None:
     facing(world.map)
     world.map.keyframes["session"][3:] = 1
     assert len(scene_of(world, camera, 1, keyframes_alone=True).T_cw) == 3
     with pytest.raises(ResultsError, match="world 0 holds no frames of this run"):
         scene_of(world, camera, 2, keyframes_alone=True)
     with pytest.raises(ResultsError, match="world 4 is empty"):
-        scene_of(World.empty(4, world.map.T_cw), camera, 0, keyframes_alone=True)
+        scene_of(Submap.empty(4, world.map.T_cw), camera, 0, keyframes_alone=True)

@@ -62,7 +62,7 @@ def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
     slam_map.points["colors"][:] = torch.arange(len(slam_map.points))[:, None].to(torch.uint8)
     slam_map.keyframes["session"][4:] = 1
     write_map_cloud(tmp_path / "map.ply", slam_map, session=0)
-    vertices, alive = read(tmp_path / "map.ply"), slam_map.living_points()
+    vertices, alive = read(tmp_path / "map.ply"), slam_map.valid_points()
     points, cameras = vertices[: len(alive)], vertices[len(alive) :]
     assert points["red"].tolist() == alive.tolist()
     assert points["observations"].tolist() == slam_map.points["times_observed"][alive].tolist()
@@ -71,7 +71,7 @@ def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
     )  # y points down in the small run
     for names, expected in (
         (("x", "y", "z"), slam_map.positions_w[alive]),
-        (("nx", "ny", "nz"), -slam_map.points["normals_w"][alive]),
+        (("nx", "ny", "nz"), -slam_map.points["view_directions_w"][alive]),
     ):
         np.testing.assert_allclose(columns(points, *names), expected @ R.mT, atol=1e-5)
     centres_w = se3_inverse(slam_map.T_cw)[:4, :3, 3]

@@ -18,7 +18,15 @@ from torchslam.cli.main import main
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.undistortion import pinhole_within
-from torchslam.io.viewer.frames import BAR, Film, Glimpse, LiveView, Watching, film_of, tracked_pixels
+from torchslam.io.viewer.frames import (
+    BAR,
+    Film,
+    FrameSnapshot,
+    FrameViewers,
+    LiveView,
+    film_of,
+    tracked_pixels,
+)
 from torchslam.types import State, StepResult
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
@@ -43,11 +51,11 @@ class Kept:
     """A screen that keeps what it is shown, with the pose of the frame and its pixels by the map of then."""
 
     def __init__(self) -> None:
-        self.glimpses: list[Glimpse] = []
+        self.glimpses: list[FrameSnapshot] = []
         self.runs: list[Run] = []
         self.closed = 0
 
-    def show(self, glimpse: Glimpse) -> None:
+    def show(self, glimpse: FrameSnapshot) -> None:
         self.glimpses.append(glimpse)
 
     def end(self, run: Run) -> None:
@@ -58,7 +66,7 @@ class Kept:
 
 
 def watched(slam: SLAM, walk: Walk, *screens: Kept | LiveView | Film) -> Run:
-    with Watching(slam, walk, list(screens)) as watching:
+    with FrameViewers(slam, walk, list(screens)) as watching:
         run = slam.run(watching.sequence, watching.show)
         watching.end(run)
     return run
@@ -84,7 +92,7 @@ def test_screens_see_every_frame_once() -> None:
 def test_without_screens_the_sequence_is_run_as_it_is() -> None:
     walk = Pictured()
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
-    with Watching(slam, walk, []) as watching:
+    with FrameViewers(slam, walk, []) as watching:
         assert watching.sequence is walk
         watching.show(StepResult(0, 0.0, State.LOST, None))
 
@@ -124,7 +132,7 @@ def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, dist
     given = torch.stack([result.T_cw for result in posed if result.T_cw is not None])
     np.testing.assert_allclose(centres, se3_inverse(given)[:, :3, 3].numpy(), atol=1e-6)
     ((_, points),) = rows["/world/points", "Points3D:positions"][-1:]
-    ids = run.map.living_points()
+    ids = run.map.valid_points()
     np.testing.assert_allclose(np.array(points), run.map.positions_w[ids].numpy(), atol=1e-5)
     frame, keypoints = rows["/world/camera/keypoints", "Points2D:positions"][-1]
     T_cw = run.results[frame].T_cw
@@ -188,7 +196,7 @@ def frames_of(path: Path) -> list[np.ndarray]:
 def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> None:
     grey = np.full((120, 1920), GREY, np.uint8)
     result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
-    glimpse = Glimpse(result, grey, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
+    glimpse = FrameSnapshot(result, grey, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
     film = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
     for shown in (glimpse, replace(glimpse, tracked=torch.zeros(0, 2))):
         film.show(shown)

@@ -68,7 +68,7 @@ def test_the_page_holds_the_map_and_the_path(kept: Results) -> None:
     (world,) = data["worlds"]
     S = torch.tensor(world["S_shown_map"], dtype=torch.float64)
     assert torch.linalg.det(S[:3, :3]) == pytest.approx(1.0)
-    ids = kept.map.living_points()
+    ids = kept.map.valid_points()
     points = transform(S, kept.map.positions_w[ids]).numpy()
     np.testing.assert_allclose(array(world["points"], 3), points, atol=1e-5)
     np.testing.assert_array_equal(array(world["colors"], 3), kept.map.points["colors"][ids].numpy())

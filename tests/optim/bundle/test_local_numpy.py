@@ -1,4 +1,4 @@
-"""The lean adjustment of a window, against `bundle_adjust`, which takes the long way."""
+"""The NumPy local bundle adjustment against `bundle_adjust`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from torch import Tensor
 
 from torchslam.geometry import se3_inverse, se3_log
 from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.optim.bundle.local_numpy import Adjusted, adjust_window
+from torchslam.optim.bundle.local_numpy import LocalBundleSolution, adjust_local_bundle
 
 SCALE = 2.0  # of the kernel
 
 
 def both(
     problem: BundleProblem, iterations: int = 30, tolerance: float = 1e-10
-) -> tuple[Adjusted, BundleSolution]:
+) -> tuple[LocalBundleSolution, BundleSolution]:
     wanted = bundle_adjust(
         problem, "huber", SCALE, backward="detached", iterations=iterations, tolerance=tolerance, check=False
     )
-    return adjust_window(problem, SCALE, iterations, tolerance), wanted
+    return adjust_local_bundle(problem, SCALE, iterations, tolerance), wanted
 
 
 def astray(problem: BundleProblem, every: int = 9) -> BundleProblem:
@@ -42,7 +42,7 @@ def weights_of(problem: BundleProblem, kind: str) -> Tensor | None:
     return root.mT @ root
 
 
-def assert_same(found: Adjusted, wanted: BundleSolution, atol: float = 1e-8) -> None:
+def assert_same(found: LocalBundleSolution, wanted: BundleSolution, atol: float = 1e-8) -> None:
     torch.testing.assert_close(found.T_cw, wanted.T_cw, rtol=0, atol=atol)
     torch.testing.assert_close(found.points_w, wanted.points_w, rtol=0, atol=10 * atol)
     assert found.cost == pytest.approx(float(wanted.cost), rel=1e-6)
@@ -138,14 +138,14 @@ def test_the_order_of_what_is_given_does_not_matter(bundle_scene) -> None:
         point_index=problem.point_index[order],
         pixels=problem.pixels[order],
     )
-    one, other = (adjust_window(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
+    one, other = (adjust_local_bundle(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
     torch.testing.assert_close(one.T_cw, other.T_cw, rtol=0, atol=1e-10)
     torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
 
 
 def test_exact_observations_leave_nothing(bundle_scene) -> None:
     scene = bundle_scene(noise=0.0)
-    found = adjust_window(scene.problem, SCALE, 20, 1e-8)
+    found = adjust_local_bundle(scene.problem, SCALE, 20, 1e-8)
     assert found.cost < 1e-12
     torch.testing.assert_close(found.T_cw, scene.T_cw, rtol=0, atol=1e-7)
 
@@ -157,7 +157,7 @@ def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong)
     index = getattr(problem, name).clone()
     index[3] = wrong
     with pytest.raises(ValueError, match=rf"{name} must lie in 0 \.\.\. {size - 1}"):
-        adjust_window(replace(problem, **{name: index}), SCALE, 1, 1e-6)
+        adjust_local_bundle(replace(problem, **{name: index}), SCALE, 1, 1e-6)
 
 
 @pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
@@ -169,8 +169,10 @@ def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
         problem = replace(problem, T_cw=problem.T_cw[None])
     else:
         problem = replace(problem, **{name: given[name]})
-    with pytest.raises(ValueError, match=r"a window is one problem, without .*: use bundle_adjust"):
-        adjust_window(problem, SCALE, 1, 1e-6)
+    with pytest.raises(
+        ValueError, match=r"a local bundle adjustment takes one problem without .*: use bundle_adjust"
+    ):
+        adjust_local_bundle(problem, SCALE, 1, 1e-6)
 
 
 def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
@@ -183,7 +185,7 @@ def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
         problem.camera.to(torch.float32).to(device),
         fixed_frames=torch.tensor([0, 1], device=device),
     )
-    found, exact = adjust_window(single, SCALE, 10, 1e-6), adjust_window(problem, SCALE, 10, 1e-6)
+    found, exact = adjust_local_bundle(single, SCALE, 10, 1e-6), adjust_local_bundle(problem, SCALE, 10, 1e-6)
     assert found.T_cw.dtype == found.points_w.dtype == torch.float32
     assert found.T_cw.device.type == device.type
     torch.testing.assert_close(found.T_cw.cpu().double(), exact.T_cw, rtol=0, atol=1e-4)

@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Noise, Undistorted, se3_exp, se3_inverse, se3_log
+from torchslam.geometry import KeypointNoise, UndistortedKeypoints, se3_exp, se3_inverse, se3_log
 from torchslam.optim import refine_pose
 from torchslam.optim.pose.frame_pose import SCALE, FrameProblem
 
 
-def problem_of(scene, noise: Noise | None = None) -> FrameProblem:
+def problem_of(scene, noise: KeypointNoise | None = None) -> FrameProblem:
     pixels = scene.pixels[0]
-    noise = noise or Noise.of(torch.ones_like(pixels[:, 0]), None)
-    undistorted = Undistorted.of(pixels, scene.camera)
+    noise = noise or KeypointNoise.of(torch.ones_like(pixels[:, 0]), None)
+    undistorted = UndistortedKeypoints.of(pixels, scene.camera)
     return FrameProblem(scene.points_w[0], undistorted.xy, undistorted.whitened(noise))
 
 
@@ -26,7 +26,7 @@ def apart(T_cw: Tensor, other: Tensor) -> Tensor:
 def test_it_finds_what_refine_pose_finds(pose_scene, kernel, model):
     far = 0.2 if model == "pinhole" else 0.0  # the first order of a distortion says nothing so far away
     scene = pose_scene(batch=1, count=200, outliers=far, model=model, perturbation=0.01)
-    noise = Noise.of(1 + torch.arange(200).double() % 3, None)
+    noise = KeypointNoise.of(1 + torch.arange(200).double() % 3, None)
     weights = torch.where(torch.arange(200) % 4 == 0, 0.5, 1.0).double()
     mask = torch.arange(200) % 7 != 0
     wanted = refine_pose(
@@ -40,7 +40,7 @@ def test_it_finds_what_refine_pose_finds(pose_scene, kernel, model):
         scale=SCALE,
     )
     problem = problem_of(scene, noise)
-    found = problem.minimize(problem.see(scene.start[0]), weights * mask, kernel)
+    found = problem.minimize(problem.linearize(scene.start[0]), weights * mask, kernel)
     assert found.success
     off, sigma = apart(found.T_cw, wanted.T_cw[0]), wanted.covariance[0].diagonal().sqrt()
     assert (off.abs() < 0.05 * sigma).all()
@@ -51,23 +51,23 @@ def test_it_finds_what_refine_pose_finds(pose_scene, kernel, model):
 
 def test_errors_and_depths_are_those_at_the_pose(pose_scene):
     scene = pose_scene(batch=1, outliers=0.2)
-    noise = Noise.of(torch.full((40,), 2.0).double(), None)
-    sighting = problem_of(scene, noise).see(scene.T_cw[0])
+    noise = KeypointNoise.of(torch.full((40,), 2.0).double(), None)
+    linearization = problem_of(scene, noise).linearize(scene.T_cw[0])
     points_c = scene.points_w[0] @ scene.T_cw[0, :3, :3].mT + scene.T_cw[0, :3, 3]
     wanted = noise.squared_reprojection(points_c, scene.pixels[0], scene.camera)
-    torch.testing.assert_close(sighting.squared, wanted)
-    torch.testing.assert_close(sighting.depths, points_c[:, 2])
-    assert torch.equal(sighting.T_cw, scene.T_cw[0])
+    torch.testing.assert_close(linearization.squared, wanted)
+    torch.testing.assert_close(linearization.depths, points_c[:, 2])
+    assert torch.equal(linearization.T_cw, scene.T_cw[0])
 
 
 def test_the_rows_are_the_derivatives_of_the_errors(pose_scene, model):
     scene = pose_scene(batch=1, model=model)
     problem, step = problem_of(scene), 1e-6
-    rows = torch.from_numpy(problem.see(scene.T_cw[0]).rows)
+    rows = torch.from_numpy(problem.linearize(scene.T_cw[0]).rows)
     for axis in range(6):
         xi = torch.zeros(6, dtype=torch.float64)
         xi[axis] = step
-        ahead, behind = (problem.see(se3_exp(sign * xi) @ scene.T_cw[0]).rows[6] for sign in (1, -1))
+        ahead, behind = (problem.linearize(se3_exp(sign * xi) @ scene.T_cw[0]).rows[6] for sign in (1, -1))
         slope = torch.from_numpy((ahead - behind) / (2 * step))
         torch.testing.assert_close(slope, rows[axis], rtol=1e-5, atol=1e-3)
 
@@ -79,9 +79,9 @@ def test_points_behind_the_camera_fit_nothing_and_pull_nowhere(pose_scene):
         scene.points_w[0, :5] - se3_inverse(scene.T_cw[0])[:3, 3]
     )
     problem = problem_of(scene._replace(points_w=points_w))
-    sighting = problem.see(scene.start[0])
-    assert (sighting.squared[:5] > 1e12).all()
-    found = problem.minimize(sighting, (sighting.squared < 1e12).double(), "cauchy")
+    linearization = problem.linearize(scene.start[0])
+    assert (linearization.squared[:5] > 1e12).all()
+    found = problem.minimize(linearization, (linearization.squared < 1e12).double(), "cauchy")
     assert apart(found.T_cw, scene.T_cw[0]).norm() < 1e-6
 
 
@@ -89,7 +89,7 @@ def test_points_behind_the_camera_fit_nothing_and_pull_nowhere(pose_scene):
 def test_too_few_points_leave_the_pose_where_it_is(pose_scene, usable):
     scene = pose_scene(batch=1)
     problem = problem_of(scene)
-    found = problem.minimize(problem.see(scene.start[0]), (torch.arange(40) < usable).double(), "huber")
+    found = problem.minimize(problem.linearize(scene.start[0]), (torch.arange(40) < usable).double(), "huber")
     assert not found.success
     assert torch.equal(found.T_cw, scene.start[0])
     assert not found.covariance().any()
@@ -101,8 +101,8 @@ def test_single_precision_is_kept(pose_scene):
         points_w=scene.points_w.float(), pixels=scene.pixels.float(), camera=scene.camera.to(torch.float32)
     )
     problem = problem_of(single)
-    found = problem.minimize(problem.see(scene.start[0].float()), torch.ones(40), "cauchy")
+    found = problem.minimize(problem.linearize(scene.start[0].float()), torch.ones(40), "cauchy")
     assert found.T_cw.dtype == found.covariance().dtype == torch.float32
     exact = problem_of(scene)
-    wanted = exact.minimize(exact.see(scene.start[0]), torch.ones(40).double(), "cauchy")
+    wanted = exact.minimize(exact.linearize(scene.start[0]), torch.ones(40).double(), "cauchy")
     assert apart(found.T_cw.double(), wanted.T_cw).norm() < 1e-4

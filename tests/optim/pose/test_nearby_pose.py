@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Undistorted, se3_exp, se3_inverse, se3_log
-from torchslam.optim.pose.nearby_pose import MAJORITY, nearby_pose
+from torchslam.geometry import UndistortedKeypoints, se3_exp, se3_inverse, se3_log
+from torchslam.optim.pose.frame_pose import MIN_AGREEING, nearby_pose
 
 THRESHOLD = 3.0  # pixels
 
 
 def found(scene, expected: Tensor) -> Tensor | None:
-    undistorted = Undistorted.of(scene.pixels[0], scene.camera)
+    undistorted = UndistortedKeypoints.of(scene.pixels[0], scene.camera)
     return nearby_pose(expected, scene.points_w[0], undistorted, THRESHOLD)
 
 
@@ -36,7 +36,7 @@ def test_what_is_wrong_does_not_move_it(pose_scene, share):
 @pytest.mark.parametrize(("wrong", "is_found"), [(24, True), (26, False)])
 def test_a_majority_must_agree(pose_scene, wrong, is_found):
     scene = pose_scene(batch=1, count=100)
-    assert MAJORITY == 0.75
+    assert MIN_AGREEING == 0.75
     scene.pixels[0, :wrong] += 40.0 * torch.linspace(-1, 1, 2 * wrong).view(wrong, 2).sign().double()
     assert (found(scene, scene.T_cw[0]) is not None) is is_found
 
@@ -64,6 +64,6 @@ def test_points_on_a_line_determine_no_pose(pose_scene):
     along = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
     points = torch.tensor([-1.0, 0.3, 4.0]).double() + along * torch.tensor([2.0, -0.4, 1.0]).double()
     pixels, _ = scene.camera.project(points)
-    undistorted = Undistorted.of(pixels, scene.camera)
+    undistorted = UndistortedKeypoints.of(pixels, scene.camera)
     eye = torch.eye(4, dtype=torch.float64)
     assert nearby_pose(eye, points, undistorted, THRESHOLD) is None

@@ -13,11 +13,11 @@ from tests.scene import CAMERA, Scene, pose
 from torchslam.config import IndependentMotionConfig, MatchingConfig
 from torchslam.geometry import se3_inverse
 from torchslam.tracking.dynamic.independent_motion import IndependentMotion, Movement
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(200)
 NEAR = Scene.of(60, seed=1, depth=2.0, width=0.8)  # a thing: a sixth of the image's width
-EVERY = IndependentMotionConfig().frames
+EVERY = IndependentMotionConfig().frame_interval
 DEPTH = 4.0
 
 
@@ -31,13 +31,13 @@ def thing_at(index: int, speed: float) -> Tensor:
     return pose(-0.4, -0.3 + speed * index, 0)
 
 
-def joined(one: View, other: View) -> View:
+def joined(one: FrameFeatures, other: FrameFeatures) -> FrameFeatures:
     """The keypoints of both."""
     columns = ("keypoints", "scales", "angles", "descriptors", "mask")
     return replace(one, **{name: torch.cat([getattr(one, name), getattr(other, name)]) for name in columns})
 
 
-def frame(index: int, speed: float = 0.03, thing: Scene = NEAR, scene: Scene = SCENE) -> View:
+def frame(index: int, speed: float = 0.03, thing: Scene = NEAR, scene: Scene = SCENE) -> FrameFeatures:
     """The scene first, then the thing before it, which moves by `speed` a frame."""
     T_cw = camera_at(index)
     behind, before = scene.view(index, T_cw), thing.view(index, T_cw @ thing_at(index, speed))
@@ -46,12 +46,12 @@ def frame(index: int, speed: float = 0.03, thing: Scene = NEAR, scene: Scene = S
     return joined(replace(behind, mask=behind.mask & ~hidden), before)
 
 
-def is_thing(view: View, scene: Scene = SCENE) -> Tensor:
+def is_thing(view: FrameFeatures, scene: Scene = SCENE) -> Tensor:
     return torch.arange(len(view.mask)) >= len(scene)
 
 
-def tracked(view: View, T_cw: Tensor, keypoints: Tensor) -> Tracked:
-    return Tracked(T_cw, keypoints, keypoints, len(keypoints), torch.eye(6).double(), DEPTH)
+def tracked(view: FrameFeatures, T_cw: Tensor, keypoints: Tensor) -> PoseEstimate:
+    return PoseEstimate(T_cw, keypoints, keypoints, len(keypoints), torch.eye(6).double(), DEPTH)
 
 
 def watcher(**settings: float) -> IndependentMotion:
@@ -59,8 +59,8 @@ def watcher(**settings: float) -> IndependentMotion:
 
 
 def watched(
-    by: IndependentMotion, views: list[View], T_cw: Tensor | None = None
-) -> Iterator[tuple[View, View, Movement]]:
+    by: IndependentMotion, views: list[FrameFeatures], T_cw: Tensor | None = None
+) -> Iterator[tuple[FrameFeatures, FrameFeatures, Movement]]:
     """Each view, what is left of it, and what is said; the scene is what agrees with the pose."""
     for view in views:
         cleared = by.clear_of(view)
@@ -146,7 +146,7 @@ def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
 
 def test_it_is_given_up_when_it_was_not_seen_to_move_for_long() -> None:
     for limit, kept in ((2, False), (100, True)):
-        by = watcher(max_unseen=limit)
+        by = watcher(max_unseen_frames=limit)
         *_, _ = watched(by, [frame(index) for index in range(EVERY + 1)])
         for index in range(EVERY + 1, EVERY + 4):
             cleared = by.clear_of(frame(index))
@@ -193,7 +193,7 @@ def test_where_most_of_the_image_moves_the_pose_is_doubted() -> None:
     assert not said.is_doubt
     cell = torch.nonzero(view.mask & ~is_thing(view))[:1, 0]  # one keypoint agrees with the map
     assert by.observe(view, tracked(view, camera_at(view.index), cell)).is_doubt
-    assert not watcher(max_share=100.0).observe(view, tracked(view, camera_at(0), cell)).is_doubt
+    assert not watcher(max_area_ratio=100.0).observe(view, tracked(view, camera_at(0), cell)).is_doubt
 
 
 def test_poses_of_two_worlds_are_not_compared() -> None:

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways
-from torchslam.config import MatchingConfig, StillnessConfig
-from torchslam.tracking.dynamic.static_overlay import Stillness, distances_to_segments
-from torchslam.types import View
+from torchslam.config import MatchingConfig, StaticOverlayConfig
+from torchslam.tracking.dynamic.static_overlay import StaticOverlayDetector, distances_to_segments
+from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(200)
 LOGO = 12  # keypoints of it
@@ -23,7 +23,9 @@ def turning(count: int, step: float = STEP) -> Tensor:
     return torch.stack([pose(0.1 * index, 0, 0, 0, step * index) for index in range(count)])
 
 
-def with_logo(view: View, keypoints: int = LOGO, spread: float = 9.0, shift: float = 0.0) -> View:
+def with_logo(
+    view: FrameFeatures, keypoints: int = LOGO, spread: float = 9.0, shift: float = 0.0
+) -> FrameFeatures:
     """The view with the keypoints of a logo in its lower right instead of its last ones."""
     x = torch.arange(keypoints, dtype=torch.float64)
     pixels = torch.stack([270 + spread * (x % 4) + shift, 190 + spread * (x // 4)], -1)
@@ -42,11 +44,11 @@ def with_logo(view: View, keypoints: int = LOGO, spread: float = 9.0, shift: flo
     )
 
 
-def stillness(**changes: float) -> Stillness:
-    return Stillness(CAMERA, replace(StillnessConfig(), **changes), MatchingConfig())
+def stillness(**changes: float) -> StaticOverlayDetector:
+    return StaticOverlayDetector(CAMERA, replace(StaticOverlayConfig(), **changes), MatchingConfig())
 
 
-def observed(by: Stillness, T_cw: Tensor, *, logo: bool = True, **options: float) -> list[int]:
+def observed(by: StaticOverlayDetector, T_cw: Tensor, *, logo: bool = True, **options: float) -> list[int]:
     """What each frame of a way makes known."""
     views = [SCENE.view(index, T) for index, T in enumerate(T_cw)]
     shown = [with_logo(view, **options) if logo else view for view in views]  # type: ignore[arg-type]

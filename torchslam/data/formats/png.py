@@ -14,7 +14,7 @@ CHUNK_FRAME = 12
 """Bytes of a chunk around its content: length, name, sum."""
 PLAIN = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
 """Chunks before the pixels that change none of them. Others (of gamma, transparency, animation) are left to OpenCV."""
-GREY, COLOUR = 0, 2  # colour types of a PNG
+GRAY, COLOR = 0, 2  # colour types of a PNG
 TO_GREY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
 """Red, green, blue to grey as OpenCV has libpng do it: 0.299, 0.587 and the rest of 32768, rounded down. Half of a
 32768th more than -1/2 makes the rounding of `cv2.transform` that; all sums are whole in float32."""
@@ -29,13 +29,13 @@ def decode_grey(data: bytes) -> np.ndarray | None:
     if not _is_plain(data):
         return None
     size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
-    bits, colour = data[24], data[25]
+    bits, color = data[24], data[25]
     try:
-        if (bits, colour) == (16, GREY):
+        if (bits, color) == (16, GRAY):
             return io.decode_image_png_u16(data, size, "mono")[..., 0]
-        if (bits, colour) == (8, GREY):
+        if (bits, color) == (8, GRAY):
             return io.decode_image_png_u8(data, size, "mono")[..., 0]
-        if (bits, colour) == (8, COLOUR):
+        if (bits, color) == (8, COLOR):
             return cv2.transform(io.decode_image_png_u8(data, size, "rgb"), TO_GREY).reshape(size)
     except Exception:  # the decoder has no error of its own
         return None

@@ -65,8 +65,8 @@ class Resized(Transformed):
     def image(self, index: int) -> Tensor:
         return self._resized(super().image(index)[0, 0])[None, None]
 
-    def colour(self, index: int) -> Tensor:
-        return self._resized(super().colour(index))
+    def color(self, index: int) -> Tensor:
+        return self._resized(super().color(index))
 
     def mask(self, index: int) -> Tensor | None:
         mask = super().mask(index)

@@ -77,7 +77,7 @@ class ImageSequence(Sequence):
         self._check_size(entry, (image.shape[-1], image.shape[-2]))
         return image
 
-    def colour(self, index: int) -> Tensor:
+    def color(self, index: int) -> Tensor:
         entry = self._entries[index]
         image = read_colour(entry.path, entry.where)
         self._check_size(entry, (image.shape[1], image.shape[0]))

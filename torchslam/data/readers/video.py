@@ -84,7 +84,7 @@ class VideoSequence(Sequence):
     def image(self, index: int) -> Tensor:
         return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
 
-    def colour(self, index: int) -> Tensor:
+    def color(self, index: int) -> Tensor:
         return bgr_to_tensor(self._frame(index))
 
     def image_name(self, index: int) -> str:

@@ -9,12 +9,12 @@ from torch import Tensor
 from torchslam.features.matching.brute_force import SCALE_TOLERANCE
 from torchslam.features.matching.hamming import hamming_between
 from torchslam.features.matching.radius_search import nearest_bits, window_pairs
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 from torchslam.utils.indexing import true_indices
 
 
 def match_within(
-    expected: View, view: View, radius: Tensor, ratio: float | None, max_distance: float
+    expected: FrameFeatures, view: FrameFeatures, radius: Tensor, ratio: float | None, max_distance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rows (m,), ascending, of expected keypoints and of a view's that match, nearest descriptors within a radius, and
     their distances (m,), bits.

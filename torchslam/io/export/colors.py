@@ -13,7 +13,7 @@ from torchslam.map.map import Map
 from torchslam.system.run import keyframe_rows
 
 
-def paint(maps: Iterable[Map], sequence: Sequence, session: int) -> None:
+def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> None:
     """Give every point that keyframes of a session see its mean colour in their images; other points keep theirs.
 
     The images are read once more, in order of time. One that cannot be read, as with simulated features, adds nothing.
@@ -33,7 +33,7 @@ def paint(maps: Iterable[Map], sequence: Sequence, session: int) -> None:
 def _add_colours(total: Tensor, slam_map: Map, keyframe: int, sequence: Sequence) -> None:
     """Add to the rows (L, 4) of the points that a keyframe sees their red, green, blue and one."""
     try:
-        image = sequence.colour(int(slam_map.keyframes["frame_index"][keyframe])).to(total.device)
+        image = sequence.color(int(slam_map.keyframes["frame_index"][keyframe])).to(total.device)
     except FrameError:
         return
     ids = slam_map.keyframes["point_ids"][keyframe]

@@ -35,7 +35,7 @@ class Images:
     def bgr(self, frame_id: int) -> np.ndarray:
         """(H, W, 3) uint8 as OpenCV writes it: blue first. Raises FrameError where it cannot be read."""
         image = cv2.cvtColor(
-            self._sequence.colour(self._rows[frame_id]).contiguous().numpy(), cv2.COLOR_RGB2BGR
+            self._sequence.color(self._rows[frame_id]).contiguous().numpy(), cv2.COLOR_RGB2BGR
         )
         return image if self._undistort is None else self._undistort(image)
 

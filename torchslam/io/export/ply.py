@@ -30,14 +30,14 @@ def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
         nothing = torch.zeros(0, 3)
         write_ply(path, nothing, nothing.byte(), nothing)
         return
-    T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.living_points()
+    T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.valid_points()
     R_up = upright_rotation(T_wc)
     write_ply(
         path,
         slam_map.positions_w[alive] @ R_up.mT,
         points["colors"][alive],
         T_wc[keyframe_rows(slam_map, session), :3, 3] @ R_up.mT,
-        -points["normals_w"][alive] @ R_up.mT,
+        -points["view_directions_w"][alive] @ R_up.mT,
         points["times_observed"][alive],
     )
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Scene:
         return total.index_add(0, self.point_index, self.errors()) / count
 
 
-def scene_of(world: World, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
+def scene_of(world: Submap, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
     """The frames of one session in a world that was read from a file, or its keyframes alone.
 
     Observations of points that lie outside of the camera's model, and points that fewer than two of the frames see,

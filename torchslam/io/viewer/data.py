@@ -20,7 +20,7 @@ from torchslam.io.export.recording import gaps
 from torchslam.io.pictures import aligned
 from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.results import Results
-from torchslam.map.submap import World
+from torchslam.map.submap import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
 
@@ -83,7 +83,7 @@ def decoded(packed: dict[str, str]) -> np.ndarray:
 
 
 def _world(
-    world: World, path: Trajectory, results: Results, times: Tensor, max_points: int
+    world: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
     """A world as it is shown: upright, around the middle of its box; aligned and in metres with ground truth.
 
@@ -108,7 +108,7 @@ def _world(
     errors = torch.full((len(path),), torch.nan, dtype=torch.float64)
     truth = torch.zeros(0, 3, dtype=torch.float64)
     if evaluation is not None:
-        errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
+        errors[nearest(evaluation.run_matcher.timestamps, path.timestamps)[0]] = evaluation.errors_m
         to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
         truth = transform(to_shown, _during(results, path).positions_w)
         truth = truth[thin(len(truth), MAX_FRAMES)]
@@ -157,11 +157,11 @@ def _during(results: Results, path: Trajectory) -> Trajectory:
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
-def _points(world: World) -> tuple[Tensor, Tensor]:
+def _points(world: Submap) -> tuple[Tensor, Tensor]:
     """(P, 3) positions and (P, 3) colours of the living points."""
     if world.map.num_points == 0:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
-    ids = world.map.living_points()
+    ids = world.map.valid_points()
     positions_w = world.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)
     return positions_w[finite], world.map.points["colors"][ids][finite]

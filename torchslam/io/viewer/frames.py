@@ -40,7 +40,7 @@ FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 
 @dataclass(frozen=True)
-class Glimpse:
+class FrameSnapshot:
     """One frame and what became of it.
 
     image:     (H, W) uint8 grey
@@ -53,23 +53,23 @@ class Glimpse:
     tracked: Tensor
 
 
-class Screen(Protocol):
+class FrameViewer(Protocol):
     """Shows frames one after the other."""
 
-    def show(self, glimpse: Glimpse) -> None: ...
+    def show(self, glimpse: FrameSnapshot) -> None: ...
 
     def end(self, run: Run) -> None: ...
 
     def close(self) -> None: ...
 
 
-class Watching:
+class FrameViewers:
     """Passes what a run sees on to screens.
 
     sequence: to be run instead of the one that is watched: it remembers the last image, so that none is read twice
     """
 
-    def __init__(self, slam: SLAM, sequence: Sequence, screens: list[Screen]) -> None:
+    def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:
         self._slam, self._screens = slam, screens
         self._closing = ExitStack()
         for screen in screens:
@@ -77,7 +77,7 @@ class Watching:
         self._memory = _Memory(sequence) if screens else None
         self.sequence = self._memory or sequence
 
-    def __enter__(self) -> Watching:
+    def __enter__(self) -> FrameViewers:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -89,7 +89,7 @@ class Watching:
             return
         assert self._memory.last is not None  # the frame's own
         seen = self._slam.seen
-        glimpse = Glimpse(
+        glimpse = FrameSnapshot(
             result,
             (self._memory.last[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy(),
             seen.keypoints[seen.mask],
@@ -120,7 +120,7 @@ def tracked_pixels(slam: SLAM, index: int) -> Tensor:
     if len(frames) == 0 or len(seen) == 0:
         return torch.zeros(0, 2, dtype=torch.float64)
     is_it = (frames["frame_index"] == index) & (frames["session"] == slam.session.number)
-    return seen["pixels"][torch.isin(seen["row"], torch.nonzero(is_it)[:, 0])]
+    return seen["pixels"][torch.isin(seen["frame_row"], torch.nonzero(is_it)[:, 0])]
 
 
 class LiveView:
@@ -153,7 +153,7 @@ class LiveView:
             raise ResultsError(f"--view: the viewer of rerun does not start: {error}") from None
         return cls(slam, recording)
 
-    def show(self, glimpse: Glimpse) -> None:
+    def show(self, glimpse: FrameSnapshot) -> None:
         result, recorder = glimpse.result, self._recorder
         self._start = result.timestamp if self._start is None else self._start
         recorder.at(result.index, result.timestamp - self._start)
@@ -183,7 +183,7 @@ class LiveView:
         self._recording.disconnect()
 
     def _map(self, slam_map: Map, path: Trajectory, painted: bool) -> None:
-        ids = slam_map.living_points()
+        ids = slam_map.valid_points()
         self._recorder.points(slam_map.positions_w[ids], slam_map.points["colors"][ids] if painted else None)
         self._recorder.path(path.positions_w, gaps(path.timestamps))
 
@@ -202,7 +202,7 @@ class Film:
         if not self._writer.isOpened():
             raise ResultsError(f"{path}: this OpenCV cannot write it")
 
-    def show(self, glimpse: Glimpse) -> None:
+    def show(self, glimpse: FrameSnapshot) -> None:
         result = glimpse.result
         image = cv2.cvtColor(
             cv2.resize(glimpse.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR

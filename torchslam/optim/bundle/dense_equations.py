@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.optim.bundle.priors import block_diagonal
-from torchslam.optim.core.linear import DefiniteFactor, factorize
+from torchslam.optim.core.linear import DefiniteFactor, factorize, inverse_root_3x3
 
 # eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k.
 _AXES = torch.eye(3, dtype=torch.float64)
@@ -196,27 +196,13 @@ def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
 
 
 def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:
-    """Lower triangular Q with Q^T Q = block^-1, zero where a block is not definite or not free. (B, 3, 3, P) -> same.
-
-    Cholesky's factors, written out, of blocks that were scaled to a unit diagonal.
-    """
+    """`inverse_root_3x3` of blocks (B, 3, 3, P), with diagonals grown by the share `damping`, where they are free."""
     diagonal = blocks.diagonal(dim1=1, dim2=2).mT
     if damping is not None:
         diagonal = diagonal * (1 + damping[:, None, None])
-    positive = diagonal > 0
-    s0, s1, s2 = torch.where(positive, diagonal, 1.0).rsqrt().unbind(1)
+    d0, d1, d2 = diagonal.unbind(1)
+    lower = d0, blocks[:, 1, 0], d1, blocks[:, 2, 0], blocks[:, 2, 1], d2
     smallest = torch.finfo(blocks.dtype).eps ** 0.8 if damping is None else 0.0
-    definite = free & positive.all(1)
-    b10, b20, b21 = blocks[:, 1, 0] * s1 * s0, blocks[:, 2, 0] * s2 * s0, blocks[:, 2, 1] * s2 * s1
-    pivot = 1 - b10 * b10
-    definite = definite & (pivot > smallest)
-    i1 = torch.where(definite, pivot, 1.0).rsqrt()
-    l21 = (b21 - b20 * b10) * i1
-    pivot = 1 - b20 * b20 - l21 * l21
-    definite = definite & (pivot > smallest)
-    i2 = torch.where(definite, pivot, 1.0).rsqrt()
-    zero = torch.zeros_like(s0)
-    q10, q20 = -b10 * s0 * i1, -(b20 - l21 * b10 * i1) * s0 * i2
-    rows = (s0, zero, zero, q10, s1 * i1, zero, q20, -l21 * s1 * i1 * i2, s2 * i2)
-    root = torch.stack(rows, dim=1).unflatten(1, (3, 3))
-    return torch.where(definite[:, None, None], root, 0.0)
+    q00, q10, q11, q20, q21, q22 = inverse_root_3x3(lower, free, smallest)
+    zero = torch.zeros_like(q00)
+    return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=1).unflatten(1, (3, 3))

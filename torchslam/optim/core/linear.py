@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,3 +53,35 @@ def factorize(matrix: Tensor, strict: bool = True) -> DefiniteFactor:
         unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
         factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], scaled, unit))
     return DefiniteFactor(scale, factor, definite)
+
+
+def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0.0) -> list[Any]:
+    """Lower triangular Q with Q^T Q = block^-1 of many symmetric 3x3 blocks, by a written-out Cholesky factorization.
+
+    Args:
+        lower: six tensors or NumPy arrays of one shape, the entries 00, 10, 11, 20, 21 and 22 of the blocks.
+        mask: bool of that shape, which blocks to invert.
+        smallest: a block counts as definite where the pivots of the block scaled to a unit diagonal exceed this.
+
+    Returns:
+        The same entries of Q, zero where a block is not definite or not in the mask.
+    """
+    b00, b10, b11, b20, b21, b22 = lower
+    xp: Any = np if isinstance(b00, np.ndarray) else torch
+
+    def inverse_sqrt(pivot: Any, is_definite: Any) -> Any:
+        return 1 / xp.sqrt(xp.where(is_definite, pivot, 1.0))
+
+    is_definite = (b00 > 0) & (b11 > 0) & (b22 > 0) & mask
+    s0, s1, s2 = (inverse_sqrt(pivot, is_definite) for pivot in (b00, b11, b22))
+    l10, l20 = b10 * s1 * s0, b20 * s2 * s0
+    pivot = 1 - l10 * l10
+    is_definite = is_definite & (pivot > smallest)
+    i1 = inverse_sqrt(pivot, is_definite)
+    l21 = (b21 * s2 * s1 - l20 * l10) * i1
+    pivot = 1 - l20 * l20 - l21 * l21
+    is_definite = is_definite & (pivot > smallest)
+    i2 = inverse_sqrt(pivot, is_definite)
+    q10, q20 = -l10 * s0 * i1, -(l20 - l21 * l10 * i1) * s0 * i2
+    root = s0, q10, s1 * i1, q20, -l21 * s1 * i1 * i2, s2 * i2
+    return [xp.where(is_definite, entry, 0.0) for entry in root]

@@ -1,55 +1,184 @@
-"""What `frame_pose` and `window` share: least squares on the host, by numpy and in double precision."""
+"""Least squares by NumPy in double precision, for the two problems that every frame of a run solves.
+
+Used by `optim.pose.frame_pose` and `optim.bundle.local_numpy`. With a few hundred values, the overhead of a call
+dominates, and a NumPy call costs about a third of a PyTorch call. There are no gradients: the graph of a finished run
+is solved by `optim.run_graph`, which has them.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 Array = NDArray[Any]
-"""On the host, of doubles where nothing else is said."""
+"""A NumPy array, of float64 unless stated otherwise."""
 
-DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-4, 0.1, 10.0
-"""At first, after a step that is taken, and after one that is not: as of `levenberg`."""
-SLACK = 1 + 1e-13
-"""Of the cost: rounding is no reason to refuse a step."""
-NEAREST = float(np.finfo(np.float64).eps)
-"""Depth in front of which a point counts as behind the camera."""
+RobustKernel = Literal["cauchy", "huber"]
+"""Kernels that exist in NumPy, as in `geometry.robust`."""
+
+MIN_DEPTH = float(np.finfo(np.float64).eps)
+"""A point at a smaller depth counts as behind the camera."""
+
+# As in `core.levenberg_marquardt`.
+_INITIAL_DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0
+_CURVATURE_BELOW = 1e-2  # predicted relative reduction of the cost below which the kernel's curvature is used
+_COST_SLACK = 1 + 1e-13  # an increase of the cost by rounding does not reject a step
+
+X = TypeVar("X", covariant=True)
 
 
-def on_host(values: Tensor) -> Array:
-    """The values of a tensor, without its graph; in the same memory where that can be."""
+class LocalModel(Protocol[X]):
+    """A quadratic model of the cost around a state."""
+
+    @property
+    def cost(self) -> float: ...
+
+    def step(self, damping: float, use_curvature: bool) -> tuple[X, float] | None:
+        """The state at the minimum of the damped model and the predicted reduction of the cost; None if singular."""
+        ...
+
+
+M = TypeVar("M", bound=LocalModel[Any])
+
+
+def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tolerance: float) -> M:
+    """Run Levenberg-Marquardt from `model` and return the model at the last accepted state.
+
+    Args:
+        model: the model at the start.
+        evaluate: makes the model at a state that `LocalModel.step` returned.
+        iterations: maximum number of steps.
+        tolerance: stop after a step with a predicted reduction of at most this share of the cost.
+    """
+    damping, use_curvature = _INITIAL_DAMPING, False
+    for _ in range(iterations):
+        proposal = model.step(damping, use_curvature)
+        if proposal is None:
+            damping *= _DAMPING_UP
+            continue
+        state, predicted_reduction = proposal
+        trial = evaluate(state)
+        converged = not predicted_reduction > tolerance * model.cost
+        accepted = trial.cost <= _COST_SLACK * model.cost
+        if accepted:
+            use_curvature = predicted_reduction < _CURVATURE_BELOW * model.cost
+            model = trial
+        if converged:
+            break
+        damping *= _DAMPING_DOWN if accepted else _DAMPING_UP
+    return model
+
+
+def to_numpy(values: Tensor) -> Array:
+    """The detached values as float64, in the same memory where possible."""
     array: Array = values.detach().cpu().double().numpy()
     return array
 
 
 def cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
-    """rho and rho' of squared errors (N,), as of `geometry.robust`."""
+    """rho and rho' of squared errors (N,), as in `geometry.robust`."""
     share = squared * scale**-2
     return np.log1p(share) * scale**2, 1 / (share + 1)
 
 
 def huber(squared: Array, scale: float) -> tuple[Array, Array]:
-    """rho and rho' of squared errors (N,), as of `geometry.robust`."""
+    """rho and rho' of squared errors (N,), as in `geometry.robust`."""
     limit = scale**2
     root = np.sqrt(np.maximum(squared, limit))
     return root * (2 * scale) + np.minimum(squared, limit) - 2 * limit, scale / root
 
 
-def moved(pose: Array, step: Array) -> Array:
-    """A pose (3, 4) moved by [rho, omega] from the left, by Cayley's rotation: as `solvers.tangent.retract`."""
+ROBUST_KERNELS = {"cauchy": cauchy, "huber": huber}
+
+
+def retract_pose(pose: Array, step: Array) -> Array:
+    """A pose (3, 4) moved by a left perturbation [rho, omega] (6,), as in `core.tangent.retract`."""
     x, y, z = (0.5 * step[3:]).tolist()
     xx, yy, zz = x * x, y * y, z * z
     f = 2 / (1 + xx + yy + zz)
-    turn = np.array(
+    rotation = np.array(
         (
             (1 - f * (yy + zz), f * (x * y - z), f * (x * z + y)),
             (f * (x * y + z), 1 - f * (xx + zz), f * (y * z - x)),
             (f * (x * z - y), f * (y * z + x), 1 - f * (xx + yy)),
         )
     )
-    result: Array = turn @ pose
+    result: Array = rotation @ pose
     result[:, 3] += step[:3]
     return result
+
+
+def variance_factor(
+    squared: Array, influence: Array, weights: Array, kernel: RobustKernel, scale: float, num_parameters: int
+) -> float:
+    """Variance of unit weight from residuals of two components, as in `core.residuals.variance_factor`.
+
+    Args:
+        squared: (N,) weighted squared errors.
+        influence: (N,) the kernel's rho' of them.
+        weights: (N,) zero where an error does not count.
+        kernel: robust kernel.
+        scale: of the kernel.
+        num_parameters: number of estimated parameters.
+    """
+    counted = (weights > 0).astype(np.float64)
+    across = influence * counted
+    if kernel == "huber":  # the slope of psi along the error: one, or zero beyond the scale
+        along = (squared <= scale**2) * counted
+    else:
+        along = across * (2 * influence - 1)
+    psi = across * across
+    sums = np.stack((counted, across, along, psi, along * along, psi * squared)).sum(1).tolist()
+    count, across_sum, along_sum, across_2, along_2, psi_2 = sums
+    components = 2 * count
+    slope = (across_sum + along_sum) / max(components, 1.0)
+    if components <= num_parameters or slope <= 0:
+        return 1.0
+    spread = (across_2 + along_2) / components / slope**2 - 1
+    correction = 1 + num_parameters / components * spread
+    variance = psi_2 / (components - num_parameters)
+    factor: float = correction**2 * variance * (2 * across_sum / components) / slope**2
+    return factor
+
+
+def cross_columns(u: Array, columns: Array, out: Array) -> None:
+    """u x every column, written to `out`: (3, N), (3, n, N) -> (3, n, N)."""
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(u[i], columns[j], out=out[k])
+        out[k] -= u[j] * columns[i]
+
+
+def solve_symmetric(matrix: Array, right: Array) -> Array | None:
+    """matrix^-1 right; None where the matrix is not positive definite."""
+    factor = _scaled_cholesky(matrix)
+    if factor is None:
+        return None
+    scale, scaled, _ = factor
+    try:
+        solution: Array = scale * np.linalg.solve(scaled, scale * right)
+    except np.linalg.LinAlgError:
+        return None
+    return solution
+
+
+def is_definite(matrix: Array) -> bool:
+    """Whether a matrix is clearly positive definite, whatever its units, as in `core.linear.factorize`."""
+    factor = _scaled_cholesky(matrix)
+    return factor is not None and bool(factor[2].diagonal().min() > np.finfo(matrix.dtype).eps ** 0.4)
+
+
+def _scaled_cholesky(matrix: Array) -> tuple[Array, Array, Array] | None:
+    """Scale (D,), the matrix scaled to a unit diagonal, and its Cholesky factor; None if not positive definite."""
+    diagonal = matrix.diagonal()
+    if not (diagonal > 0).all():
+        return None
+    scale = diagonal**-0.5
+    scaled = scale[:, None] * matrix * scale
+    try:
+        return scale, scaled, np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return None

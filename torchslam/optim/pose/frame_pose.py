@@ -1,52 +1,49 @@
-"""The pose of one frame against known points, for every frame of a run: `refine_pose` in a fraction of the time.
+"""The pose of one frame against known points by NumPy, for every frame of a run; `refine_pose` is the general solver.
 
-In undistorted coordinates a pose moves points alike whatever the camera is, and an error in them times the slope of the
-distortion at the keypoint is one in pixels, to first order: the iterations pass no distortion. What is far off is to be
-left out before. It is all computed on the host, by numpy and in double precision: of a few hundred points a call costs
-more than its numbers, and one of numpy a third of one of torch. There are no gradients: a run's graph is solved anew
-(`solvers.graph`).
+Errors are taken in undistorted coordinates and multiplied with the slope of the distortion at the keypoint, which makes
+them pixels to first order, so no iteration evaluates the distortion. Gross outliers must be removed before. The NumPy
+backend has no gradients (`core.numpy_backend`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchslam.geometry import UndistortedKeypoints
 from torchslam.optim.core.numpy_backend import (
-    DAMPING,
-    DAMPING_DOWN,
-    DAMPING_UP,
-    NEAREST,
-    SLACK,
+    MIN_DEPTH,
+    ROBUST_KERNELS,
     Array,
-    cauchy,
-    huber,
-    moved,
-    on_host,
+    RobustKernel,
+    is_definite,
+    minimize_model,
+    retract_pose,
+    to_numpy,
+    variance_factor,
 )
 
-RobustKernel = Literal["cauchy", "huber"]
-"""As in `geometry.robust`."""
-
 SCALE = 2.0
-"""Of the kernels, in units of the noise."""
+"""Scale of the kernels, in units of the noise."""
+MIN_AGREEING = 0.75
+"""Fraction of the matches that must agree in `nearby_pose`: another pose with as many would share at least half."""
 
 _ITERATIONS = 10
-_NEGLIGIBLE = 1e-4  # share of the cost that a step promises: less moves the pose by hundredths of its noise
+_TOLERANCE = 1e-4  # relative to the cost: a smaller reduction moves the pose by hundredths of its noise
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """Points as a pose sees them, before anybody says how much each counts.
+class PoseLinearization:
+    """The unweighted errors of a frame's points at a pose.
 
-    pose:   (3, 4) world to camera; rows: (7, 2, N) whitened derivatives in the pose's left perturbation, and the
-            whitened errors; squares, z: (N,) what `squared` and `depths` say, all on the host
-    like:   of the type and on the device that tensors are to have
+    pose:   (3, 4) world to camera
+    rows:   (7, 2, N) derivatives of the whitened errors in the left perturbation of the pose, then the errors
+    squares, z: (N,) what `squared` and `depths` return
+    like:   type and device of the tensors that properties return
     """
 
     pose: Array
@@ -62,7 +59,7 @@ class Sighting:
 
     @property
     def squared(self) -> Tensor:
-        """(N,) squared errors in units of the noise, far beyond all gates behind the camera."""
+        """(N,) squared errors in units of the noise; huge for points behind the camera."""
         return self._tensor(self.squares)
 
     @property
@@ -76,48 +73,71 @@ class Sighting:
 
 @dataclass(frozen=True)
 class FramePose:
-    """A pose of least robust cost.
+    """A pose of minimal robust cost.
 
-    sighting: at the pose
-    success:  whether the points that counted determine it; if not, the pose is where it started
+    linearization: at the pose
+    success:       the weighted points determine the pose; otherwise it is the start
     """
 
-    sighting: Sighting
+    linearization: PoseLinearization
     success: bool
     _model: _Model
 
     @property
     def T_cw(self) -> Tensor:
         """(4, 4)"""
-        return self.sighting.T_cw
+        return self.linearization.T_cw
 
     def covariance(self) -> Tensor:
-        """(6, 6) of the left perturbation (translation, rotation), calibrated by the errors themselves; zero where the
-        pose is not determined. As `RefinedPose.covariance`."""
+        """(6, 6) of the left perturbation (translation, rotation), as `RefinedPose.covariance`; zero on failure."""
+        like, model = self.linearization.like, self._model
         if not self.success:
-            return self.sighting.like.new_zeros(6, 6)
-        covariance = self._model.variance_factor() * np.linalg.inv(self._model.normal[:6, :6])
-        return torch.from_numpy(covariance).to(self.sighting.like)
+            return like.new_zeros(6, 6)
+        factor = variance_factor(model.squared, model.influence, model.weights, model.kernel, SCALE, 6)
+        return torch.from_numpy(factor * np.linalg.inv(model.normal[:6, :6])).to(like)
 
 
 class FrameProblem:
-    """Points of known place, and where one frame sees them."""
+    """Known points and the keypoints at which one frame observes them."""
 
     def __init__(self, points_w: Tensor, xy: Tensor, whitened: Tensor) -> None:
-        """points_w: (N, 3); xy: (2, N) undistorted coordinates; whitened: (2, 2, N) as of `Undistorted`; all finite."""
-        self.points_w, self.like = np.ascontiguousarray(on_host(points_w).T), points_w.detach()
-        self.xy = on_host(xy)
-        self.along_x, self.along_y = np.ascontiguousarray(on_host(whitened))
+        """Take the matches, all finite.
 
-    def see(self, T_cw: Tensor) -> Sighting:
-        """The points from a pose (4, 4)."""
-        return self._see(on_host(T_cw[:3]))
+        Args:
+            points_w: (N, 3)
+            xy: (2, N) undistorted coordinates.
+            whitened: (2, 2, N) as returned by `UndistortedKeypoints.whitened`.
+        """
+        self.points_w, self.like = np.ascontiguousarray(to_numpy(points_w).T), points_w.detach()
+        self.xy = to_numpy(xy)
+        self.along_x, self.along_y = np.ascontiguousarray(to_numpy(whitened))
 
-    def _see(self, pose: Array) -> Sighting:
+    def linearize(self, T_cw: Tensor) -> PoseLinearization:
+        """The errors and their derivatives at a pose (4, 4)."""
+        return self._linearize(to_numpy(T_cw[:3]))
+
+    def minimize(self, start: PoseLinearization, weights: Tensor, kernel: RobustKernel) -> FramePose:
+        """Find the pose of minimal robust cost by Levenberg-Marquardt.
+
+        Args:
+            start: the linearization at the start.
+            weights: (N,) of the squared errors, not negative; zero where a point does not count.
+            kernel: robust kernel, of scale `SCALE`.
+        """
+        counts = to_numpy(weights)
+
+        def evaluate(pose: Array) -> _Model:
+            return _Model.of(self._linearize(pose), counts, kernel)
+
+        model = minimize_model(_Model.of(start, counts, kernel), evaluate, _ITERATIONS, _TOLERANCE)
+        success = is_definite(model.normal[:6, :6])
+        return FramePose(model.linearization if success else start, success, model)
+
+    def _linearize(self, pose: Array) -> PoseLinearization:
         points_c = pose[:, :3] @ self.points_w
         points_c += pose[:, 3:]
         z = points_c[2]
-        inverse = 1 / np.maximum(z, NEAREST)
+        inverse = 1 / np.maximum(z, MIN_DEPTH)
         image = points_c[:2] * inverse
         x, y = image
         # The derivatives of (x, y) in translation and rotation, and the errors in them.
@@ -132,29 +152,29 @@ class FrameProblem:
         rows[5, 1] = x
         np.subtract(image, self.xy, out=rows[6])
         rows = rows[:, :1] * self.along_x + rows[:, 1:] * self.along_y
-        return Sighting(pose, rows, np.square(rows[6]).sum(0), z, self.like)
+        return PoseLinearization(pose, rows, np.square(rows[6]).sum(0), z, self.like)
 
-    def minimize(self, start: Sighting, weights: Tensor, kernel: RobustKernel) -> FramePose:
-        """The pose of least robust cost near a start, by Levenberg-Marquardt.
 
-        weights: (N,) of the squared errors, none negative; zero where a point does not count
-        """
-        counts = on_host(weights)
-        model, damping = _Model.of(start, counts, kernel), DAMPING
-        for _ in range(_ITERATIONS):
-            step = _step(model.normal, damping)
-            if step is None:
-                break
-            promised = -0.5 * float(step @ model.normal[:6, 6])
-            trial = _Model.of(self._see(moved(model.sighting.pose, step)), counts, kernel)
-            settled = not promised > _NEGLIGIBLE * model.cost
-            better = trial.cost <= SLACK * model.cost
-            model = trial if better else model
-            if settled:
-                break
-            damping *= DAMPING_DOWN if better else DAMPING_UP
-        success = _is_definite(model.normal[:6, :6])
-        return FramePose(model.sighting if success else start, success, model)
+def nearby_pose(
+    expected_T_cw: Tensor, points_w: Tensor, undistorted: UndistortedKeypoints, threshold: float
+) -> Tensor | None:
+    """Refine an expected pose without RANSAC, by all matches under a robust kernel, then by those that agree.
+
+    Args:
+        expected_T_cw: (4, 4) start.
+        points_w: (N, 3) matched points.
+        undistorted: their keypoints.
+        threshold: maximum error of a match that agrees, px.
+
+    Returns:
+        The pose (4, 4), or None where less than `MIN_AGREEING` of the matches agree with it.
+    """
+    problem = FrameProblem(points_w, undistorted.xy, undistorted.slope / threshold)
+    ones = torch.ones_like(points_w[:, 0])
+    first = problem.minimize(problem.linearize(expected_T_cw), ones, "cauchy").linearization
+    found = problem.minimize(first, ones * (first.squared < 1), "huber")
+    agreeing = int((found.linearization.squared < 1).sum())
+    return found.T_cw if found.success and agreeing >= MIN_AGREEING * len(points_w) else None
 
 
 @dataclass(frozen=True)
@@ -165,7 +185,7 @@ class _Model:
     normal:  (7, 7) [J r]^T W [J r]
     """
 
-    sighting: Sighting
+    linearization: PoseLinearization
     kernel: RobustKernel
     weights: Array
     squared: Array
@@ -174,57 +194,20 @@ class _Model:
     normal: Array
 
     @classmethod
-    def of(cls, sighting: Sighting, weights: Array, kernel: RobustKernel) -> _Model:
-        squared = sighting.squares * weights
-        rho, influence = _KERNELS[kernel](squared, SCALE)
-        weighted = sighting.rows * (influence * weights)
-        normal = weighted.reshape(7, -1) @ sighting.rows.reshape(7, -1).T
-        return cls(sighting, kernel, weights, squared, influence, 0.5 * float(rho.sum()), normal)
+    def of(cls, linearization: PoseLinearization, weights: Array, kernel: RobustKernel) -> _Model:
+        squared = linearization.squares * weights
+        rho, influence = ROBUST_KERNELS[kernel](squared, SCALE)
+        weighted = linearization.rows * (influence * weights)
+        normal = weighted.reshape(7, -1) @ linearization.rows.reshape(7, -1).T
+        return cls(linearization, kernel, weights, squared, influence, 0.5 * float(rho.sum()), normal)
 
-    def variance_factor(self) -> float:
-        """As `residuals.variance_factor`, of six parameters."""
-        counted = (self.weights > 0).astype(np.float64)
-        across = self.influence * counted
-        if self.kernel == "huber":  # the slope of psi along the error: one, or zero beyond the scale
-            along = (self.squared <= SCALE**2) * counted
-        else:
-            along = across * (2 * self.influence - 1)
-        psi = across * across
-        sums = np.stack((counted, across, along, psi, along * along, psi * self.squared)).sum(1).tolist()
-        count, across_sum, along_sum, across_2, along_2, psi_2 = sums
-        components = 2 * count
-        slope = (across_sum + along_sum) / max(components, 1.0)
-        if components <= 6 or slope <= 0:
-            return 1.0
-        spread = (across_2 + along_2) / components / slope**2 - 1
-        correction = 1 + 6 / components * spread
-        variance = psi_2 / (components - 6)
-        factor: float = correction**2 * variance * (2 * across_sum / components) / slope**2
-        return factor
-
-
-_KERNELS = {"cauchy": cauchy, "huber": huber}
-
-
-def _step(normal: Array, damping: float) -> Array | None:
-    """(6,) the step that minimises the damped model; None where there is none."""
-    hessian, gradient = normal[:6, :6].copy(), normal[:6, 6]
-    hessian.flat[::7] *= 1 + damping
-    try:
-        step = -np.linalg.solve(hessian, gradient)
-    except np.linalg.LinAlgError:
-        return None
-    return step if math.isfinite(float(step @ gradient)) else None
-
-
-def _is_definite(hessian: Array) -> bool:
-    """Whether a matrix is clearly positive definite, whatever its units: as `linear.factorize`."""
-    diagonal = hessian.diagonal()
-    if not (diagonal > 0).all():
-        return False
-    scale = diagonal**-0.5
-    try:
-        factor = np.linalg.cholesky(scale[:, None] * hessian * scale)
-    except np.linalg.LinAlgError:
-        return False
-    return bool(factor.diagonal().min() > np.finfo(hessian.dtype).eps ** 0.4)
+    def step(self, damping: float, use_curvature: bool) -> tuple[Array, float] | None:
+        """As `LocalModel.step`; reweighted least squares converge fast enough here without the kernel's curvature."""
+        hessian, gradient = self.normal[:6, :6].copy(), self.normal[:6, 6]
+        hessian.flat[::7] *= 1 + damping
+        try:
+            step = -np.linalg.solve(hessian, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        slope = float(step @ gradient)
+        return (retract_pose(self.linearization.pose, step), -0.5 * slope) if math.isfinite(slope) else None

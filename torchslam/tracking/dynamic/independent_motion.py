@@ -19,7 +19,7 @@ from torchslam.tracking.correspondences import match_views
 from torchslam.tracking.dynamic.static_overlay import distances_to_segments
 from torchslam.tracking.match_selection import cells
 from torchslam.tracking.matcher import max_distance
-from torchslam.types import Tracked, View
+from torchslam.types import FrameFeatures, PoseEstimate
 
 _DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
 _NEIGHBOURS = 3  # of a keypoint that say whether it belongs
@@ -33,7 +33,7 @@ class _Look:
     """A frame to compare later ones with: what it saw, where it was if that is known, how deep the scene was, and
     for how many more comparisons its keypoints (N,) int64 are taken to belong to what moves."""
 
-    view: View
+    view: FrameFeatures
     T_cw: Tensor | None
     depth: float
     patience: Tensor
@@ -55,7 +55,7 @@ class _Mover:
     motion: Tensor
 
     @classmethod
-    def of(cls, view: View, belongs: Tensor, motion: Tensor) -> _Mover:
+    def of(cls, view: FrameFeatures, belongs: Tensor, motion: Tensor) -> _Mover:
         rows = torch.nonzero(view.mask & belongs)[:, 0]
         rest = view.keypoints[view.mask & ~belongs]
         return cls(belongs, view.keypoints[rows], view.descriptors[rows], view.scales[rows], rest, motion)
@@ -89,31 +89,31 @@ class IndependentMotion:
         if self._last is not None:
             self._last = replace(self._last, T_cw=None)
 
-    def clear_of(self, view: View) -> View:
+    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints of what moves, which is followed to where it is now."""
         self._since += 1
         self._unseen += 1
         if self._mover is not None:
             self._mover = self._followed(self._mover, view)
-        if self._mover is not None and self._since >= 2 * self.settings.frames:
+        if self._mover is not None and self._since >= 2 * self.settings.frame_interval:
             self._look_again(view, None, 0.0)  # nobody knows where the camera is
         if self._mover is None:
             return view
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
-    def observe(self, view: View, tracked: Tracked) -> Movement:
+    def observe(self, view: FrameFeatures, tracked: PoseEstimate) -> Movement:
         """Compare a posed frame with one some frames earlier; in doubt where the map agrees with little of the image.
 
         view: with all its keypoints
         """
         mover, seen = self._mover, view.keypoints[tracked.keypoints]
-        if mover is not None and self._area(mover.pixels) > self.settings.max_share * self._area(seen):
+        if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
             return Movement(True, "most of the image moves by itself")
-        if self._last is None or self._since >= self.settings.frames:
+        if self._last is None or self._since >= self.settings.frame_interval:
             return self._look_again(view, tracked.T_cw, tracked.depth)
         return NOTHING
 
-    def _followed(self, mover: _Mover, view: View) -> _Mover | None:
+    def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
         """Where it is in the next frame, by how it looks; None when it is gone, or not seen to move for long."""
         matches = match_projected(
             mover.descriptors[None],
@@ -124,12 +124,12 @@ class IndependentMotion:
             max_distance=max_distance(view.descriptors, self.matching),
         )
         found = matches.mask[0]
-        if int(found.sum()) < self.settings.min_matches or self._unseen > self.settings.max_unseen:
+        if int(found.sum()) < self.settings.min_matches or self._unseen > self.settings.max_unseen_frames:
             return None
         motion = (view.keypoints[matches.indices_2[0][found]] - mover.pixels[found]).median(0).values
         return _Mover.of(view, self._nearer_to(view.keypoints, mover.pixels + motion, mover.rest), motion)
 
-    def _look_again(self, view: View, T_cw: Tensor | None, depth: float) -> Movement:
+    def _look_again(self, view: FrameFeatures, T_cw: Tensor | None, depth: float) -> Movement:
         """Compare with the last look: what moves against the scene, and what of the mover moves as one."""
         last = self._last
         nobody = torch.zeros_like(view.mask, dtype=torch.int64)
@@ -197,7 +197,9 @@ class IndependentMotion:
         errors = distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
         return errors / torch.maximum(seen.noise.tolerance[first], view.noise.tolerance[second])
 
-    def _together(self, earlier: View, view: View, first: Tensor, second: Tensor, among: Tensor) -> Tensor:
+    def _together(
+        self, earlier: FrameFeatures, view: FrameFeatures, first: Tensor, second: Tensor, among: Tensor
+    ) -> Tensor:
         """(m,) rows of the matches (n,), (n,) that one rigid motion explains, if it explains enough of those among
         (n,) bool."""
         rows = torch.nonzero(among)[:, 0]
@@ -213,7 +215,7 @@ class IndependentMotion:
             min_samples=64,
         )
         group = rows[motion.inliers[0]]
-        enough = max(self.settings.min_matches, self.settings.min_share * len(rows))
+        enough = max(self.settings.min_matches, self.settings.min_outlier_ratio * len(rows))
         return group if len(group) >= enough else rows[:0]
 
     def _nearer_to(self, pixels: Tensor, group: Tensor, rest: Tensor) -> Tensor:

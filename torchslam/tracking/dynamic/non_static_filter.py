@@ -7,25 +7,25 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera
 from torchslam.tracking.dynamic.independent_motion import NOTHING, IndependentMotion, Movement
-from torchslam.tracking.dynamic.static_overlay import Stillness
-from torchslam.types import Tracked, View
+from torchslam.tracking.dynamic.static_overlay import StaticOverlayDetector
+from torchslam.types import FrameFeatures, PoseEstimate
 
 
-class Foreign:
+class NonStaticFilter:
     """Watches for both, as far as the configuration wants it."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.config = config
-        self.stillness = Stillness(camera, config.stillness, config.matching)
+        self.stillness = StaticOverlayDetector(camera, config.static_overlay, config.matching)
         self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
 
-    def clear_of(self, view: View) -> View:
+    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints that are known not to belong; views come in order of time."""
         self._seen = view
         self._steady = self.stillness.clear_of(view)
         return self.independent_motion.clear_of(self._steady)
 
-    def moves(self, tracked: Tracked) -> Movement:
+    def moves(self, tracked: PoseEstimate) -> Movement:
         """What of the newest view moves against the scene, by the pose that was found for it."""
         if not self.config.independent_motion.enabled:
             return NOTHING
@@ -33,7 +33,7 @@ class Foreign:
 
     def stays(self, T_cw: Tensor, depth: float) -> bool:
         """Whether pixels of the newest view became known to stay; its pose (4, 4), and the depth of the scene."""
-        if not self.config.stillness.enabled:
+        if not self.config.static_overlay.enabled:
             return False
         return self.stillness.observe(self._seen, T_cw, depth) > 0
 

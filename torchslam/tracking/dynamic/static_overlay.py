@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchslam.config import MatchingConfig, StillnessConfig
+from torchslam.config import MatchingConfig, StaticOverlayConfig
 from torchslam.features import match_projected
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.tracking.matcher import max_distance
-from torchslam.types import View
+from torchslam.types import FrameFeatures
 
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
 _SAMPLE = 8  # every so many-th keypoint is asked first whether the camera moved far enough to tell
@@ -31,23 +31,23 @@ class _Look:
     points_c: (d, n, 3) where the points of these may be, by their depth
     """
 
-    view: View
+    view: FrameFeatures
     T_wc: Tensor
     pixels: Tensor
     points_c: Tensor
 
     @classmethod
-    def of(cls, view: View, T_cw: Tensor, depth: float, camera: Camera) -> _Look:
+    def of(cls, view: FrameFeatures, T_cw: Tensor, depth: float, camera: Camera) -> _Look:
         pixels = view.keypoints[view.mask]
         rays = camera.unproject(pixels)
         depths = depth * rays.new_tensor(_DEPTHS)
         return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None])
 
 
-class Stillness:
+class StaticOverlayDetector:
     """Collects evidence of pixels that stay, cell by cell."""
 
-    def __init__(self, camera: Camera, settings: StillnessConfig, matching: MatchingConfig) -> None:
+    def __init__(self, camera: Camera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
         self.camera = camera
         self.settings = settings
         self.matching = matching
@@ -57,7 +57,7 @@ class Stillness:
         self._last: _Look | None = None
         self._pause = 0
 
-    def clear_of(self, view: View) -> View:
+    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints that are known to stay."""
         if not bool((self.evidence >= self.settings.min_evidence).any()):
             return view
@@ -68,7 +68,7 @@ class Stillness:
         row, column = self._cells(pixels)
         return self.evidence[row, column] >= self.settings.min_evidence
 
-    def observe(self, view: View, T_cw: Tensor, depth: float) -> int:
+    def observe(self, view: FrameFeatures, T_cw: Tensor, depth: float) -> int:
         """Compare a posed frame with an earlier one; returns how many cells became known to stay.
 
         view: with all its keypoints; T_cw: (4, 4); depth: median depth of the scene
@@ -108,13 +108,13 @@ class Stillness:
 
     def _is_far(self, must_move: Tensor) -> bool:
         """Whether the camera moved far enough to tell: enough of some keypoints (n,) bool had to move."""
-        return int(must_move.sum()) >= self.settings.min_moving_share * len(must_move)
+        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
 
     def forget_last(self) -> None:
         """The next frame cannot be compared with the ones before: its pose is in another world."""
         self._last = None
 
-    def _stayed(self, earlier: View, view: View, candidates: Tensor) -> Tensor:
+    def _stayed(self, earlier: FrameFeatures, view: FrameFeatures, candidates: Tensor) -> Tensor:
         """(m, 2) pixels of the candidates (N,) among the keypoints of an earlier view that look the same now."""
         rows = torch.nonzero(candidates)[:, 0]
         matches = match_projected(
@@ -123,7 +123,7 @@ class Stillness:
             self.settings.radius_px,
             view.features,
             scales=earlier.scales[rows][None],
-            max_distance=self.settings.max_distance_share * max_distance(view.descriptors, self.matching),
+            max_distance=self.settings.max_distance_ratio * max_distance(view.descriptors, self.matching),
             ratio=None,
         )
         return view.keypoints[matches.indices_2[0][matches.mask[0]]]

@@ -1,0 +1,64 @@
+"""States and reasons: what a session says of its frames, and of a run without a map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchslam.config import load_config
+from torchslam.data import open_sequence
+from torchslam.system.run import why_no_map
+from torchslam.system.slam import SLAM
+from torchslam.types import Reason, State, StepResult
+
+
+def result(index: int, reason: str) -> StepResult:
+    return StepResult(index, float(index), State.INITIALIZING, None, None, None, False, 0, 0, reason)
+
+
+def test_a_video_without_texture_is_told_so() -> None:
+    few = "too few matches with the reference frame: 12, 100 are needed"
+    results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
+    assert why_no_map(results, []) == f"no map was initialised in 1000 frames: {few}"
+
+
+def test_a_reference_frame_alone_is_too_short_a_video() -> None:
+    assert "1 frames are too few" in why_no_map([result(0, Reason.NEW_REFERENCE)], [])
+
+
+@pytest.fixture
+def slam() -> SLAM:
+    return SLAM(
+        open_sequence("synthetic:room?frames=40").camera, load_config(None, ["features.kind=opencv-orb"])
+    )
+
+
+def test_states_follow_each_other_as_frames_come(slam: SLAM) -> None:
+    sequence = open_sequence("synthetic:room?frames=40")
+    assert slam.state is State.INITIALIZING
+    results = [slam.step(sequence[index]) for index in range(25)]
+    assert results[0].reason == Reason.NEW_REFERENCE
+    started = next(index for index, each in enumerate(results) if each.reason == Reason.STARTED)
+    assert all(each.state is State.INITIALIZING and each.T_cw is None for each in results[:started])
+    assert all(each.state is not State.INITIALIZING and each.T_cw is not None for each in results[started:])
+    assert slam.world is not None
+    slam.reset()
+    assert slam.state is State.INITIALIZING
+    assert slam.world is None
+
+
+def test_a_camera_without_a_view_is_lost_and_found_again(slam: SLAM) -> None:
+    sequence = open_sequence("synthetic:room?frames=40")
+    frames = [sequence[index] for index in range(40)]
+    for index in range(25, 29):
+        frames[index] = replace(frames[index], image=torch.full_like(frames[index].image, 0.5))
+    results = [slam.step(frame) for frame in frames]
+    lost = [each for each in results if each.state is State.LOST]
+    assert lost
+    assert {each.reason for each in lost} == {Reason.LOST}
+    again = [each for each in results if each.reason == Reason.FOUND_AGAIN]
+    assert len(again) == 1
+    assert again[0].state is State.UNCERTAIN
+    assert slam.state is State.TRACKING
