@@ -92,7 +92,7 @@ def test_poses_without_truth_are_left_out(generator: torch.Generator) -> None:
     evaluation = evaluate(Trajectory(_times(30), T_wc), groundtruth)
     assert (evaluation.posed, evaluation.compared) == (30, 20)
     assert len(evaluation.aligned) == 30
-    assert len(evaluation.run_matcher) == len(evaluation.groundtruth) == len(evaluation.errors_m) == 20
+    assert len(evaluation.matched) == len(evaluation.groundtruth) == len(evaluation.errors_m) == 20
 
 
 def test_too_few_poses_in_common(generator: torch.Generator) -> None:

@@ -14,7 +14,7 @@ import torch
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.geometry import squared_reprojection_errors, transform
-from torchslam.map.file import read_map, read_atlas, write_atlas
+from torchslam.map.file import read_atlas, read_map, write_atlas
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]

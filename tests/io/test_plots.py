@@ -28,13 +28,13 @@ def points_w(generator: torch.Generator) -> torch.Tensor:
     return points
 
 
-def features_figure(generator: torch.Generator, run_matcher: int = 30) -> Figure:
+def features_figure(generator: torch.Generator, matched: int = 30) -> Figure:
     image = torch.rand(120, 160, generator=generator)
     keypoints = torch.rand(80, 2, generator=generator) * torch.tensor([160.0, 120.0])
     previous = keypoints + 3.0
     previous[::2] = torch.nan
     return plots.plot_features(
-        image, keypoints, torch.arange(80) < run_matcher, previous, torch.arange(80) % 7, "Frame 3"
+        image, keypoints, torch.arange(80) < matched, previous, torch.arange(80) % 7, "Frame 3"
     )
 
 
@@ -192,7 +192,7 @@ def test_nothing_to_draw_is_drawn_without_complaint(tmp_path: Path, generator: t
         plots.plot_errors(torch.zeros(1), torch.zeros(1)),
         plots.plot_tracking([]),
         plots.plot_stage_times([]),
-        features_figure(generator, run_matcher=0),
+        features_figure(generator, matched=0),
     ]
     for index, figure in enumerate(empty):
         plots.save(figure, tmp_path / f"{index}.png")

@@ -8,7 +8,7 @@ import torch
 
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
-from torchslam.io.report import result_warnings, metrics, quality, summary, table
+from torchslam.io.report import metrics, quality, result_warnings, summary, table
 from torchslam.map.submap import Submap
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory

@@ -67,7 +67,8 @@ def test_only_so_many_are_tried() -> None:
     assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.max_candidates=4") is right
     # those beside one that failed are not tried, nor do they count
     assert (
-        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.max_candidates=2") is right
+        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.max_candidates=2")
+        is right
     )
 
 
@@ -112,6 +113,8 @@ def test_points_match_by_descriptor_wherever_they_are() -> None:
 
 def test_thresholds_of_bits_and_of_floats() -> None:
     bits, floats = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 2)
-    settings = load_config(None, ["matching.max_hamming_distance=50", "matching.max_cosine_distance=0.3"]).matching
+    settings = load_config(
+        None, ["matching.max_hamming_distance=50", "matching.max_cosine_distance=0.3"]
+    ).matching
     assert max_distance(bits, settings) == 50
     assert max_distance(floats, settings) == 0.3

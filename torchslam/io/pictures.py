@@ -105,11 +105,11 @@ def _truth(results: Results) -> Trajectory | None:
 
 
 def _errors(evaluation: Evaluation, results: Results) -> Figure:
-    estimated, true = evaluation.run_matcher.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
+    estimated, true = evaluation.matched.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
     errors_rad = so3_log(true.mT @ estimated).norm(dim=-1)
     title = f"Error against ground truth, aligned by a similarity (scale {evaluation.scale:.4g})"
     return plots.plot_errors(
-        evaluation.run_matcher.timestamps, evaluation.errors_m, errors_rad, results.frames, title
+        evaluation.matched.timestamps, evaluation.errors_m, errors_rad, results.frames, title
     )
 
 

@@ -62,9 +62,9 @@ class Tracker:
         recent = self.settings.recent_frames if self.counts else 0
         if recent:
             last_seen = slam_map.points["last_seen_frame"]
-            local_points = torch.nonzero((last_seen > last_seen.max() - recent) & slam_map.points["is_valid"])[
-                :, 0
-            ]
+            local_points = torch.nonzero(
+                (last_seen > last_seen.max() - recent) & slam_map.points["is_valid"]
+            )[:, 0]
         else:
             local_points = slam_map.points_seen_by(local_keyframes)
         return TrackingState(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def plot_features(
-    image: Tensor, keypoints: Tensor, run_matcher: Tensor, previous: Tensor, lengths: Tensor, title: str = ""
+    image: Tensor, keypoints: Tensor, matched: Tensor, previous: Tensor, lengths: Tensor, title: str = ""
 ) -> Figure:
     """Keypoints on an image: map points as dots with a tail to where they were before, the others as rings.
 
@@ -30,7 +30,7 @@ def plot_features(
 
     grey = style.to_numpy(image)
     height, width = grey.shape
-    is_matched = run_matcher.cpu().numpy()
+    is_matched = matched.cpu().numpy()
     x, y = style.to_numpy(keypoints).T
     with style.house_style():
         figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
@@ -47,7 +47,7 @@ def plot_features(
             alpha=0.85,
             zorder=1,
         )
-        _draw_tails(axes, keypoints[run_matcher], previous[run_matcher])
+        _draw_tails(axes, keypoints[matched], previous[matched])
         counts = lengths.cpu().numpy()[is_matched]
         dots = axes.scatter(
             x[is_matched],

@@ -71,7 +71,7 @@ def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
         figure = style.new_figure(9.0, 3.2)
         axes = figure.add_subplot()
         _shade(axes, results, origin)
-        axes.fill_between(seconds, matches, color=style.ESTIMATE, alpha=0.16, lw=0, label="run_matcher")
+        axes.fill_between(seconds, matches, color=style.ESTIMATE, alpha=0.16, lw=0, label="matched")
         axes.plot(seconds, inliers, color=style.ESTIMATE, lw=1.2, label="agree with the pose")
         axes.plot(seconds[keyframes], inliers[keyframes], "o", ms=3.0, color=style.ACCENT, label="keyframe")
         axes.set(xlabel="time (s)", ylabel="map points in the frame", ylim=(0.0, None))

@@ -108,7 +108,7 @@ def _world(
     errors = torch.full((len(path),), torch.nan, dtype=torch.float64)
     truth = torch.zeros(0, 3, dtype=torch.float64)
     if evaluation is not None:
-        errors[nearest(evaluation.run_matcher.timestamps, path.timestamps)[0]] = evaluation.errors_m
+        errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
         to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
         truth = transform(to_shown, _during(results, path).positions_w)
         truth = truth[thin(len(truth), MAX_FRAMES)]
