@@ -289,7 +289,7 @@ class Trajectory:
 
 
 class Reason(StrEnum):
-    """What a frame did to the state of the system, as `StepResult.reason` says it; some reasons carry figures instead."""
+    """Effect of a frame on the state of the system, the text of `StepResult.reason`; some reasons add numbers."""
 
     NEW_REFERENCE = "took a reference frame"
     STARTED = "started the map"

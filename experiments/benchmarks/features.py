@@ -62,7 +62,7 @@ def in_turns(tasks: dict[str, Callable[[], Any]], rounds: int = 30) -> dict[str,
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def run_matcher(first: Features, second: Features, **options: Any) -> tuple[NDArray, NDArray]:
+def match_pixels(first: Features, second: Features, **options: Any) -> tuple[NDArray, NDArray]:
     """Pixels (M, 2) of the matches in both images."""
     matches = match(first, second, **options)
     rows = matches.mask[0]
@@ -82,7 +82,7 @@ def epipolar(
         images = [grey(paths[start]), grey(paths[start + gap])]
         height, width = images[0].shape
         camera = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
-        pixels_1, pixels_2 = run_matcher(*(extract(to_tensor(image)) for image in images), **options)
+        pixels_1, pixels_2 = match_pixels(*(extract(to_tensor(image)) for image in images), **options)
         ransac = {"max_epipolar_error": 1.0, "min_iterations": 200, "max_iterations": 1000, "seed": 0}
         _, found = poselib.estimate_relative_pose(pixels_1, pixels_2, camera, camera, ransac, {})
         counts.append(sum(found["inliers"]))
@@ -144,7 +144,7 @@ def known_change(
     seen_1 = shared(first, homography)
     seen_2 = mapped(homography, shared(second, np.linalg.inv(homography)))
     nearest = np.linalg.norm(seen_1[:, None] - seen_2[None], axis=-1).min(1)
-    pixels_1, pixels_2 = run_matcher(first, second, ratio=None, max_distance=None)
+    pixels_1, pixels_2 = match_pixels(first, second, ratio=None, max_distance=None)
     errors = np.linalg.norm(mapped(homography, pixels_1) - pixels_2, axis=1)
     right = errors < RIGHT
     return [float(v) for v in ((nearest < NEAR).mean(), right.mean(), right.sum(), np.median(errors[right]))]

@@ -95,14 +95,14 @@ def pairs_of(sequence: Sequence, least_baseline: float, count: int) -> list[Pair
     pairs = []
     for first, second, T_21 in chosen:
         pixels_1, pixels_2 = (
-            undistorted(pixels, sequence.camera) for pixels in run_matcher(seen[first], seen[second])
+            undistorted(pixels, sequence.camera) for pixels in match_pixels(seen[first], seen[second])
         )
         if len(pixels_1) >= MIN_MATCHES:
             pairs.append(Pair(sequence.name, (first, second), pixels_1, pixels_2, T_21.double(), camera))
     return pairs
 
 
-def run_matcher(first: Features, second: Features) -> tuple[Tensor, Tensor]:
+def match_pixels(first: Features, second: Features) -> tuple[Tensor, Tensor]:
     """Pixels (M, 2) of the matches in both images."""
     matches = match(first, second)
     rows = matches.mask[0]

@@ -75,7 +75,8 @@ def test_an_integer_serves_as_a_float() -> None:
         ),
         (
             "bundle_adjustment.local_window=0",
-            "--set bundle_adjustment.local_window=0: bundle_adjustment.local_window must be at least 2 and at most 1000000, not 0",
+            "--set bundle_adjustment.local_window=0: bundle_adjustment.local_window must be at least 2 "
+            "and at most 1000000, not 0",
         ),
         ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 100000, not 0"),
         ("features.max_image_pixels=1", "features.max_image_pixels must be 0 or at least 1024 and at most"),

@@ -43,7 +43,7 @@ class System(Protocol):
 
 
 class Frames(Protocol):
-    """Where a run takes its frames from, each once, in the order of its index: a sequence, or `ahead.FeaturePrefetcher`."""
+    """The frames of a run, each read once and in order: a sequence or a `FeaturePrefetcher`."""
 
     def __getitem__(self, index: int) -> Frame: ...
 

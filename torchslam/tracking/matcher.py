@@ -41,9 +41,9 @@ Matcher = Callable[[FrameFeatures, FrameFeatures, MatchPrior | None], Matches]
 """Two views, and what is known before, to a batch of one of `Matches`. Only keypoints of `mask` may match, each of the
 second view once.
 
-A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints; one whose
-attribute `wants_images` is true finds (1, 1, H, W) grey in `FrameFeatures.image`, of frames of this run, not of what the map
-expects to be seen."""
+A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints. One whose
+attribute `wants_images` is true finds (1, 1, H, W) gray images in `FrameFeatures.image`: of frames of this run, not of
+the appearance that the map predicts."""
 
 
 @dataclass(frozen=True)
