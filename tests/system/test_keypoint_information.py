@@ -168,7 +168,7 @@ def test_gradients_reach_what_says_the_information(kind: str) -> None:
     images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
     eyes = Doubtful(walk, kind)
     clip_slam = ClipSLAM(eyes, config=load_config(None, ["bundle_adjustment.global_iterations=30"]))
-    graph = clip_slam.look(images, walk.camera)
+    graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(falloff: float) -> Tensor:
         with torch.no_grad():

@@ -22,7 +22,8 @@ from safetensors.torch import load_file
 
 from tests.walks import Walk, arc
 from torchslam import SLAM, Config, State, StepResult, load_config
-from torchslam.cli import arguments, main
+from torchslam.cli import arguments
+from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
 from torchslam.io.frames_file import read_frames

@@ -50,9 +50,9 @@ def test_states_follow_each_other_as_frames_come(slam: SLAM) -> None:
 
 
 def test_a_camera_without_a_view_is_lost_and_found_again(slam: SLAM) -> None:
-    sequence = open_sequence("synthetic:room?frames=40")
-    frames = [sequence[index] for index in range(40)]
-    for index in range(25, 29):
+    sequence = open_sequence("synthetic:room?frames=60")
+    frames = [sequence[index] for index in range(46)]
+    for index in range(35, 39):
         frames[index] = replace(frames[index], image=torch.full_like(frames[index].image, 0.5))
     results = [slam.step(frame) for frame in frames]
     lost = [each for each in results if each.state is State.LOST]

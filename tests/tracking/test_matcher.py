@@ -72,7 +72,7 @@ class Counting(Wrapped):
     def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         modules = {Path(frame.filename).stem for frame in traceback.extract_stack()}
         # Relocalisation asks through the tracker, which then is not tracking.
-        stages = ("initialization", "youth", "new_points", "relocalization", "tracker")
+        stages = ("initialization", "provisional_map", "new_points", "relocalization", "tracker")
         self.asked_by[next(stage for stage in stages if stage in modules)] += 1
         return super().__call__(view_1, view_2, prior)
 
@@ -90,7 +90,7 @@ def test_it_is_asked_in_all_stages() -> None:
     assert states[-1] is State.TRACKING
     assert len(run.worlds) == 1
     asked = matcher.asked_by
-    assert set(asked) == {"initialization", "youth", "tracker", "new_points", "relocalization"}
+    assert set(asked) == {"initialization", "provisional_map", "tracker", "new_points", "relocalization"}
     assert asked["tracker"] >= 20  # near the prediction, in every frame that is followed
     assert asked["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
 

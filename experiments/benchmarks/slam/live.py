@@ -1,6 +1,6 @@
 """Does a live run keep up? A recording is played at the rate of its camera, whether anybody looks or not.
 
-python -m experiments.benchmarks.slam.live redkitchen --config configs/fast.toml
+python -m experiments.benchmarks.slam.live redkitchen
 """
 
 from __future__ import annotations

@@ -20,8 +20,6 @@ from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 
 OURS, ALONE, PEER = "ours", "ours, one process", "ORB-SLAM3"
-FAST, FAST_ALONE = "ours, fast", "ours, fast, one process"
-FAST_CONFIG = Path(__file__).parents[3] / "configs" / "fast.toml"
 HEADER = ["sequence", "system", "ms, median", "ms, 95 %", "frames/s", "CPU ms a frame", "ATE, m", "posed"]
 
 
@@ -85,7 +83,7 @@ def main() -> None:
 
 def systems(with_peer: bool) -> list[str]:
     """Which ones run a recording."""
-    ours = [OURS, ALONE, FAST, FAST_ALONE]
+    ours = [OURS, ALONE]
     return [*ours, PEER] if with_peer else ours
 
 
@@ -111,8 +109,7 @@ def measured(system: str, recording: Recording, peer: list[str] | None) -> Figur
         else:
             line = [sys.executable, "-m", "experiments.benchmarks.slam.ours", str(source)]
             line += [str(folder / "trajectory.txt"), "--limit", str(recording.frames)]
-            line += ["--processes", "1"] if system in (ALONE, FAST_ALONE) else []
-            line += ["--config", str(FAST_CONFIG)] if system in (FAST, FAST_ALONE) else []
+            line += ["--processes", "1"] if system == ALONE else []
         said, seconds = with_cpu_time(line)
         figures = json.loads(said.strip().split("\n")[-1])
         ate, posed = accuracy(folder / "trajectory.txt", source, recording.frames)

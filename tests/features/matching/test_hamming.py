@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.features.matching.brute_force import hamming as bits
+from torchslam.features.matching import hamming as bits
 from torchslam.features.matching.hamming import (
     hamming,
     hamming_between,
