@@ -1,6 +1,5 @@
 """Multi-view geometry as pure, batched, differentiable functions over tensors."""
 
-from torchslam.geometry import estimator_operators as estimator_operators  # to make them known
 from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
 from torchslam.geometry.alignment import umeyama
 from torchslam.geometry.camera import Camera

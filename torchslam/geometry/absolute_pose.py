@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -76,9 +75,6 @@ def estimate_absolute_pose(
     The same arguments and seed give the same result. Too few points, points on a line, or pure noise give `success`
     False for that camera.
 
-    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits: how many samples it draws depends on
-    the data, which no graph may ask.
-
     Where an input requires a gradient, T_cw carries that of the final least squares with respect to points, pixels
     and camera parameters, with the set of rows it uses fixed (implicit function theorem, exact Hessian).
     Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003; for P3P see `p3p`.
@@ -95,18 +91,18 @@ def estimate_absolute_pose(
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
     pixels = torch.where(mask[..., None], pixels, 0.0)
-    statics = camera.model, list(camera.size), threshold
-    effort = seed, confidence, max_samples
-    compiling = torch.compiler.is_compiling()
-    find = torch.ops.torchslam.absolute_pose if compiling else find_absolute_pose
-    detached = points_w.detach(), pixels.detach(), camera.params.detach()
-    T_cw, success, squared, score = find(*detached, mask, *statics, *effort)
+    T_cw, success, squared, score = find_absolute_pose(
+        points_w.detach(),
+        pixels.detach(),
+        camera.with_params(camera.params.detach()),
+        threshold,
+        mask,
+        *(seed, confidence, max_samples),
+    )
     mask = mask & success[:, None]
-    inputs, used = [points_w, pixels, camera.params], (squared < FINAL_WIDTH**2) & mask
-    if compiling:
-        T_cw = torch.ops.torchslam.attached_absolute_pose(T_cw, inputs, [used], *statics[:2])
-    elif needs_gradient(*inputs):
-        T_cw = attach_absolute_pose(T_cw, inputs, [used], *statics[:2])
+    if needs_gradient(points_w, pixels, camera.params):
+        used = (squared < FINAL_WIDTH**2) & mask
+        T_cw = attach_absolute_pose(T_cw, points_w, pixels, camera, used)
     return AbsolutePose(T_cw, (squared < 1) & mask, success, score)
 
 
@@ -269,34 +265,21 @@ def is_success(
 
 
 def find_absolute_pose(
-    points_w: Tensor,
-    pixels: Tensor,
-    params: Tensor,
-    mask: Tensor,
-    model: str,
-    size: Sequence[int],
-    threshold: float,
-    *effort: Any,
+    points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor, *effort: Any
 ) -> tuple[Tensor, ...]:
     """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
 
     effort: seed, confidence and max_samples of `estimate_absolute_pose`
     """
     with torch.inference_mode():  # less work per operation than without gradients only
-        camera = Camera(model, params, (size[0], size[1]))
         results = _Problem.of(points_w, pixels, camera, threshold, mask).solve(*effort)
     return tuple(result.clone() for result in results)  # fit for graphs
 
 
 def attach_absolute_pose(
-    T_cw: Tensor, inputs: Sequence[Tensor], others: Sequence[Tensor], model: str, size: Sequence[int]
+    T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera, used: Tensor
 ) -> Tensor:
-    """The same poses, with the gradient of the minimiser of the squared error over the rows in use.
-
-    inputs: points_w (B, N, 3), pixels (B, N, 2) and the camera's parameters; others: which rows, (B, N)
-    """
-    (points_w, pixels, params), (used,) = inputs, others
-    camera = Camera(model, params, (size[0], size[1]))
+    """The same poses, with the gradient of the minimizer of the squared error over the rows (B, N) in use."""
 
     def objective(xi: Tensor) -> Tensor:
         projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))

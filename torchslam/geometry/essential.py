@@ -33,13 +33,9 @@ def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     x_1, x_2: (S, 5, 2) undistorted image coordinates. Returns E (R, 3, 3) of norm sqrt(2) for the R real solutions
     of all samples together, up to ten each, and sample (R,) in ascending order. Solutions closer together than
     1.4 degrees of the last unknown's angle can be missed; degenerate samples may give none or wrong ones. Not
-    differentiable by design: it makes hypotheses. `torch.compile(fullgraph=True)` takes it as one operator, where
-    `torch._dynamo.config.capture_dynamic_output_shape_ops` is set, for R depends on the data.
+    differentiable by design: it makes hypotheses.
     Source: Nister, "An efficient solution to the five-point relative pose problem", 2004.
     """
-    if torch.compiler.is_compiling():
-        E, sample = torch.ops.torchslam.five_point(x_1.detach(), x_2.detach())
-        return E, sample
     with torch.no_grad():
         basis = _null_space(x_1, x_2)
         B = _elimination(_constraints(basis))

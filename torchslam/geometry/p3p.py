@@ -16,7 +16,7 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     rays: (..., 3, 3), the rows of unit length; points: (..., 3, 3), one per row. Returns R (..., 4, 3, 3),
     t (..., 4, 3) and valid (..., 4); invalid entries and degenerate samples (collinear points) may hold anything.
-    Not differentiable by design: it makes hypotheses. `torch.compile(fullgraph=True)` takes it.
+    Not differentiable by design: it makes hypotheses.
 
     The three distance equations in the depths form a pencil of conics; a degenerate one of them is a pair of lines,
     which a real root of a cubic finds, and lines meet a conic in closed form.

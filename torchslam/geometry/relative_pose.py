@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -21,12 +20,11 @@ from torchslam.geometry.relative_pose_search import (
     FoundPose,
     Model,
     find_relative_pose,
-    views_of,
 )
 from torchslam.geometry.robust import Kernel, robustify
+from torchslam.geometry.two_view import TwoViews
 from torchslam.geometry.two_view_essential import tangent_basis
 
-# Here, as compiled graphs of older torch cannot look them up.
 _MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 
 
@@ -102,9 +100,9 @@ def estimate_relative_pose(
     The same arguments and seed give the same result. Too few matches and pure noise give `success` False for that
     pair. Raises ValueError for wrong shapes, and for an unknown model or kernel.
 
-    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits; there, ask for `model_index`. Where an
-    input requires a gradient, T_21 carries that of the final least squares of the chosen model with respect to pixels,
-    weights and camera parameters, the matches it uses and the level of the noise fixed (implicit function theorem).
+    Where an input requires a gradient, T_21 carries that of the final least squares of the chosen model with respect to
+    pixels, weights and camera parameters, the matches it uses and the level of the noise fixed (implicit function
+    theorem).
     Sources: Nister, 2004; Chum et al., "Locally optimized RANSAC", 2003; Torr, "An assessment of information
     criteria for motion model selection", 1997, for the problem of choosing.
     """
@@ -113,17 +111,19 @@ def estimate_relative_pose(
         return _nothing(pixels_1)
     mask = _usable(pixels_1, pixels_2, mask, weights)
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
-    cameras = camera_1.model, list(camera_1.size), camera_2.model, list(camera_2.size)
     inputs = [pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])]
+
+    def views(
+        pixels_1: Tensor, pixels_2: Tensor, params_1: Tensor, params_2: Tensor, weights: Tensor | None = None
+    ) -> TwoViews:
+        cameras = camera_1.with_params(params_1), camera_2.with_params(params_2)
+        return TwoViews.of(pixels_1, pixels_2, *cameras, threshold, mask, weights)
+
     effort = seed, confidence, min_samples, max_samples
-    compiling = torch.compiler.is_compiling()
-    find = torch.ops.torchslam.relative_pose if compiling else find_relative_pose
-    found = FoundPose(*find([x.detach() for x in inputs], mask, *cameras, threshold, kernel, model, *effort))
-    T_21, others = found.T_21, [mask, found.normal, found.model, found.noise, found.used]
-    if compiling:
-        T_21 = torch.ops.torchslam.attached_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
-    elif needs_gradient(*inputs):
-        T_21 = attach_relative_pose(T_21, inputs, others, *cameras, threshold, kernel)
+    with torch.no_grad():
+        detached = views(*(x.detach() for x in inputs))
+        found = find_relative_pose(detached, weights, mask, camera_2, threshold, kernel, model, *effort)
+    T_21 = attach_relative_pose(found, views(*inputs), kernel) if needs_gradient(*inputs) else found.T_21
     return _answer(T_21, found)
 
 
@@ -170,23 +170,10 @@ def _nothing(pixels: Tensor) -> RelativePose:
     return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21)
 
 
-def attach_relative_pose(
-    T_21: Tensor,
-    inputs: Sequence[Tensor],
-    others: Sequence[Tensor],
-    model_1: str,
-    size_1: Sequence[int],
-    model_2: str,
-    size_2: Sequence[int],
-    threshold: float,
-    kernel: Kernel,
-) -> Tensor:
-    """The same poses, with the gradient of the minimiser of the chosen model's errors over the rows in use.
-
-    inputs: as of `views_of`; others: its mask, and normal, model, noise and used of what was found
-    """
-    mask, normal, model, noise, used = others
-    views = views_of(inputs, mask, (model_1, size_1, model_2, size_2), threshold).in_units(noise[:, None])
+def attach_relative_pose(found: FoundPose, views: TwoViews, kernel: Kernel) -> Tensor:
+    """The poses found, with the gradient of the minimizer of the chosen model's errors over the rows in use."""
+    T_21, normal, model, used = found.T_21, found.normal, found.model, found.used
+    views = views.in_units(found.noise[:, None])
     R, t = T_21[:, :3, :3], T_21[:, :3, 3]
     # Parameters that the chosen model does not have must not bring NaN.
     forward = t.new_tensor((0.0, 0.0, 1.0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
@@ -74,41 +73,22 @@ class FoundPose(NamedTuple):
     T_essential: Tensor
 
 
-def views_of(
-    inputs: Sequence[Tensor],
-    mask: Tensor,
-    cameras: tuple[str, Sequence[int], str, Sequence[int]],
-    threshold: float,
-) -> TwoViews:
-    """What `estimate_relative_pose` is given: pixels, parameters of both cameras, and weights if there are any."""
-    pixels_1, pixels_2, params_1, params_2, *weights = inputs
-    model_1, (width_1, height_1), model_2, (width_2, height_2) = cameras
-    camera_1 = Camera(model_1, params_1, (width_1, height_1))
-    camera_2 = Camera(model_2, params_2, (width_2, height_2))
-    weight = weights[0] if weights else None
-    return TwoViews.of(pixels_1, pixels_2, camera_1, camera_2, threshold, mask, weight)
-
-
 def find_relative_pose(
-    inputs: Sequence[Tensor],
+    views: TwoViews,
+    weights: Tensor | None,
     mask: Tensor,
-    model_1: str,
-    size_1: Sequence[int],
-    model_2: str,
-    size_2: Sequence[int],
+    camera_2: Camera,
     threshold: float,
     kernel: Kernel,
     wanted: Model,
     *effort: Any,
 ) -> FoundPose:
-    """What `estimate_relative_pose` finds, without gradient; inputs as of `views_of`, the rest as its arguments."""
-    with torch.no_grad():
-        views = views_of(inputs, mask, (model_1, size_1, model_2, size_2), threshold)
-        # The probability that a wrong match is within the threshold of an epipolar line.
-        chance = 2 * threshold * math.hypot(*size_2) / (size_2[0] * size_2[1])
-        weights = inputs[4] if len(inputs) > 4 else None
-        chances = chance * _mean_width(mask, weights, views.x_1.dtype)
-        return _search(views, chances, wanted, kernel, _Effort(*effort))
+    """What `estimate_relative_pose` finds; effort: seed, confidence, min_samples and max_samples of it."""
+    width, height = camera_2.size
+    # The probability that a wrong match is within the threshold of an epipolar line.
+    chance = 2 * threshold * math.hypot(width, height) / (width * height)
+    chances = chance * _mean_width(mask, None if weights is None else weights.detach(), views.x_1.dtype)
+    return _search(views, chances, wanted, kernel, _Effort(*effort))
 
 
 class _Chosen(NamedTuple):

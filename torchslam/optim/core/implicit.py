@@ -30,15 +30,14 @@ Backward = Literal["implicit", "unroll", "truncated", "detached"]
 "truncated": through one last Gauss-Newton step from the detached minimum; biased with a robust kernel
 "detached":  none
 """
-_BACKWARDS = get_args(Backward)  # looked up here: compiled graphs of older torch cannot
 
 Ndims = tuple[int, ...]
 
 
 def check_backward(backward: str) -> None:
     """Raises ValueError unless `backward` is one of the modes."""
-    if backward not in _BACKWARDS:
-        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(_BACKWARDS)}")
+    if backward not in get_args(Backward):
+        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
 
 
 class Minimization(Protocol):
@@ -93,20 +92,6 @@ def minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
     return _Minimum.apply(problem, *inputs)
 
 
-def attached_gradient(
-    problem: Minimization,
-    found: Tensors,
-    inputs: Tensors,
-    gradient: Sequence[Tensor],
-    needed: Sequence[bool],
-) -> list[Tensor | None]:
-    """The gradient to the inputs that need it of a loss with this gradient in what was found, itself without graph."""
-    direction = problem.factorized(found, inputs)(
-        problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
-    )
-    return _last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
-
-
 class _Minimum(torch.autograd.Function):
     """inputs -> found."""
 
@@ -129,7 +114,9 @@ class _Minimum(torch.autograd.Function):
         problem, needed = ctx.problem, ctx.needs_input_grad[1:]
         inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
         if not torch.is_grad_enabled() and not _are_functorch_transforms_active():
-            return None, *attached_gradient(problem, found, inputs, gradient, needed)
+            vector = problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
+            direction = problem.factorized(found, inputs)(vector)
+            return None, *_last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
         right = problem.pull_back(found, gradient[: problem.num_unknowns])
         direction = _solve(problem, right, found, inputs)
         return None, *_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)

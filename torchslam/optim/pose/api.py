@@ -14,7 +14,6 @@ from torchslam.geometry.robust import Kernel
 from torchslam.optim.core.implicit import Backward, check_backward, minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence
 from torchslam.optim.core.priors import PosePrior
-from torchslam.optim.pose.operator import pose_minimum
 from torchslam.optim.pose.problem import PoseInputs, PoseMinimization, PoseProblem
 
 
@@ -75,18 +74,12 @@ def refine_pose(
     An element that fails (too few points, pose not determined) has `success` False and a zero gradient. The implicit
     gradient is zero as well where the exact Hessian is not positive definite, that is, not at a strict minimum.
     Raises ValueError for shapes that do not fit and for unknown names.
-
-    `torch.compile(fullgraph=True)` takes it as one operator, with the same bits: how often it iterates depends on the
-    data, which no graph may ask. There, "unroll" and "truncated" raise ValueError, `covariance` breaks the graph, and
-    gradients have no second derivatives.
     """
     check_backward(backward)
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
     minimization = PoseMinimization(inputs, iterations, tolerance)
     tensors = (T_cw, *inputs.tensors())
-    if torch.compiler.is_compiling():
-        found = pose_minimum(minimization, tensors, backward)
-    elif backward == "unroll":
+    if backward == "unroll":
         found = minimization.minimize(tensors)
     else:
         attached = backward == "implicit"
