@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchslam.data import open_sequence
     from torchslam.errors import TorchslamError
     from torchslam.evaluation import evaluate
-    from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_projected
+    from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_by_projection
     from torchslam.geometry import (
         Camera,
         estimate_absolute_pose,
@@ -63,7 +63,7 @@ __all__ = [
     "evaluate",
     "load_config",
     "match",
-    "match_projected",
+    "match_by_projection",
     "minimize",
     "open_sequence",
     "refine_pose",
@@ -77,7 +77,7 @@ HOMES = {
     "torchslam.data": "open_sequence",
     "torchslam.errors": "TorchslamError",
     "torchslam.evaluation": "evaluate",
-    "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_projected",
+    "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_by_projection",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
     "torchslam.learning.clip": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",

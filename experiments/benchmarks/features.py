@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchslam.features import ORB, OpenCVORB, match, match_projected
+from torchslam.features import ORB, OpenCVORB, match, match_by_projection
 from torchslam.types import Features
 
 HERE = Path(__file__).parent
@@ -190,7 +190,7 @@ def speed_tables(image: NDArray, compiled: bool) -> list[str]:
         a, b = random_descriptors(points, 0), random_descriptors(keypoints, 1)
         t = in_turns(
             {
-                str(radius): partial(match_projected, a.descriptors, a.keypoints, radius, b)
+                str(radius): partial(match_by_projection, a.descriptors, a.keypoints, radius, b)
                 for radius in (15.0, 50.0)
             }
         )

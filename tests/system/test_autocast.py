@@ -150,8 +150,8 @@ def estimator_cases() -> dict[str, Case]:
             lambda a, b: torchslam.match(features(a, a[..., :2]), features(b, b[..., :2]), temperature=0.1),
             (unit(1, 30, 64), unit(1, 30, 64, seed=1)),
         ),
-        "match_projected": (
-            lambda a, at: torchslam.match_projected(a, at, 9.0, features(a.flip(1), at.flip(1))),
+        "match_by_projection": (
+            lambda a, at: torchslam.match_by_projection(a, at, 9.0, features(a.flip(1), at.flip(1))),
             (unit(1, 30, 64), 50 * normal(1, 30, 2)),
         ),
     }  # fmt: skip

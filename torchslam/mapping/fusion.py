@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.features import match_projected
+from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, fits
 from torchslam.map.map import Map
 from torchslam.tracking.correspondences import look_at
@@ -41,7 +41,7 @@ def find_in(
     somewhere = torch.nonzero(visible.any(0))[:, 0]
     point_ids = point_ids[somewhere]
     pixels, scales, visible = (x.index_select(1, somewhere) for x in (pixels, scales, visible))
-    matches = match_projected(
+    matches = match_by_projection(
         points["descriptors"][point_ids].expand(len(keyframes), -1, -1),
         pixels,
         RADIUS_PX * scales,

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
-from torchslam.features import match, match_projected
-from torchslam.features.matching.by_projection import match_within
+from torchslam.features import match, match_by_projection
 from torchslam.geometry import Camera
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
@@ -74,11 +73,8 @@ class DescriptorMatcher:
                 mutual=True,
                 max_distance=limit,
             )
-        if prior.radius_px is not None and view_2.descriptors.dtype == torch.uint8:
-            rows, columns, distances = match_within(view_1, view_2, prior.radius_px, prior.ratio, limit)
-            return Matches(rows[None], columns[None], distances[None], torch.ones_like(rows).bool()[None])
         if prior.radius_px is not None:
-            return match_projected(
+            return match_by_projection(
                 view_1.descriptors[None],
                 view_1.keypoints[None],
                 prior.radius_px[None],

@@ -1,69 +1,18 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.accelerator import simulated_accelerator
-from tests.conftest import HAS_SIMULATED_ACCELERATOR
-from torchslam.features import expand_runs, hamming, match, match_pairs, match_projected
-from torchslam.features.matching.radius_search import nearest_bits, window_pairs
-from torchslam.types import Features, Matches
-
-WIDTH, HEIGHT = 320, 240
-
-
-def features(batch: int, count: int, seed: int = 0, floats: int | None = None) -> Features:
-    """Random keypoints, some of them masked."""
-    g = torch.Generator().manual_seed(seed)
-    keypoints = torch.rand(batch, count, 2, generator=g) * torch.tensor([WIDTH, HEIGHT])
-    level = torch.randint(0, 3, (batch, count), generator=g)
-    if floats is None:
-        descriptors = torch.randint(0, 256, (batch, count, 32), dtype=torch.uint8, generator=g)
-    else:
-        descriptors = torch.nn.functional.normalize(torch.randn(batch, count, floats, generator=g), dim=-1)
-    return Features(
-        keypoints=keypoints,
-        scores=torch.rand(batch, count, generator=g),
-        scales=1.2**level,
-        angles=(torch.rand(batch, count, generator=g) * 2 - 1) * math.pi,
-        descriptors=descriptors,
-        mask=torch.rand(batch, count, generator=g) < 0.9,
-    )
-
-
-def disturbed(first: Features, seed: int, flips: int = 30) -> Features:
-    """The same features in another order, with some bits flipped (floats: some noise)."""
-    g = torch.Generator().manual_seed(seed)
-    order = torch.randperm(first.mask.shape[1], generator=g)
-    second = first.rows(order)
-    d = second.descriptors
-    if d.dtype == torch.uint8:
-        noise = torch.rand(*d.shape, 8, generator=g) < flips / 256
-        d = d ^ (noise * 2 ** torch.arange(8)).sum(-1).to(torch.uint8)
-    else:
-        d = torch.nn.functional.normalize(d + 0.1 * torch.randn(d.shape, generator=g), dim=-1)
-    return replace(second, descriptors=d)
-
-
-def pairs(matches: Matches, row: int = 0) -> dict[int, int]:
-    kept = matches.mask[row]
-    return dict(
-        zip(matches.indices_1[row][kept].tolist(), matches.indices_2[row][kept].tolist(), strict=True)
-    )
-
-
-def distances_between(first: Features, second: Features) -> Tensor:
-    if first.descriptors.dtype == torch.uint8:
-        return hamming(first.descriptors, second.descriptors).float()
-    return 1 - first.descriptors @ second.descriptors.mT
+from tests.features.matching.random_features import distances_between, disturbed, features, pairs
+from torchslam.features import hamming, match, match_by_projection, match_pairs
+from torchslam.types import Features
 
 
 def reference(
@@ -233,105 +182,6 @@ def test_soft_weights_and_distances_have_right_gradients() -> None:
     assert torch.autograd.gradcheck(outputs, (first.requires_grad_(), second.requires_grad_()))
 
 
-def naive_projected(
-    query: Features,
-    pixels: Tensor,
-    radius: Tensor,
-    second: Features,
-    row: int,
-    ratio: float,
-    limit: float,
-    guided: bool,
-) -> dict[int, int]:
-    d = distances_between(query, second)[row]
-    claims: dict[int, tuple[float, int]] = {}
-    for i in range(d.shape[0]):
-        if not query.mask[row, i]:
-            continue
-        candidates = []
-        for j in range(d.shape[1]):
-            apart = (second.keypoints[row, j] - pixels[row, i]).norm()
-            factor = float(second.scales[row, j] / query.scales[row, i])
-            turn = float((second.angles[row, j] - query.angles[row, i] + math.pi) % (2 * math.pi) - math.pi)
-            fits = not guided or (1 / 1.3 <= factor <= 1.3 and abs(turn) <= 0.5)
-            if second.mask[row, j] and apart <= radius[row, i] and fits:
-                candidates.append((float(d[i, j]), j))
-        if not candidates:
-            continue
-        nearest, j = min(candidates)
-        same_scale = [c for c, k in candidates if k != j and second.scales[row, k] == second.scales[row, j]]
-        good = nearest <= limit and nearest < ratio * min(same_scale, default=math.inf)
-        if good and (nearest, i) < claims.get(j, (math.inf, -1)):
-            claims[j] = (nearest, i)
-    return {i: j for j, (_, i) in claims.items()}
-
-
-@pytest.mark.parametrize("floats", [None, 16])
-@pytest.mark.parametrize("guided", [True, False])
-@given(seed=st.integers(0, 1000), size=st.sampled_from([5.0, 40.0, 400.0]))
-@settings(max_examples=10, deadline=None)
-def test_match_projected_equals_the_loop(floats: int | None, guided: bool, seed: int, size: float) -> None:
-    query = features(2, 25, seed, floats)
-    second = disturbed(query, seed + 1)
-    g = torch.Generator().manual_seed(seed + 2)
-    pixels = query.keypoints + torch.randn(2, 25, 2, generator=g) * 4
-    pixels[0, 0], pixels[1, 0], pixels[1, 1] = -1e4, 1e30, math.nan
-    radius = size * torch.rand(2, 25, generator=g)
-    limit = 60 if floats is None else 0.3
-    extras = {"scales": query.scales, "angles": query.angles} if guided else {}
-    matches = match_projected(
-        query.descriptors,
-        pixels,
-        radius,
-        second,
-        query.mask,
-        ratio=0.9,
-        max_distance=limit,
-        scale_tolerance=1.3,
-        angle_tolerance=0.5,
-        **extras,
-    )
-    for row in range(2):
-        assert pairs(matches, row) == naive_projected(query, pixels, radius, second, row, 0.9, limit, guided)
-
-
-def test_match_projected_with_one_radius_and_no_limits() -> None:
-    first = features(1, 30, 9)
-    matches = match_projected(
-        first.descriptors, first.keypoints, 1e-3, first, first.mask, ratio=None, max_distance=None
-    )
-    valid = first.mask[0].nonzero()[:, 0].tolist()
-    assert pairs(matches) == {i: i for i in valid}
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
-def test_match_projected_of_nothing(rows: int, columns: int) -> None:
-    query = features(1, rows)
-    matches = match_projected(query.descriptors, query.keypoints, 10.0, features(1, columns))
-    assert matches.mask.shape == (1, rows)
-    assert not matches.mask.any()
-
-
-def test_match_projected_with_nothing_in_the_windows() -> None:
-    first = features(1, 10)
-    matches = match_projected(first.descriptors, first.keypoints + 1000, 5.0, first)
-    assert not matches.mask.any()
-    assert matches.distances.isfinite().all()
-
-
-def test_match_projected_distances_carry_gradients() -> None:
-    base = features(1, 8, 11, 5)
-
-    def distances(a: Tensor, b: Tensor) -> Tensor:
-        found = match_projected(
-            a, base.keypoints, 50.0, replace(base, descriptors=b), base.mask, max_distance=None
-        )
-        return found.distances
-
-    a, b = (base.descriptors.double().clone().requires_grad_() for _ in range(2))
-    assert torch.autograd.gradcheck(distances, (a, b))
-
-
 def test_matching_moves_to_the_device(device: torch.device) -> None:
     first = features(2, 40, 12)
     second = disturbed(first, 13)
@@ -339,65 +189,8 @@ def test_matching_moves_to_the_device(device: torch.device) -> None:
     found = match(first.to(device), second.to(device))
     assert torch.equal(found.indices_2.cpu(), expected.indices_2)
     moved = first.to(device)
-    projected = match_projected(moved.descriptors, moved.keypoints, 30.0, second.to(device))
+    projected = match_by_projection(moved.descriptors, moved.keypoints, 30.0, second.to(device))
     assert projected.mask.device.type == device.type
-
-
-@given(
-    seed=st.integers(0, 1000),
-    batch=st.integers(1, 3),
-    spread=st.sampled_from([1.0, 20.0, 1e5]),
-    largest=st.sampled_from([0.0, 25.0, 400.0]),
-)
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)  # of the fixture nothing is kept
-def test_windows_hold_what_is_near(
-    device: torch.device, seed: int, batch: int, spread: float, largest: float
-) -> None:
-    """Wherever keypoints are, in front of the first cell and behind the last one too."""
-    first, second = features(batch, 60, seed), features(batch, 70, seed + 1)
-    places, keypoints = ((view.keypoints.double() - 100) * spread + 100 for view in (first, second))
-    keypoints[:, :20] = places[:, :20]  # within a radius of nothing
-    radius = largest * torch.rand(batch, 60, generator=torch.Generator().manual_seed(seed)).double()
-    inputs = (places, radius, first.mask, keypoints, second.mask)
-    row, column = (found.cpu() for found in window_pairs(*(tensor.to(device) for tensor in inputs)))
-    squared = (places[:, :, None] - keypoints[:, None]).square().sum(-1)
-    near = (squared <= radius.square()[..., None]) & first.mask[..., None] & second.mask[:, None]
-    b, i, j = near.nonzero(as_tuple=True)
-    assert (row.diff() >= 0).all()
-    assert sorted(zip(row.tolist(), column.tolist(), strict=True)) == list(
-        zip((b * 60 + i).tolist(), (b * 70 + j).tolist(), strict=True)
-    )
-
-
-@given(
-    seed=st.integers(0, 1000), ratio=st.sampled_from([None, 0.5, 0.9]), pairs=st.sampled_from([0, 1, 40, 400])
-)
-@settings(max_examples=60, deadline=None)
-def test_the_nearest_of_pairs(seed: int, ratio: float | None, pairs: int) -> None:
-    """As one finds it pair by pair, on the CPU and elsewhere, with many ties."""
-    generator = torch.Generator().manual_seed(seed)
-    key = torch.randperm(30 * 20, generator=generator)[:pairs].sort().values
-    row, column = key // 20, key % 20
-    distance = torch.randint(0, 12, (len(key),), generator=generator)
-    scales = 1.2 ** torch.randint(0, 3, (20,), generator=generator).double()
-    wanted: dict[int, tuple[int, int, int]] = {}
-    for i in range(30):
-        of_row = sorted((int(d), int(c)) for r, c, d in zip(row, column, distance, strict=True) if r == i)
-        if not of_row or of_row[0][0] > 9:
-            continue
-        nearest, chosen = of_row[0]
-        others = [d for d, c in of_row[1:] if scales[c] == scales[chosen]]
-        if ratio is not None and others and not nearest < ratio * min(others):
-            continue
-        wanted[chosen] = min(wanted.get(chosen, (99, 0, 0)), (nearest, i, chosen))
-    expected = sorted((i, c, d) for d, i, c in wanted.values())
-    with simulated_accelerator() if HAS_SIMULATED_ACCELERATOR else nullcontext(torch.device("cpu")) as other:
-        for where in (torch.device("cpu"), other):
-            inputs = (tensor.to(where) for tensor in (row, column, distance))
-            found = [x.tolist() for x in nearest_bits(*inputs, 30, scales.to(where), ratio, 9)]
-            assert list(zip(*found, strict=True)) == expected
 
 
 @pytest.mark.parametrize("wrong", [1.1, 0.5, torch.nan, torch.inf])
@@ -412,7 +205,7 @@ def test_descriptors_of_another_length_are_an_error(wrong: float) -> None:
     with pytest.raises(ValueError, match=words):
         match(features, replace(features, descriptors=spoilt))
     with pytest.raises(ValueError, match=words):
-        match_projected(spoilt, torch.zeros(1, 5, 2), 5.0, features)
+        match_by_projection(spoilt, torch.zeros(1, 5, 2), 5.0, features)
     with pytest.raises(ValueError, match=words):
         match_pairs(descriptors[0], spoilt[0], torch.arange(5), torch.arange(5), 0.5)
 
@@ -445,9 +238,3 @@ def test_pairs_match_as_all_against_all_where_only_they_are_allowed(
     )
     assert pairs(wanted) == dict(zip(rows.tolist(), columns.tolist(), strict=True))
     assert (rows.diff() > 0).all()
-
-
-def test_runs_are_expanded(device: torch.device) -> None:
-    run, number = expand_runs(torch.tensor([3, 7, 0], device=device), torch.tensor([5, 7, 3], device=device))
-    assert run.tolist() == [0, 0, 2, 2, 2]
-    assert number.tolist() == [3, 4, 0, 1, 2]

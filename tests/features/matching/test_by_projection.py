@@ -1,72 +1,117 @@
-"""Lean matching near predictions, against `match_projected`, which takes the long way."""
+"""Matching near predicted pixels, against a plain loop."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
 
-from torchslam.features import match_projected
-from torchslam.features.matching.by_projection import match_within
-from torchslam.types import FrameFeatures
+from tests.features.matching.random_features import distances_between, disturbed, features, pairs
+from torchslam.features import match_by_projection
+from torchslam.types import Features
 
 
-def view_of(count: int, seed: int, words: int = 8) -> FrameFeatures:
-    """Keypoints all over, few distinct descriptors and scales: ties and rivals everywhere."""
-    generator = torch.Generator().manual_seed(seed)
-    codes = torch.randint(0, 256, (words, 32), generator=generator, dtype=torch.uint8)
-    descriptors = codes[torch.randint(0, words, (count,), generator=generator)]
-    flips = torch.randint(0, 2, (count, 32), generator=generator, dtype=torch.uint8)
-    return FrameFeatures(
-        0,
-        0.0,
-        keypoints=torch.rand(count, 2, generator=generator, dtype=torch.float64) * 200 - 5,
-        scales=1.2 ** torch.randint(0, 4, (count,), generator=generator).double(),
-        angles=torch.zeros(count, dtype=torch.float64),
-        descriptors=descriptors ^ flips,
-        mask=torch.rand(count, generator=generator) > 0.1,
+def naive_projected(
+    query: Features,
+    pixels: Tensor,
+    radius: Tensor,
+    second: Features,
+    row: int,
+    ratio: float,
+    limit: float,
+    guided: bool,
+) -> dict[int, int]:
+    d = distances_between(query, second)[row]
+    claims: dict[int, tuple[float, int]] = {}
+    for i in range(d.shape[0]):
+        if not query.mask[row, i]:
+            continue
+        candidates = []
+        for j in range(d.shape[1]):
+            apart = (second.keypoints[row, j] - pixels[row, i]).norm()
+            factor = float(second.scales[row, j] / query.scales[row, i])
+            turn = float((second.angles[row, j] - query.angles[row, i] + math.pi) % (2 * math.pi) - math.pi)
+            fits = not guided or (1 / 1.3 <= factor <= 1.3 and abs(turn) <= 0.5)
+            if second.mask[row, j] and apart <= radius[row, i] and fits:
+                candidates.append((float(d[i, j]), j))
+        if not candidates:
+            continue
+        nearest, j = min(candidates)
+        same_scale = [c for c, k in candidates if k != j and second.scales[row, k] == second.scales[row, j]]
+        good = nearest <= limit and nearest < ratio * min(same_scale, default=math.inf)
+        if good and (nearest, i) < claims.get(j, (math.inf, -1)):
+            claims[j] = (nearest, i)
+    return {i: j for j, (_, i) in claims.items()}
+
+
+@pytest.mark.parametrize("floats", [None, 16])
+@pytest.mark.parametrize("guided", [True, False])
+@given(seed=st.integers(0, 1000), size=st.sampled_from([5.0, 40.0, 400.0]))
+@settings(max_examples=10, deadline=None)
+def test_match_by_projection_equals_the_loop(
+    floats: int | None, guided: bool, seed: int, size: float
+) -> None:
+    query = features(2, 25, seed, floats)
+    second = disturbed(query, seed + 1)
+    g = torch.Generator().manual_seed(seed + 2)
+    pixels = query.keypoints + torch.randn(2, 25, 2, generator=g) * 4
+    pixels[0, 0], pixels[1, 0], pixels[1, 1] = -1e4, 1e30, math.nan
+    radius = size * torch.rand(2, 25, generator=g)
+    limit = 60 if floats is None else 0.3
+    extras = {"scales": query.scales, "angles": query.angles} if guided else {}
+    matches = match_by_projection(
+        query.descriptors,
+        pixels,
+        radius,
+        second,
+        query.mask,
+        ratio=0.9,
+        max_distance=limit,
+        scale_tolerance=1.3,
+        angle_tolerance=0.5,
+        **extras,
     )
+    for row in range(2):
+        assert pairs(matches, row) == naive_projected(query, pixels, radius, second, row, 0.9, limit, guided)
 
 
-@pytest.mark.parametrize("ratio", [0.9, None])
-@pytest.mark.parametrize("limit", [4, 64, 256])
-@pytest.mark.parametrize("size", [2.0, 20.0, 300.0])
-def test_it_finds_what_match_projected_finds(ratio: float | None, limit: int, size: float) -> None:
-    found = 0
-    for seed in range(5):
-        expected, view = view_of(60, seed), view_of(80, seed + 100)
-        view.descriptors[:60] = expected.descriptors ^ (torch.arange(32) == 3).to(torch.uint8)
-        view.keypoints[:60] = expected.keypoints + 1.0
-        radius = size * (0.5 + torch.arange(60).double() / 60)
-        wanted = match_projected(
-            expected.descriptors[None],
-            expected.keypoints[None],
-            radius[None],
-            view.features,
-            mask=expected.mask[None],
-            scales=expected.scales[None],
-            ratio=ratio,
-            max_distance=limit,
-        )
-        rows, columns, distances = match_within(expected, view, radius, ratio, limit)
-        mask = wanted.mask[0]
-        assert torch.equal(rows, wanted.indices_1[0][mask])
-        assert torch.equal(columns, wanted.indices_2[0][mask])
-        assert torch.equal(distances, wanted.distances[0][mask])
-        found += len(rows)
-    assert found > 0
+def test_match_by_projection_with_one_radius_and_no_limits() -> None:
+    first = features(1, 30, 9)
+    matches = match_by_projection(
+        first.descriptors, first.keypoints, 1e-3, first, first.mask, ratio=None, max_distance=None
+    )
+    valid = first.mask[0].nonzero()[:, 0].tolist()
+    assert pairs(matches) == {i: i for i in valid}
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
-def test_nothing_matches_nothing(rows: int, columns: int) -> None:
-    first, second, _ = match_within(view_of(rows, 0), view_of(columns, 1), torch.ones(rows).double(), 0.9, 64)
-    assert len(first) == len(second) == 0
-    assert first.dtype == torch.int64
+def test_match_by_projection_of_nothing(rows: int, columns: int) -> None:
+    query = features(1, rows)
+    matches = match_by_projection(query.descriptors, query.keypoints, 10.0, features(1, columns))
+    assert matches.mask.shape == (1, rows)
+    assert not matches.mask.any()
 
 
-def test_no_keypoint_in_any_window() -> None:
-    view = view_of(20, 0)
-    elsewhere = replace(view, keypoints=view.keypoints + 500)
-    rows, *_ = match_within(view, elsewhere, torch.full((20,), 9.0).double(), 0.9, 64)
-    assert len(rows) == 0
+def test_match_by_projection_with_nothing_in_the_windows() -> None:
+    first = features(1, 10)
+    matches = match_by_projection(first.descriptors, first.keypoints + 1000, 5.0, first)
+    assert not matches.mask.any()
+    assert matches.distances.isfinite().all()
+
+
+def test_match_by_projection_distances_carry_gradients() -> None:
+    base = features(1, 8, 11, 5)
+
+    def distances(a: Tensor, b: Tensor) -> Tensor:
+        found = match_by_projection(
+            a, base.keypoints, 50.0, replace(base, descriptors=b), base.mask, max_distance=None
+        )
+        return found.distances
+
+    a, b = (base.descriptors.double().clone().requires_grad_() for _ in range(2))
+    assert torch.autograd.gradcheck(distances, (a, b))

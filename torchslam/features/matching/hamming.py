@@ -1,9 +1,9 @@
-"""Binary descriptors: 256 bits packed in 32 bytes, and the Hamming distance between them."""
+"""Binary descriptors of 256 bits, packed in 32 bytes; Hamming distances; exact nearest neighbors."""
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,12 @@ from torch import Tensor
 
 # Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
 _GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
+
+# Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
+_AMPLITUDE = 64
+_INDEX_BITS = 13
+_CHUNK = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
+_MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
 
 def pack_bits(bits: Tensor) -> Tensor:
@@ -62,8 +68,11 @@ def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
 def hamming_between(descriptors_1: Tensor, rows: Tensor, descriptors_2: Tensor, columns: Tensor) -> Tensor:
     """Hamming distances of pairs (P,), (P,) of rows of (N1, D) and (N2, D) uint8, D as for `hamming_pairs`: (P,) int64.
 
-    On the CPU by numpy, which gathers words and counts bits several times as fast, in versions from 2 on.
+    On the CPU by NumPy, which gathers words and counts bits several times as fast, in versions from 2 on.
     """
+    if len(rows) > _CHUNK:
+        chunks = zip(rows.split(_CHUNK), columns.split(_CHUNK), strict=True)
+        return torch.cat([hamming_between(descriptors_1, r, descriptors_2, c) for r, c in chunks])
     if not (rows.is_cpu and hasattr(np, "bitwise_count")):
         return hamming_pairs(descriptors_1.index_select(0, rows), descriptors_2.index_select(0, columns))
     words_1, words_2 = (
@@ -126,3 +135,84 @@ def _fast_int8(device: torch.device) -> bool:
         and torch.backends.mkldnn.is_available()
         and torch.backends.cpu.get_cpu_capability().startswith("AVX512")
     )
+
+
+class Nearest(NamedTuple):
+    """Nearest columns of N1 rows.
+
+    column:   (B, N1) the nearest column
+    distance: (B, N1) to it
+    found:    (B, N1) whether any column may match
+    mutual:   (B, N1) whether no other row is nearer to that column
+    second:   (B, N1) distance of the second nearest column, if requested
+    """
+
+    column: Tensor
+    distance: Tensor
+    found: Tensor
+    mutual: Tensor
+    second: Tensor | None
+
+
+def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
+    """(B, N1, N2) bool, the pairs that may match."""
+    possible = mask_1[:, :, None] & mask_2[:, None, :]
+    return possible if allowed is None else possible & allowed
+
+
+def nearest_by_hamming(
+    descriptors_1: Tensor,
+    descriptors_2: Tensor,
+    mask_1: Tensor,
+    mask_2: Tensor,
+    allowed: Tensor | None,
+    with_second: bool,
+) -> Nearest:
+    """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
+    keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
+    bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
+    columns = keys.shape[2]
+    if columns > 1 << _INDEX_BITS:  # more columns than the free bits can number: wider keys
+        index_bits = columns.bit_length()
+        keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
+    highest = (1 << index_bits) - 1
+    masked = _MASKED << (index_bits - _INDEX_BITS)
+    if allowed is not None:
+        keys.masked_fill_(~allowed, masked)
+    numbers = highest - torch.arange(columns, device=keys.device) + masked * ~mask_2
+    keys += numbers.to(keys.dtype)[:, None, :]
+    keys += (masked * ~mask_1).to(keys.dtype)[:, :, None]
+
+    def distance(key: Tensor) -> Tensor:
+        return (bits // 2 - (key.to(torch.int64) >> index_bits)).float()
+
+    best, column_best = keys.amax(2), keys.amax(1)
+    column, nearest, second = highest - (best.to(torch.int64) & highest), distance(best), None
+    if with_second:
+        keys.scatter_(2, column[..., None], 2 * masked)
+        second = distance(keys.amax(2))
+        second = torch.where(second > bits, torch.inf, second)
+    mutual = nearest <= distance(column_best).gather(1, column)
+    return Nearest(column, nearest, nearest <= bits, mutual, second)
+
+
+def nearest_by_cosine(
+    similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None, with_second: bool
+) -> Nearest:
+    """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
+    values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
+    best, column = values.max(2)
+    mutual = best >= values.amax(1).gather(1, column)
+    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2) if with_second else None
+    nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
+    return Nearest(column, nearest, best > -torch.inf, mutual, second)
+
+
+def dual_softmax(
+    logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
+) -> Tensor:
+    """Product of the softmax over columns and over rows at (row, column[row]): (B, N1, N2), (B, N1) -> (B, N1)."""
+    low = torch.finfo(logits.dtype).min / 2
+    logits = logits.masked_fill(~_possible(mask_1, mask_2, allowed), low)
+    both = logits.softmax(2) * logits.softmax(1)
+    return both.gather(2, column[..., None])[..., 0]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import IndependentMotionConfig, MatchingConfig
-from torchslam.features import match_projected
+from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
 from torchslam.tracking.correspondences import match_views
 from torchslam.tracking.dynamic.static_overlay import distances_to_segments
@@ -89,7 +89,7 @@ class IndependentMotion:
         if self._last is not None:
             self._last = replace(self._last, T_cw=None)
 
-    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints of what moves, which is followed to where it is now."""
         self._since += 1
         self._unseen += 1
@@ -101,21 +101,21 @@ class IndependentMotion:
             return view
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
-    def observe(self, view: FrameFeatures, tracked: PoseEstimate) -> Movement:
+    def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
         """Compare a posed frame with one some frames earlier; in doubt where the map agrees with little of the image.
 
         view: with all its keypoints
         """
-        mover, seen = self._mover, view.keypoints[tracked.keypoints]
+        mover, seen = self._mover, view.keypoints[estimate.keypoints]
         if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
             return Movement(True, "most of the image moves by itself")
         if self._last is None or self._since >= self.settings.frame_interval:
-            return self._look_again(view, tracked.T_cw, tracked.depth)
+            return self._look_again(view, estimate.T_cw, estimate.depth)
         return NOTHING
 
     def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
         """Where it is in the next frame, by how it looks; None when it is gone, or not seen to move for long."""
-        matches = match_projected(
+        matches = match_by_projection(
             mover.descriptors[None],
             (mover.pixels + mover.motion)[None],
             self.settings.search_px,

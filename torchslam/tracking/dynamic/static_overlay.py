@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import MatchingConfig, StaticOverlayConfig
-from torchslam.features import match_projected
+from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
@@ -57,7 +57,7 @@ class StaticOverlayDetector:
         self._last: _Look | None = None
         self._pause = 0
 
-    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints that are known to stay."""
         if not bool((self.evidence >= self.settings.min_evidence).any()):
             return view
@@ -117,7 +117,7 @@ class StaticOverlayDetector:
     def _stayed(self, earlier: FrameFeatures, view: FrameFeatures, candidates: Tensor) -> Tensor:
         """(m, 2) pixels of the candidates (N,) among the keypoints of an earlier view that look the same now."""
         rows = torch.nonzero(candidates)[:, 0]
-        matches = match_projected(
+        matches = match_by_projection(
             earlier.descriptors[rows][None],
             earlier.keypoints[rows][None],
             self.settings.radius_px,
