@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
-from torchslam.batch.fingerprints import digest, of_files, program
-from torchslam.batch.result_store import RUNS, run_or_reuse
+from torchslam.batch.result_store import RUNS, hash_files, hash_json, program_hash, run_or_reuse
 from torchslam.batch.rows import short_name
 from torchslam.batch.table import read_times
 from torchslam.data import Sequence as Frames
@@ -91,8 +90,8 @@ def kept(
     """
 
     def fingerprints_of() -> Columns:
-        config = digest({"label": label, "settings": list(settings), "program": program()})
-        return {"configuration": config, "input": of_files([f"{code}/*.py", str(DATA_DIR)])}
+        config = hash_json({"label": label, "settings": list(settings), "program": program_hash()})
+        return {"configuration": config, "input": hash_files([f"{code}/*.py", str(DATA_DIR)])}
 
     return run_or_reuse(Path(output), name, fingerprints_of, work, overwrite=True)
 

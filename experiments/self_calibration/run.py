@@ -15,7 +15,7 @@ from experiments.common import DATA_DIR, add_engine, check, each_case, kept, tab
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
 from torchslam.calibration import FoundCamera, Round, calibrate, estimate_intrinsics
-from torchslam.calibration.report import contradiction
+from torchslam.calibration.find_camera import contradiction
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence

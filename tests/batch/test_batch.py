@@ -18,8 +18,7 @@ from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch,
 from tests.cli.test_cli import write_tum_folder
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import table as tables
-from torchslam.batch.fingerprints import of_files
-from torchslam.batch.result_store import ERRORS, RECORD, RUNS
+from torchslam.batch.result_store import ERRORS, RECORD, RUNS, hash_files
 from torchslam.cli.main import main
 from torchslam.errors import ConfigError
 
@@ -109,7 +108,7 @@ def test_what_is_done_is_not_done_again(
     shutil.copytree(whole, again)
     assert batch(listed, again) == 4
     said = capsys.readouterr()
-    assert "3 of them were there before" in said.out
+    assert "3 of them already existed" in said.out
     assert "torchslam: 1/5 one: 10 of 10 frames posed" in said.err
     assert times_of_change(again) == times_of_change(whole)
     assert content(again) == content(whole)
@@ -161,16 +160,16 @@ def test_the_files_of_a_sequence_are_known_by_name_size_and_time(tmp_path: Path)
     (folder / "rgb").mkdir(parents=True)
     (folder / "rgb" / "0.png").write_bytes(b"1")
     (folder / "nowhere").symlink_to(tmp_path / "nothing")
-    first = of_files([str(folder)])
-    assert of_files([str(folder)]) == first
-    assert of_files([str(folder), str(tmp_path / "missing")]) != first
+    first = hash_files([str(folder)])
+    assert hash_files([str(folder)]) == first
+    assert hash_files([str(folder), str(tmp_path / "missing")]) != first
     os.utime(folder / "rgb" / "0.png", ns=(1, 1))
-    second = of_files([str(folder)])
+    second = hash_files([str(folder)])
     assert second != first
     (folder / "rgb" / "1.png").write_bytes(b"1")
-    assert of_files([str(folder)]) not in (first, second)
-    assert of_files([str(folder / "rgb" / "*.png")]) != of_files([str(folder / "rgb" / "0*.png")])
-    assert of_files(["synthetic:room"]) != of_files(["synthetic:planar"])
+    assert hash_files([str(folder)]) not in (first, second)
+    assert hash_files([str(folder / "rgb" / "*.png")]) != hash_files([str(folder / "rgb" / "0*.png")])
+    assert hash_files(["synthetic:room"]) != hash_files(["synthetic:planar"])
 
 
 # --- shards, kills -------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torchslam.calibration import FoundCamera, estimate_intrinsics
-from torchslam.calibration.keyframes import FOCAL, K1, adjust_with_camera, frames_of, problem_of
-from torchslam.calibration.report import contradiction, describe_camera
+from torchslam.calibration.find_camera import contradiction, describe_camera
+from torchslam.calibration.intrinsics import FOCAL, K1, adjust_with_camera, frames_of, problem_of
 from torchslam.geometry import Camera
 from torchslam.optim.run_graph import ObservationGraph
 
@@ -161,5 +161,5 @@ def test_few_keyframes_have_frames_between_them_counted(simulated: Make, truth: 
 
 def test_the_largest_world_is_asked(simulated: Make, truth: Camera) -> None:
     graph = simulated(straight(truth), frames=40)
-    worlds = replace(graph, world=(torch.arange(40) >= 10).long())
-    assert frames_of(worlds).tolist() == list(range(10, 40))
+    submaps = replace(graph, submap=(torch.arange(40) >= 10).long())
+    assert frames_of(submaps).tolist() == list(range(10, 40))

@@ -9,7 +9,7 @@ import torch
 
 from tests.walks import Walk, arc, turn
 from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
-from torchslam.calibration.report import contradiction, describe_camera
+from torchslam.calibration.find_camera import contradiction, describe_camera
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.geometry import Camera

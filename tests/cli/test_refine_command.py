@@ -19,7 +19,7 @@ from torchslam.data.formats.trajectory_file import write_trajectory
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.conventions import opengl, quaternion_wxyz
 from torchslam.io.export.nerfstudio import nerfstudio_camera
-from torchslam.refine.alignment import align_to_input
+from torchslam.refine.pose_refinement import align_to_input
 from torchslam.types import Trajectory
 
 FRAMES = 8
@@ -40,7 +40,7 @@ def truth() -> Tensor:
 
 @pytest.fixture(scope="module")
 def given(truth: Tensor) -> Tensor:
-    return se3_inverse(disturbed(truth, centimetres=2.0, degrees=1.0).T_wc)
+    return se3_inverse(disturbed(truth, centimeters=2.0, degrees=1.0).T_wc)
 
 
 def write(kind: str, given: Tensor, folder: Path) -> Path:
@@ -82,7 +82,7 @@ def test_poses_come_back_as_they_came(
     assert main([*arguments, *camera, *FAST]) == 0
     printed = capsys.readouterr().out
     assert "8 from" in printed
-    assert "1 of no image here; 1 of 8 images have none" in printed
+    assert "1 have no image; 1 of 8 images have no pose" in printed
     names = {"tum": "phone.txt", "nerfstudio": "transforms.json", "colmap": "."}
     refined = read_poses(results / "refined" / names[kind])
     assert refined.kind == kind
@@ -115,10 +115,10 @@ def test_poses_come_back_as_they_came(
 
 
 def shape_errors(T_cw: Tensor, truth: Tensor) -> float:
-    """Root mean square of the distances of the centres, after a similarity."""
+    """Root mean square of the distances of the centers, after a similarity."""
     S = align_to_input(T_cw, truth)
-    centres = se3_inverse(T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
-    return float((centres - se3_inverse(truth)[:, :3, 3]).square().sum(-1).mean().sqrt())
+    centers = se3_inverse(T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
+    return float((centers - se3_inverse(truth)[:, :3, 3]).square().sum(-1).mean().sqrt())
 
 
 def test_what_users_get_wrong(

@@ -27,7 +27,7 @@ from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
 from torchslam.data.formats.given_poses import read_poses
-from torchslam.data.formats.image_file import read_colour, read_grey
+from torchslam.data.formats.image_file import read_color, read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
@@ -121,7 +121,7 @@ def _row_and_times() -> Files:
         "error": "",
         "posed": 3,
     }
-    record |= {"frames": 4, "ate_m": 0.25, "path_length_m": 1.5, "camera": "as given", "initialised_at": None}
+    record |= {"frames": 4, "ate_m": 0.25, "path_length_m": 1.5, "camera": "as given", "initialized_at": None}
     times = {"cpu_s": 1.5, "fps": 12.0, "stage_ms": {"total": {"median": 2.0}}}
     files = {"row.json": record, "times.json": times}
     return {name: json.dumps(content, indent=2).encode() for name, content in files.items()}
@@ -193,11 +193,11 @@ def _trajectory(root: Path) -> None:
 
 def _map(root: Path) -> None:
     saved = read_atlas(root / "map.safetensors")
-    for world in saved.worlds:
-        assert bool(world.trajectory().T_wc.isfinite().all())
-        world.history.graph(world.map, saved.camera)
+    for submap in saved.atlas:
+        assert bool(submap.trajectory().T_wc.isfinite().all())
+        submap.posed_frames.graph(submap.map, saved.camera)
     session = Session.load(root / "map.safetensors")
-    write_atlas(root / "again", session.worlds, session.camera, session.number)
+    write_atlas(root / "again", session.atlas, session.camera, session.number)
     read_atlas(root / "again")
 
 
@@ -211,7 +211,7 @@ def _checkpoint(root: Path) -> None:
 
 def _graph(root: Path) -> object:
     graph = RunGraph.load(root / "graph.safetensors")
-    return [graph.part(world) for world in graph.worlds]
+    return [graph.part(submap) for submap in graph.submaps]
 
 
 def _results(root: Path) -> str:
@@ -269,10 +269,10 @@ def _record(root: Path) -> None:
 
 def _image(root: Path) -> None:
     path = next(root.iterdir(), root / "a")
-    grey = read_grey(path, str(path))
+    grey = read_gray(path, str(path))
     assert bool(grey.isfinite().all())
     assert 0 <= float(grey.min()) <= float(grey.max()) <= 1
-    assert read_colour(path, str(path)).shape[2] == 3
+    assert read_color(path, str(path)).shape[2] == 3
 
 
 def _calibration(root: Path) -> None:

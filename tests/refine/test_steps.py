@@ -12,12 +12,18 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, sideways
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, so3_log, transform
-from torchslam.refine.adjustment import align_rotations, build_map
-from torchslam.refine.alignment import align_to_input
-from torchslam.refine.pairs import Pair, candidates, choose_keyframes, find_pairs
-from torchslam.refine.refine import largest_connected_part
-from torchslam.refine.rotations import average_rotations
-from torchslam.refine.tracks import Tracks, join_matches, make_map, triangulate_tracks
+from torchslam.refine.map_building import align_rotations, average_rotations, build_map
+from torchslam.refine.pose_refinement import align_to_input, largest_connected_part
+from torchslam.refine.tracks import (
+    Pair,
+    Tracks,
+    candidates,
+    choose_keyframes,
+    find_pairs,
+    join_matches,
+    make_map,
+    triangulate_tracks,
+)
 
 CONFIG = Config()
 

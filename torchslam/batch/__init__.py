@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from torchslam.batch.engines import ENGINES, RETRIES, Engine
+from torchslam.batch.engines import ENGINES, RETRIES, Engine, Shard, parse_shard
 from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, store_failure
 from torchslam.batch.rows import Row, named, read_list
-from torchslam.batch.shards import Shard, parse_shard
 from torchslam.batch.table import write_table
 from torchslam.batch.task import Task, configuration, run_row
 

@@ -1,17 +1,25 @@
-"""Results that are there whole or not at all, with the record of what they are the results of.
+"""Results that are complete or absent, each with a fingerprint of what it depends on.
 
-In the folder of a batch: `runs/NAME/` has what a run wrote, with its record; `errors/NAME.json` says why there is none.
+In the folder of a batch, `runs/NAME/` has what a run wrote, with its record; `errors/NAME.json` has the error instead.
+A fingerprint hashes the settings, the program, the files that were read and the weights.
 """
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
+import os
+import stat
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from torchslam.errors import ResultsError, TorchslamError
+import torchslam
+from torchslam.data.synthetic import sequence as synthetic
+from torchslam.errors import ResultsError, SequenceError, TorchslamError
 from torchslam.utils.atomic_write import whole_folder, write_whole
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
 
@@ -113,3 +121,77 @@ def _describe(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text[:1000]} ({Path(place.filename).name}:{place.lineno})"
+
+
+MAX_FILES = 1_000_000
+"""Below the path of a sequence: a folder with more is none."""
+DIGITS = 16
+"""Hexadecimal ones of a hash that are kept: two of a billion are the same by chance with 3 %."""
+
+
+def hash_json(values: Mapping[str, Any]) -> str:
+    """A hash of what JSON can say."""
+    text = json.dumps(values, sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+
+
+@cache
+def program_hash() -> str:
+    """Version and files of this package: another program may find something else."""
+    root = Path(torchslam.__file__).parent
+    found = hashlib.sha256(torchslam.__version__.encode())
+    for path in sorted(root.rglob("*")):
+        if path.suffix in (".py", ".safetensors", ".js", ".css", ".html"):
+            found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return f"{torchslam.__version__}+{found.hexdigest()[:DIGITS]}"
+
+
+def hash_files(paths: list[str]) -> str:
+    """A hash of names, sizes and times of last change: of files, of folders with all below them, of patterns.
+
+    What is missing counts as such. The content is not read: that would take as long as reading the images of all
+    sequences at each start. Raises SequenceError for too many files, OSError for what may not be listed.
+    """
+    found = hashlib.sha256()
+    for path in paths:
+        if synthetic.matches(path):
+            found.update(path.encode() + b"\0")
+            continue
+        for name, status in _files(path):
+            found.update(f"{name}\0{status.st_size} {status.st_mtime_ns}\0".encode(errors="surrogateescape"))
+        found.update(b"\1")
+    return found.hexdigest()[:DIGITS]
+
+
+def hash_content(path: str) -> str:
+    """A hash of what is in a file, such as one of weights: another one may be given the size and time of the last.
+
+    What is no file counts as in `hash_files`. Raises OSError for one that cannot be read.
+    """
+    if not os.path.isfile(path):
+        return hash_files([path])
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:DIGITS]
+
+
+def _files(path: str) -> Iterator[tuple[str, os.stat_result]]:
+    """Files by their names below a path, sorted."""
+    if not os.path.isdir(path):
+        for name in [path] if os.path.exists(path) else sorted(glob.glob(path)):
+            yield os.path.basename(name), os.stat(name)
+        return
+    count, waiting = 0, [""]
+    while waiting:
+        folder = waiting.pop()
+        with os.scandir(os.path.join(path, folder)) as entries:
+            for entry in sorted(entries, key=lambda entry: entry.name):
+                name = os.path.join(folder, entry.name)
+                count += 1
+                if count > MAX_FILES:
+                    raise SequenceError(f"{path}: more than {MAX_FILES} files: no sequence")
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(name)
+                elif os.path.exists(entry.path):  # a link may lead nowhere
+                    status = entry.stat()
+                    if stat.S_ISREG(status.st_mode):
+                        yield name, status

@@ -13,10 +13,18 @@ from typing import Any
 
 import torch
 
-from torchslam.batch import fingerprints
-from torchslam.batch.result_store import DONE, NO_MAP, Columns, run_or_reuse
+from torchslam.batch.result_store import (
+    DONE,
+    NO_MAP,
+    Columns,
+    hash_content,
+    hash_files,
+    hash_json,
+    program_hash,
+    run_or_reuse,
+)
 from torchslam.batch.rows import Row
-from torchslam.calibration.auto import RADIAL, find_camera
+from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
@@ -89,13 +97,13 @@ def settings_of(row: Row) -> Config:
 def configuration(task: Task) -> str:
     """A hash of all that decides about the results, the content of the files apart. Raises ConfigError."""
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
-    return fingerprints.digest(
+    return hash_json(
         {
             "row": row,
             "settings": to_toml(settings_of(task.row)),
             "device": torch.device(task.device).type,
             "pictures": task.pictures,
-            "program": fingerprints.program(),
+            "program": program_hash(),
         }
     )
 
@@ -104,11 +112,9 @@ def _input(task: Task) -> str:
     """A hash of the files that the row reads."""
     row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
-    files = fingerprints.of_files([row.path(name) for name in names if name])
+    files = hash_files([row.path(name) for name in names if name])
     weights = [settings.features.weights, settings.matching.weights]
-    return fingerprints.digest(
-        {"files": files, "weights": [fingerprints.of_content(name) for name in weights if name]}
-    )
+    return hash_json({"files": files, "weights": [hash_content(name) for name in weights if name]})
 
 
 def open_row(row: Row) -> Sequence:
@@ -173,7 +179,7 @@ def _columns(figures: Mapping[str, Any]) -> Columns:
         key: value for key, value in figures.items() if value is None or isinstance(value, int | float | str)
     }
     flat |= {f"rpe_{key}": value for key, value in figures.get("rpe", {}).items()}
-    return {**flat, "worlds": len(figures["worlds"]), "skipped": len(figures["skipped"])}
+    return {**flat, "submaps": len(figures["submaps"]), "skipped": len(figures["skipped"])}
 
 
 @contextmanager

@@ -1,24 +1,24 @@
-"""Run many sequences, each once, with one table: alone, as shards of an array of jobs, or on Ray.
+"""Run many sequences and write one table: in one process, as shards of a job array, or on Ray.
 
-LIST is a text with a path on each line (`#` for comments), or a CSV file with a header: `sequence`, and of `name`,
-`camera`, `config`, `overrides` (section.key=value; ...), `groundtruth` (TUM format), `start`, `stop`, `stride`, `fps`,
-`limit`, `resize` and `mask` those that differ from row to row; the options below say the rest. Names of files in it are
-relative to its folder.
+LIST is a text file with one path per line (`#` for comments), or a CSV file with the column `sequence` and any of
+`name`, `camera`, `config`, `overrides` (section.key=value; ...), `groundtruth` (TUM format), `start`, `stop`, `stride`,
+`fps`, `limit`, `resize` and `mask`. The options below apply to all rows without a value of their own. File names in
+LIST are relative to its folder.
 
-In DIR: runs/NAME/ with the results of each sequence, as `torchslam run` writes them but for times, which are in
-times.json; errors/NAME.json for those that failed; table.csv, table.parquet where pyarrow is installed, times.csv and
-table.png. One process or many, in one go or after having been killed: apart from times the same bytes. A sequence is
-run on one thread; what is there already, by settings, program, and names, sizes and times of change of the files below
-its path, is not run again. What failed is tried again by the next call.
+DIR receives: runs/NAME/ with the results of each sequence, as of `torchslam run`, but with the times in times.json;
+errors/NAME.json for sequences that failed; table.csv, table.parquet (if pyarrow is installed), times.csv and table.png.
+Each sequence runs on one thread. Apart from the times, the results do not depend on the number of processes or on
+interruptions. Existing results are reused if the settings, the version, and the names, sizes and modification times of
+the input files are the same. Failed sequences are retried by the next call.
 
-Several jobs may share DIR, each with its `--shard`; the table has the rows of all. In an array of jobs:
+Several jobs can share DIR, each with its own `--shard`; the table contains the rows of all. In a job array:
   Slurm       sbatch --array=0-7 --wrap 'torchslam batch LIST -o DIR --shard auto'
   Kubernetes  completionMode: Indexed, args: [batch, LIST, -o, DIR, --shard, $(JOB_COMPLETION_INDEX)/8]
-`--shard auto` reads SLURM_ARRAY_TASK_ID, _MIN, _MAX and _COUNT, or JOB_COMPLETION_INDEX and, set by yourself,
-JOB_COMPLETIONS. Without --shard no such variable is looked at.
+`--shard auto` reads SLURM_ARRAY_TASK_ID, _MIN, _MAX and _COUNT, or JOB_COMPLETION_INDEX and JOB_COMPLETIONS, which you
+have to set. Without --shard these variables are ignored.
 
-Exit status: 0 all sequences of this call are done ("no map" is a result), 4 some ended with an error, which the table
-says, 2 the batch could not be run; 130 and 143 ended by Ctrl-C and by SIGTERM: the same command goes on.
+Exit status: 0 all sequences of this call are done ("no map" is a result), 4 some failed (the table has the errors),
+2 the batch could not be run; 130 and 143 ended by Ctrl-C and by SIGTERM (the same command continues).
 """
 
 from __future__ import annotations
@@ -42,37 +42,37 @@ READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("list", type=Path, metavar="LIST", help="which sequences: a text, or a CSV file")
+    parser.add_argument("list", type=Path, metavar="LIST", help="list of sequences: a text or CSV file")
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for all results"
     )
     parser.add_argument(
         "--overwrite",
         action="store_true",
-        help="replace results of other settings, files or versions; else these are errors",
+        help="replace results of other settings, files or versions, which are errors otherwise",
     )
     parser.add_argument(
-        "--no-pictures", action="store_true", help="no plots and no view.html for each sequence"
+        "--no-pictures", action="store_true", help="write no plots and no view.html"
     )
-    spread = parser.add_argument_group("who runs them")
-    spread.add_argument("--shard", metavar="I/N|auto", help="every N-th row from row I on; I counts from 0")
+    spread = parser.add_argument_group("distribution")
+    spread.add_argument("--shard", metavar="I/N|auto", help="run every N-th row, starting with row I (from 0)")
     spread.add_argument(
         "--engine",
         choices=ENGINES,
         default=ENGINES[0],
-        help="ray: Ray Data, extra `ray` (default: %(default)s)",
+        help="ray: Ray Data, requires the extra `ray` (default: %(default)s)",
     )
     spread.add_argument(
         "--address",
         metavar="ADDRESS",
-        help="of a Ray cluster (auto, ray://HOST:10001) whose nodes have torchslam, and LIST's files and DIR at the "
-        "same places; without it a local one for this call",
+        help="address of a Ray cluster (auto, ray://HOST:10001) whose nodes have torchslam installed and see the files "
+        "of LIST and DIR at the same paths; default: a local one for this call",
     )
     spread.add_argument(
         "--workers",
         type=arguments.positive,
         metavar="N",
-        help="of Ray, at a time (default: one per processor)",
+        help="number of concurrent Ray workers (default: one per processor)",
     )
     arguments.add_reading(parser)
     arguments.add_device(parser)
@@ -90,7 +90,7 @@ def execute(options: argparse.Namespace) -> int:
         progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
         found = run_batch(tasks, engine, shard, progress.tell)
     new = sum(columns["is_new"] for columns in found)
-    print(f"{len(found)} sequences: {counts(found)}; {len(found) - new} of them were there before")
+    print(f"{len(found)} sequences: {counts(found)}; {len(found) - new} of them already existed")
     print(f"table: {options.output / CSV}")
     return ERRORS if any(columns["status"] == ERROR for columns in found) else 0
 
@@ -121,7 +121,7 @@ class _Progress:
             words += f", ATE {columns['ate_m']:.4f} m" if "ate_m" in columns else ""
         elif columns["error"]:
             words += f": {columns['error']}"
-        before = "" if columns["is_new"] else " (there before)"
+        before = "" if columns["is_new"] else " (already existed)"
         print(
             f"torchslam: {self._done}/{self._count} {columns['name']}: {words}{before}",
             file=sys.stderr,
@@ -134,7 +134,7 @@ def _stopping() -> Iterator[None]:
     """Inside, Ctrl-C and SIGTERM end at once: what is half-written goes, what is done stays."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        print("torchslam: stopped; the same command goes on", file=sys.stderr)
+        print("torchslam: stopped; run the same command to continue", file=sys.stderr)
         raise SystemExit(STATUS[signal.Signals(number)])
 
     before = {number: signal.signal(number, end) for number in SIGNALS}

@@ -1,11 +1,11 @@
-"""Make poses of another program better by the images, and write them in the form that they had.
+"""Refine the poses of another program from the images and write them in their original format.
 
-Poses and camera of COLMAP, of a transforms.json, or a TUM trajectory: from a phone, a network, another SLAM. The images
-are matched and triangulated; poses, points and, where the images contradict it, the focal length are adjusted. The
-results are those of a run, in the frame and the unit of the given poses; refined/ has them as they were given, with
-covariances. Images without a pose and poses without an image are left out.
+The input is a COLMAP model, a transforms.json or a TUM trajectory, for example of a phone, a network or another SLAM
+system. Features are matched and triangulated; then poses, points and, where the images contradict it, the focal length
+are adjusted. The results are those of `torchslam run`, in the frame and unit of the given poses; refined/ has the poses
+in their original format, with covariances. Images without a pose and poses without an image are ignored.
 
-Exit status: 0 done, 2 an error, 3 the images make no map.
+Exit status: 0 done, 2 an error, 3 no map could be built from the images.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from torchslam.calibration.report import contradiction
+from torchslam.calibration.find_camera import contradiction
 from torchslam.cli import arguments
 from torchslam.cli.result_folder import prepare
 from torchslam.config import Config
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="FILE|DIR",
         help="TUM trajectory, COLMAP model (folder with images.bin or images.txt), or transforms.json. Its camera is "
-        "taken unless --camera says another one",
+        "used unless --camera is given",
     )
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
@@ -72,12 +72,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     camera.add_argument(
         "--refine-camera",
         action="store_true",
-        help="take the focal length of the images wherever they determine it, not only where they contradict the given "
-        "one",
+        help="refine the focal length wherever the images determine it, not only where they contradict the given one",
     )
-    camera.add_argument("--fix-camera", action="store_true", help="leave the camera as it is")
+    camera.add_argument("--fix-camera", action="store_true", help="keep the camera fixed")
     parser.add_argument(
-        "--refine-distortion", action="store_true", help="also k1 and k2, where the images ask for them"
+        "--refine-distortion", action="store_true", help="also refine k1 and k2, if the images require them"
     )
     arguments.add_device(parser)
     arguments.add_config(parser)
@@ -85,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     if options.fix_camera and options.refine_distortion:
-        raise ConfigError("--refine-distortion: --fix-camera leaves the camera as it is")
+        raise ConfigError("--refine-distortion cannot be combined with --fix-camera")
     given = read_poses(options.poses)
     sequence = _with_camera(arguments.sequence(options), given, options.camera)
     is_guess = sequence.calibrated is Calibrated.GUESSED
@@ -117,8 +116,8 @@ def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> in
     )
     figures = _write(refined, sequence, plan)
     written = {} if refined.run.failure else {"refined": str(write_refined(plan.output / REFINED, refined))}
-    rows = _used(refined, sequence) | summary(figures) | written | {"results": str(plan.output)}
-    rows.pop("speed", None)  # there is no frame after frame
+    rows = _describe_poses(refined, sequence) | summary(figures) | written | {"results": str(plan.output)}
+    rows.pop("speed", None)  # frames are not processed one by one
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
@@ -129,7 +128,7 @@ def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> in
 
 
 def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> Sequence:
-    """The sequence with the camera that comes with the poses, unless the user named one; a guess where nobody knows."""
+    """Return the sequence with the camera of the poses, unless the user gave one; a guess if there is none."""
     if sequence.known_length is None:
         raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
     if camera is None and given.calibration is not None:
@@ -147,7 +146,7 @@ def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
     after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
     figures = metrics(finished, after, None if ate_before is None else ate_before.ate_m)
     figures |= {
-        "camera": _words(refined, sequence),
+        "camera": _describe_camera(refined, sequence),
         "focal_px": [float(sequence.camera.focal), float(finished.camera.focal)],
         "without_pose": refined.without_pose,
         "without_image": refined.without_image,
@@ -176,8 +175,8 @@ def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
         return None
 
 
-def _words(refined: Refined, sequence: Sequence) -> str:
-    """What became of the camera."""
+def _describe_camera(refined: Refined, sequence: Sequence) -> str:
+    """Return how the camera was determined."""
     found, focal = refined.camera, float(refined.run.camera.focal)
     if found is None:
         return f"focal length {focal:.1f} px, as given"
@@ -185,14 +184,14 @@ def _words(refined: Refined, sequence: Sequence) -> str:
         against = contradiction(sequence.camera, found) or "the images do not contradict it"
         return f"focal length {focal:.1f} px, as given; {against}"
     std = found.std * focal
-    return f"focal length {focal:.1f} ± {std:.1f} px by the images, given {float(sequence.camera.focal):.1f}"
+    return f"focal length {focal:.1f} ± {std:.1f} px from the images, given {float(sequence.camera.focal):.1f}"
 
 
-def _used(refined: Refined, sequence: Sequence) -> dict[str, str]:
-    """How many poses there were and how they were used, label by label."""
+def _describe_poses(refined: Refined, sequence: Sequence) -> dict[str, str]:
+    """Return the number of given poses and of those not used, as a row for `table`."""
     words = f"{len(refined.given)} from {refined.given.path}"
     if refined.without_image:
-        words += f"; {refined.without_image} of no image here"
+        words += f"; {refined.without_image} have no image"
     if refined.without_pose:
-        words += f"; {refined.without_pose} of {len(sequence)} images have none"
+        words += f"; {refined.without_pose} of {len(sequence)} images have no pose"
     return {"poses": words}

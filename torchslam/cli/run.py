@@ -1,9 +1,10 @@
-"""Run SLAM on a sequence and write trajectory, map, figures and pictures.
+"""Run SLAM on a sequence and write trajectory, map, metrics and plots.
 
-Without a calibration, and with `--camera auto`, the images say what the camera is: calibration.txt in the results.
+Without a calibration, or with `--camera auto`, the intrinsics are estimated from the images and written to
+calibration.txt in the results.
 
-Exit status: 0 done, 2 an error, 3 no map could be initialised or no frame be localised; 130 and 143 ended by Ctrl-C
-and by SIGTERM (what there is by then is written, and --resume goes on from the last checkpoint).
+Exit status: 0 done, 2 an error, 3 no map could be initialized or no frame could be localized; 130 and 143 ended by
+Ctrl-C and by SIGTERM (the results so far are written, and --resume continues from the last checkpoint).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.auto import RADIAL, find_camera
+from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.cli import arguments
 from torchslam.cli.progress import ProgressBar
 from torchslam.cli.result_folder import Checkpoints, prepare
@@ -27,6 +28,7 @@ from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
+from torchslam.geometry import Camera
 from torchslam.io.calibration_file import is_found
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.metrics import compute_metrics
@@ -54,7 +56,7 @@ class Plan:
     source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
                 where that was said
     output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
-    map:        file of a saved map to go on in, without `mapping` only to localise in it
+    map:        file of a saved map to go on in, without `mapping` only to localize in it
     checkpoint: keyframes from one checkpoint to the next; 0: none
     refine:     improve the given camera by the images first; distortion: its distortion, too
     processes:  how many; None: what is best
@@ -85,29 +87,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
     existing.add_argument(
-        "--resume", action="store_true", help="go on from the folder's checkpoint, if it has one"
+        "--resume", action="store_true", help="continue from the checkpoint in the folder, if there is one"
     )
     parser.add_argument(
         "--map",
         type=Path,
         metavar="DIR|FILE",
-        help="go on in a saved map: its file, or the results it is in, with their configuration unless --config",
+        help="continue a saved map: a map file, or a results folder, whose configuration is used unless --config is given",
     )
     parser.add_argument(
-        "--localize", action="store_true", help="with --map: find poses in it, and leave it as it is"
+        "--localize", action="store_true", help="with --map: only localize, without changing the map"
     )
     parser.add_argument(
         "--checkpoint",
         type=arguments.not_negative,
         default=CHECKPOINT_EVERY,
         metavar="N",
-        help="save the state every N keyframes at the most, for --resume; 0: never (default: %(default)s)",
+        help="save the state at most every N keyframes, for --resume; 0: never (default: %(default)s)",
     )
     parser.add_argument(
-        "--refine-camera", action="store_true", help="improve the focal length by the images before the run"
+        "--refine-camera", action="store_true", help="refine the focal length from the images before the run"
     )
     parser.add_argument(
-        "--refine-distortion", action="store_true", help="with it k1 and k2, where the images ask for them"
+        "--refine-distortion", action="store_true", help="also refine k1 and k2, if the images require them"
     )
     parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
     parser.add_argument(
@@ -120,9 +122,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     if options.map is not None and (options.refine_camera or options.refine_distortion):
-        raise ConfigError("--refine-camera: a --map has the camera that it was made with")
+        raise ConfigError("--refine-camera cannot be combined with --map: a map keeps the camera that it was built with")
     if options.localize and options.map is None:
-        raise ConfigError("--localize needs a --map to find poses in")
+        raise ConfigError("--localize requires --map")
     if options.view:
         import_rerun()
     saved = options.map
@@ -198,7 +200,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     for warning in result_warnings(figures):
         print(f"torchslam: warning: {warning}", file=sys.stderr)
     if finished.interrupted:
-        print("torchslam: interrupted; the results up to here are written", file=sys.stderr)
+        print("torchslam: interrupted; the results so far were written", file=sys.stderr)
         return stopping.status
     checkpoints.remove()
     if finished.failure:
@@ -232,10 +234,10 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunPro
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
         slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
-        print(f"torchslam: going on at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
+        print(f"torchslam: resuming at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
         return slam, so_far
     if plan.resume:
-        print("torchslam: no checkpoint to resume: beginning with the first frame", file=sys.stderr)
+        print("torchslam: no checkpoint to resume from; starting with the first frame", file=sys.stderr)
     if plan.map is None:
         return SLAM(sequence.camera.to(plan.device), config), RunProgress()
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
@@ -247,8 +249,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunPro
         and (known.model != mine.model or not same)
     ):
         raise ResultsError(
-            f"{plan.map}: made with the camera {_words(known.model, known.params, known.size)}, "
-            f"the sequence has {_words(mine.model, mine.params, mine.size)}"
+            f"{plan.map}: the map was built with the camera {_describe(known)}, but the sequence has {_describe(mine)}"
         )
     return slam, RunProgress()
 
@@ -262,9 +263,9 @@ def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> FrameViewers:
     return FrameViewers(slam, sequence, screens)
 
 
-def _words(model: str, params: torch.Tensor, size: tuple[int, int]) -> str:
-    numbers = ",".join(f"{number:.9g}" for number in params.tolist())
-    return f"{model} {numbers} of {size[0]} x {size[1]} pixels"
+def _describe(camera: Camera) -> str:
+    numbers = ",".join(f"{number:.9g}" for number in camera.params.tolist())
+    return f"{camera.model} {numbers} of {camera.width} x {camera.height} pixels"
 
 
 def _write(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from torchslam.calibration.auto import camera_remark
+from torchslam.calibration.find_camera import camera_remark
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate_apart, evaluate

@@ -19,7 +19,7 @@ from torchslam.geometry.conventions import opengl
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.io.export.scene import Scene, scene_of
-from torchslam.refine.refine import Refined
+from torchslam.refine.pose_refinement import Refined
 from torchslam.types import Trajectory
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json
 
@@ -67,10 +67,10 @@ def write_refined(folder: Path, refined: Refined) -> Path:
 
 def refined_poses(refined: Refined) -> tuple[Tensor, Tensor]:
     """(n,) the frames of the sequence that have a refined pose, ascending, and (n, 4, 4) T_cw."""
-    history, slam_map = refined.run.history, refined.run.map
-    frames = history.frames["frame_index"].cpu()
+    posed_frames, slam_map = refined.run.posed_frames, refined.run.map
+    frames = posed_frames.frames["frame_index"].cpu()
     order = torch.argsort(frames)
-    return frames[order], history.T_cw(slam_map).cpu()[order]
+    return frames[order], posed_frames.T_cw(slam_map).cpu()[order]
 
 
 def _name(refined: Refined, frame: int) -> str:

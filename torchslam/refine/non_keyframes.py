@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
+from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
-from torchslam.map.submap import Submap
 from torchslam.tracking.correspondences import match_keyframe
 from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import why_doubt
@@ -31,30 +31,30 @@ class FramePoser:
         self.config = config
 
     @torch.no_grad()
-    def pose(self, world: Submap, views: list[FrameFeatures], given_cw: Tensor) -> list[StepResult]:
-        """Fill the history of the world with the views, in their order; a result for each.
+    def pose(self, submap: Submap, views: list[FrameFeatures], given_cw: Tensor) -> list[StepResult]:
+        """Fill the history of the submap with the views, in their order; a result for each.
 
         given_cw: (N, 4, 4), what the results say as the pose that was there before
         """
-        row_of = {index: row for row, index in enumerate(world.map.keyframes["frame_index"].tolist())}
-        self.tracker.follow(world, 0)
+        row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
+        self.tracker.reset_to_keyframe(submap, 0)
         results = []
         for view, T_cw in zip(views, given_cw, strict=True):
             keyframe = row_of.get(view.index)
             if keyframe is not None:
-                result = self._pass(world, view, keyframe)
+                result = self._pass(submap, view, keyframe)
             else:
-                result = self._track(world, view)
-            results.append(replace(result, T_cw=T_cw, world=world.number))
+                result = self._track(submap, view)
+            results.append(replace(result, T_cw=T_cw, submap=submap.number))
         return results
 
-    def _pass(self, world: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
+    def _pass(self, submap: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
         """A keyframe: it is where the map has it."""
-        slam_map = world.map
-        self.tracker.follow(world, keyframe)
-        world.track.velocity = None
+        slam_map = submap.map
+        self.tracker.reset_to_keyframe(submap, keyframe)
+        submap.tracking.velocity = None
         own = keyframe_estimate(slam_map, keyframe)
-        world.history.add(view, own, world.track.T_cr, keyframe)
+        submap.posed_frames.add(view, own, submap.tracking.T_cr, keyframe)
         return StepResult(
             view.index,
             view.timestamp,
@@ -65,36 +65,36 @@ class FramePoser:
             inliers=own.inliers,
         )
 
-    def _track(self, world: Submap, view: FrameFeatures) -> StepResult:
+    def _track(self, submap: Submap, view: FrameFeatures) -> StepResult:
         """A frame between keyframes: from the last one, or else by what the keyframes nearest in time saw."""
-        tracked = self.tracker.track(world, view)
-        if tracked is None:
-            tracked = self._find(world, view)
-        if tracked is None:
+        estimate = self.tracker.track(submap, view)
+        if estimate is None:
+            estimate = self._find(submap, view)
+        if estimate is None:
             return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
-        doubt = why_doubt(tracked, None, alone(world.track, tracked), self.config.pose_validation)
-        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+        doubt = why_doubt(estimate, None, alone(submap.tracking, estimate), self.config.pose_validation)
+        submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return StepResult(
             view.index,
             view.timestamp,
             State.UNCERTAIN if doubt else State.TRACKING,
             None,
-            covariance=tracked.covariance,
-            matches=tracked.matches,
-            inliers=tracked.inliers,
+            covariance=estimate.covariance,
+            matches=estimate.matches,
+            inliers=estimate.inliers,
             reason=doubt,
         )
 
-    def _find(self, world: Submap, view: FrameFeatures) -> PoseEstimate | None:
-        slam_map = world.map
+    def _find(self, submap: Submap, view: FrameFeatures) -> PoseEstimate | None:
+        slam_map = submap.map
         away = (slam_map.keyframes["frame_index"] - view.index).abs()
         nearest = torch.argsort(away, stable=True)[:NUM_NEAREST]
-        tracked = self.tracker.localizer.locate(
+        estimate = self.tracker.localizer.locate(
             slam_map, view, self._candidates(slam_map, view, nearest), slam_map.points_seen_by(nearest)
         )
-        if tracked is not None:
-            self.tracker.start_at(world, view, tracked)
-        return tracked
+        if estimate is not None:
+            self.tracker.start_at_estimate(submap, view, estimate)
+        return estimate
 
     def _candidates(self, slam_map: Map, view: FrameFeatures, nearest: Tensor) -> Iterator[MatchIndices]:
         for keyframe in nearest.tolist():
@@ -112,8 +112,8 @@ def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
 
 def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
     """What the keyframes of a map saw, without any frames between."""
-    history = PosedFrames()
+    posed_frames = PosedFrames()
     for keyframe in range(slam_map.num_keyframes):
         T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
-        history.add(slam_map.view(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
-    return history.graph(slam_map, camera)
+        posed_frames.add(slam_map.view(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
+    return posed_frames.graph(slam_map, camera)

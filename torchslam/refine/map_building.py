@@ -1,21 +1,25 @@
-"""From given poses to a map: rotations from the matches, points from the tracks, and both adjusted, ever closer."""
+"""Build a map from approximate poses: average rotations, triangulate tracks, adjust coarse to fine, add points.
+
+Rotation averaging: Chatterjee and Govindu, "Efficient and robust large-scale rotation averaging", 2013; here the given
+rotations are measurements too, with a standard deviation estimated from how well they agree with the relative ones.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
-from torchslam.calibration.keyframes import FOCAL, directions
+from torchslam.calibration.intrinsics import FOCAL, directions
 from torchslam.config import Config
-from torchslam.geometry import Camera, KeypointNoise, fits, transform
+from torchslam.geometry import Camera, KeypointNoise, fits, so3_exp, so3_log, transform
 from torchslam.map.map import Map
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.optim import BundleProblem, bundle_adjust
-from torchslam.refine.pairs import Pair
-from torchslam.refine.rotations import average_rotations
-from torchslam.refine.tracks import Tracks, make_map, triangulate_tracks
+from torchslam.refine.tracks import Pair, Tracks, make_map, triangulate_tracks
 from torchslam.types import FrameFeatures
 
 # Where the kernel lets go of a residual, in pixels of its level: given poses are off by tens of them.
@@ -34,9 +38,9 @@ def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
     R_21 = torch.stack([pair.R_21 for pair in known if pair.R_21 is not None])
     device = T_cw.device
     R_cw = average_rotations(T_cw[:, :3, :3], first.to(device), second.to(device), R_21)
-    centres_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])
+    centers_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])
     align_rotations = T_cw.clone()
-    align_rotations[:, :3, :3], align_rotations[:, :3, 3:] = R_cw, -R_cw @ centres_w
+    align_rotations[:, :3, :3], align_rotations[:, :3, 3:] = R_cw, -R_cw @ centers_w
     return align_rotations
 
 
@@ -101,3 +105,48 @@ def build_map(
     adjust_all(made, camera, config.bundle_adjustment)
     densify(made, camera, config)
     return made, camera
+
+
+MAX_ROTATION_STEPS = 20
+RELATIVE_STD = math.radians(0.3)  # of a rotation between two views by their matches
+MAD = 1.4826 / 1.54  # from the median of the length of three errors to the deviation of each, about
+
+
+def average_rotations(R_cw: Tensor, first: Tensor, second: Tensor, R_21: Tensor) -> Tensor:
+    """(K, 3, 3) rotations near R_cw (K, 3, 3) for which R_21 (E, 3, 3) lead from views first (E,) to second (E,).
+
+    The errors of the given rotations are taken to be as large as they disagree with the relative ones.
+    """
+    if len(first) == 0:
+        return R_cw
+    given, count = R_cw, len(R_cw)
+    residuals = so3_log(R_21 @ R_cw[first] @ R_cw[second].mT)
+    given_std = max(RELATIVE_STD, MAD * float(residuals.norm(dim=-1).median()) / math.sqrt(2))
+    eye = torch.eye(3, dtype=R_cw.dtype, device=R_cw.device)
+    for _ in range(MAX_ROTATION_STEPS):
+        residuals = so3_log(R_21 @ R_cw[first] @ R_cw[second].mT)
+        from_given = so3_log(given @ R_cw.mT)
+        weights = _cauchy(residuals, 2 * RELATIVE_STD) / RELATIVE_STD**2
+        own = _cauchy(from_given, 3 * given_std) / given_std**2
+        # The residual of an edge changes by R_21 w_1 - w_2, that of a given rotation by -w.
+        A = R_cw.new_zeros(count, count, 3, 3)
+        W = weights[:, None, None]
+        diagonal = A.new_zeros(count, 3, 3)
+        diagonal.index_add_(0, first, W * eye).index_add_(0, second, W * eye)
+        diagonal += own[:, None, None] * eye
+        A[range(count), range(count)] = diagonal
+        A.index_put_((first, second), -W * R_21.mT, accumulate=True)
+        A.index_put_((second, first), -W * R_21, accumulate=True)
+        b = own[:, None] * from_given
+        b.index_add_(0, first, -weights[:, None] * (R_21.mT @ residuals[..., None])[..., 0])
+        b.index_add_(0, second, weights[:, None] * residuals)
+        step = torch.linalg.solve(A.transpose(1, 2).reshape(3 * count, 3 * count), b.flatten()).view(count, 3)
+        R_cw = so3_exp(step) @ R_cw
+        if float(step.abs().max()) < 1e-8:
+            break
+    return R_cw
+
+
+def _cauchy(residuals: Tensor, scale: float) -> Tensor:
+    """(n,) weights of residuals (n, 3)."""
+    return 1 / (1 + residuals.square().sum(-1) / scale**2)

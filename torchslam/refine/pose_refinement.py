@@ -1,7 +1,7 @@
-"""Poses and a camera of another program, and the images: better poses, a map, a better camera, in the same frame.
+"""Refine the poses of another program with the images: better poses, a map and a better camera, in the same frame.
 
-given poses -> keyframes -> pairs that match -> rotations, points, all adjusted -> camera, and again -> other frames
-            -> all of it once more as one graph, with covariances -> back to the frame and the unit of the given poses
+given poses -> keyframes -> verified pairs -> rotations and points, adjusted -> camera; repeated until it is stable
+            -> the other frames -> one graph of all frames, with covariances -> frame and unit of the given poses
 """
 
 from __future__ import annotations
@@ -16,22 +16,20 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchslam.calibration.find_camera import contradiction
 from torchslam.calibration.intrinsics import Refinement, estimate_intrinsics
-from torchslam.calibration.report import contradiction
 from torchslam.calibration.rounds import MAX_ROUNDS, MIN_CHANGE, MIN_CHANGE_IN_STD
 from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, TrajectoryError
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
 from torchslam.optim.run_graph import solve
-from torchslam.refine.adjustment import align_rotations, build_map
-from torchslam.refine.alignment import align_to_input
+from torchslam.refine.map_building import align_rotations, build_map
 from torchslam.refine.non_keyframes import FramePoser, graph_of
-from torchslam.refine.pairs import Pair, choose_keyframes, find_pairs
-from torchslam.refine.tracks import join_matches
+from torchslam.refine.tracks import Pair, choose_keyframes, find_pairs, join_matches
 from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
 from torchslam.system.run import Run
 from torchslam.types import FrameFeatures, State, StepResult, Trajectory
@@ -120,11 +118,11 @@ def refine_poses(
     slam_map, camera, refined, rounds = _rounds(
         keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, log
     )
-    world = Submap.empty(0, camera.params)
-    world.map = slam_map
-    results = FramePoser(camera, scaled).pose(world, views, T_cw)
-    _finalize(world, camera, frames, T_cw)
-    run = _run((world,), camera, config, views, results, skipped, "")
+    submap = Submap.empty(0, camera.params)
+    submap.map = slam_map
+    results = FramePoser(camera, scaled).pose(submap, views, T_cw)
+    _finalize(submap, camera, frames, T_cw)
+    run = _run((submap,), camera, config, views, results, skipped, "")
     return Refined(run, given, rows, refined, rounds)
 
 
@@ -144,13 +142,13 @@ def _connected(
     return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
 
 
-def _finalize(world: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
+def _finalize(submap: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
     """Everything once more as one graph, with covariances, and back to where the given poses T_cw of the frames are."""
-    graph = world.history.graph(world.map, camera)
-    world.history.take(solve(graph, backward="detached"), graph, world.map)
+    graph = submap.posed_frames.graph(submap.map, camera)
+    submap.posed_frames.take(solve(graph, backward="detached"), graph, submap.map)
     row_of = {index: row for row, index in enumerate(frames.tolist())}
-    posed = [row_of[index] for index in world.history.frames["frame_index"].tolist()]
-    world.move(align_to_input(world.history.T_cw(world.map), T_cw[posed]))
+    posed = [row_of[index] for index in submap.posed_frames.frames["frame_index"].tolist()]
+    submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), T_cw[posed]))
 
 
 def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
@@ -238,7 +236,7 @@ def _renumbered(pairs: list[Pair], kept: list[int]) -> list[Pair]:
 
 
 def _run(
-    worlds: tuple[Submap, ...],
+    submaps: tuple[Submap, ...],
     camera: Camera,
     config: Config,
     views: list[FrameFeatures],
@@ -248,4 +246,38 @@ def _run(
 ) -> Run:
     if failure:
         results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=failure) for view in views]
-    return Run(worlds, camera, config, results, skipped, False, failure)
+    return Run(submaps, camera, config, results, skipped, False, failure)
+
+
+MAX_OUTLIER_RATIO = 4.0  # times the median: a given position so far off does not count
+
+
+def align_to_input(T_cw: Tensor, given_cw: Tensor) -> Tensor:
+    """S (4, 4) that leads from the world of poses T_cw (N, 4, 4) to that of the given ones (N, 4, 4).
+
+    Centres and orientations count alike: centres on a line say nothing of the turn about it, and orientations nothing
+    of the rest. Where the centres have no extent, the unit stays.
+    """
+    T_wc, given = se3_inverse(T_cw), se3_inverse(given_cw)
+    counts = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)
+    for _ in range(3):
+        S = _similarity(T_wc[counts], given[counts])
+        moved = T_wc[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
+        off = torch.linalg.vector_norm(moved - given[:, :3, 3], dim=-1)
+        counts = off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
+    return S
+
+
+def _similarity(T_wc: Tensor, given: Tensor) -> Tensor:
+    source, target = T_wc[:, :3, 3], given[:, :3, 3]
+    x, y = source - source.mean(0), target - target.mean(0)
+    extent = (x.square().sum() * y.square().sum()).sqrt()
+    M = (given[:, :3, :3] @ T_wc[:, :3, :3].mT).mean(0) + (y.mT @ x) / extent.clamp(min=1e-300)
+    U, _, Vh = torch.linalg.svd(M)
+    U[:, 2] *= torch.linalg.det(U @ Vh).sign()
+    R = U @ Vh
+    scale = (y * (x @ R.mT)).sum() / x.square().sum() if float(extent) > 0 else x.new_ones(())
+    S = torch.eye(4, dtype=x.dtype, device=x.device)
+    S[:3, :3] = scale * R
+    S[:3, 3] = target.mean(0) - scale * (R @ source.mean(0))
+    return S
