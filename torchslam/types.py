@@ -28,7 +28,7 @@ class Frame:
                by scale from ground truth and by evaluation.
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
     features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
-    waiting:   frames of a live source that have come after it: so far behind its camera is who works on it
+    backlog:   number of newer frames already queued (live sources only)
     """
 
     index: int
@@ -38,7 +38,7 @@ class Frame:
     T_cw_groundtruth: Tensor | None = None
     mask: Tensor | None = None
     features: Features | None = None
-    waiting: int = 0
+    backlog: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class FrameFeatures:
     session:     which run over the same map saw it, from 0
     information: (N, I) as in `KeypointNoise`: what the front end says of the keypoints' errors; nothing if left out
     image:       (1, 1, H, W) grey, where a matcher wants it
-    waiting:     frames that have come after it, as in `Frame`
+    backlog:     as in `Frame`
     """
 
     index: int
@@ -132,7 +132,7 @@ class FrameFeatures:
     session: int = 0
     information: Tensor = field(default_factory=lambda: torch.zeros(0))
     image: Tensor | None = None
-    waiting: int = 0
+    backlog: int = 0
 
     def __post_init__(self) -> None:
         _nothing_said(self)
@@ -153,7 +153,7 @@ class FrameFeatures:
             features.mask[0],
             None if truth is None else truth.to(like),
             information=packed_information(information, scales)[0].to(like.dtype),
-            waiting=frame.waiting,
+            backlog=frame.backlog,
         )
 
     @property
@@ -213,8 +213,8 @@ class PoseEstimate:
     expected:    (n,) points that it should see; None: those that it does see
     depth:       median depth of the points it sees
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
-    coverage:    share of the image in which the points that were expected are found
-    explained:   share of the image with keypoints in which some agree with the map
+    coverage_ratio: share of the image in which the points that were expected are found
+    explained_ratio: share of the image with keypoints in which some agree with the map
     """
 
     T_cw: Tensor
@@ -224,8 +224,8 @@ class PoseEstimate:
     covariance: Tensor
     depth: float
     error: float = 0.0
-    coverage: float = 1.0
-    explained: float = 1.0
+    coverage_ratio: float = 1.0
+    explained_ratio: float = 1.0
     weights: Tensor | None = None
     expected: Tensor | None = None
 
@@ -320,7 +320,7 @@ class StepResult:
     state:       after the frame. Uncertain: there is a pose that may be wrong; nothing is built on it until later
                  frames confirm it
     T_cw:        (4, 4) pose of the frame, world to camera; None while initializing or lost
-    world:       number of the world the pose is in; None without a pose
+    submap:       number of the submap the pose is in; None without a pose
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation); None where it was not estimated
     is_keyframe: whether the frame became a keyframe
     matches:     map points matched in this frame
@@ -333,7 +333,7 @@ class StepResult:
     timestamp: float
     state: State
     T_cw: Tensor | None
-    world: int | None = None
+    submap: int | None = None
     covariance: Tensor | None = None
     is_keyframe: bool = False
     matches: int = 0

@@ -30,7 +30,7 @@ from torchslam.utils.timing import Stopwatch
 HERE = Path(__file__).parent
 SIZES, NEXT = (200, 1000, 5000), 31
 CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
-STEP, SPACING, DEPTH = 0.4, 0.008, 4.0  # metres from keyframe to keyframe, from point to point, to the wall
+STEP, SPACING, DEPTH = 0.4, 0.008, 4.0  # meters from keyframe to keyframe, from point to point, to the wall
 KEYPOINTS = 1000  # of a keyframe, as the default front end finds
 LEVELS, NOISE_PX = 4, 0.5
 UNMAPPED = 3  # every so many points of the wall are not in the map: the new keyframes triangulate them
@@ -48,17 +48,17 @@ class Walk:
         self.descriptors = torch.randint(0, 256, (count, 32), generator=g, dtype=torch.uint8)
         self.scales = 1.2 ** torch.randint(0, LEVELS, (count,), generator=g).double()
         self.rows = torch.full((count,), -1)  # of the points in the map
-        self.worlds = Atlas(CAMERA.params)
-        self.world = self.worlds.begin()
+        self.atlas = Atlas(CAMERA.params)
+        self.submap = self.atlas.create()
         self.tracker = Tracker(CAMERA, Config())
         self.mapper = Mapper(CAMERA, Config(), Stopwatch())
         for index in range(keyframes):
             self._add(index)
-        slam_map = self.world.map
+        slam_map = self.submap.map
         for some in torch.arange(keyframes).split(100):
             slam_map.refresh(some)
-        self.world.asked = keyframes
-        self.memory = LoopCloser(CAMERA, Config(), self.worlds)
+        self.submap.num_cull_checked = keyframes
+        self.memory = LoopCloser(CAMERA, Config(), self.atlas)
 
     def look(self, index: int) -> tuple[FrameFeatures, Tensor]:
         """What the camera sees at a step of its way, and which points of the wall these are."""
@@ -88,7 +88,7 @@ class Walk:
 
     def _add(self, index: int) -> None:
         """A keyframe of the map as it was made: it sees what it can of the points, new ones are added."""
-        slam_map = self.world.map
+        slam_map = self.submap.map
         view, seen = self.look(index)
         assert view.T_cw_groundtruth is not None
         keyframe = slam_map.add_keyframe(view, view.T_cw_groundtruth)
@@ -99,7 +99,7 @@ class Walk:
 
     def next(self) -> dict[str, float]:
         """Map the next keyframe; returns the milliseconds of the process by stage."""
-        slam_map = self.world.map
+        slam_map = self.submap.map
         index = int(slam_map.keyframes["frame_index"][-1]) + 1
         view, seen = self.look(index)
         assert view.T_cw_groundtruth is not None
@@ -108,7 +108,7 @@ class Walk:
         alive = slam_map.points["is_valid"][ids]
         at, ids = torch.nonzero(known)[alive, 0], ids[alive]
         eye = torch.eye(6, dtype=torch.float64)
-        tracked = PoseEstimate(view.T_cw_groundtruth, ids, at, len(ids), 1e-6 * eye, DEPTH)
+        estimate = PoseEstimate(view.T_cw_groundtruth, ids, at, len(ids), 1e-6 * eye, DEPTH)
         spent: dict[str, float] = {}
 
         def timed(stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -117,12 +117,12 @@ class Walk:
             spent[stage] = 1e3 * (time.process_time() - begin)
             return answer
 
-        keyframe = timed("mapping, bundle", self.mapper.insert, slam_map, view, tracked)
+        keyframe = timed("mapping, bundle", self.mapper.insert, slam_map, view, estimate)
         timed("memory", self.memory.add, slam_map, keyframe)
-        timed("local map", self.tracker.follow, self.world, keyframe)
-        timed("recognition", self.memory.recognizer.recognize, self.world, keyframe)
+        timed("local map", self.tracker.reset_to_keyframe, self.submap, keyframe)
+        timed("recognition", self.memory.recognizer.recognize, self.submap, keyframe)
         keys = slam_map.keys
-        renumbering = timed("tidy", self.mapper.tidy, self.world)
+        renumbering = timed("tidy", self.mapper.tidy, self.submap)
         if renumbering is not None:
             self.memory.remove(keys[renumbering.keyframes < 0])
             self.rows = torch.where(self.rows >= 0, renumbering.points[self.rows], -1)

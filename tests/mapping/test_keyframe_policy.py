@@ -12,8 +12,8 @@ from torch import Tensor
 from tests.map.simulated import tracked_at
 from tests.scene import Scene, pose, sideways, world_in
 from torchslam.config import KeyframesConfig, load_config
-from torchslam.geometry.motion import apart
-from torchslam.map.submap import Submap
+from torchslam.geometry.transforms import apart
+from torchslam.map.atlas import Submap
 from torchslam.mapping.keyframe_policy import why_keyframe
 
 SCENE = Scene.of(100)
@@ -21,81 +21,81 @@ SETTINGS = KeyframesConfig()
 
 
 def why(
-    world: Submap, T_cw: Tensor, *, index: int = 50, share: float = 1.0, waiting: int = 0, **changes: int
+    submap: Submap, T_cw: Tensor, *, index: int = 50, share: float = 1.0, backlog: int = 0, **changes: int
 ) -> str:
     """Of a frame at T_cw that sees the points of keyframe 0, `share` of what its reference has."""
     settings = load_config(None, [f"keyframes.{name}={value}" for name, value in changes.items()]).keyframes
-    seen = world.map.points_seen_by(torch.tensor([0]))
-    world.track.reference_size = round(len(seen) / share)
-    tracked = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(world, T_cw))
-    view = replace(SCENE.view(index, T_cw), waiting=waiting)
-    return why_keyframe(view, tracked, world, settings)
+    seen = submap.map.points_seen_by(torch.tensor([0]))
+    submap.tracking.reference_size = round(len(seen) / share)
+    estimate = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(submap, T_cw))
+    view = replace(SCENE.view(index, T_cw), backlog=backlog)
+    return why_keyframe(view, estimate, submap, settings)
 
 
-def depth(world: Submap, T_cw: Tensor) -> float:
-    seen = world.map.points_seen_by(torch.tensor([0]))
-    return float((world.map.positions_w[seen] @ T_cw[2, :3] + T_cw[2, 3]).median())
+def depth(submap: Submap, T_cw: Tensor) -> float:
+    seen = submap.map.points_seen_by(torch.tensor([0]))
+    return float((submap.map.positions_w[seen] @ T_cw[2, :3] + T_cw[2, 3]).median())
 
 
 def test_a_frame_where_a_keyframe_is_adds_nothing() -> None:
-    world = world_in(SCENE, sideways(1))
-    assert why(world, pose()) == ""
+    submap = world_in(SCENE, sideways(1))
+    assert why(submap, pose()) == ""
 
 
 def test_a_tenth_of_the_depth_is_a_new_place() -> None:
-    world = world_in(SCENE, sideways(1))
-    step = SETTINGS.max_translation * depth(world, pose())
-    assert why(world, pose(0.99 * step)) == ""
-    assert why(world, pose(1.01 * step)) == "moved by 0.10 of the depth of the scene"
-    assert why(world, pose(0, -2.0 * step)) == "moved by 0.20 of the depth of the scene"
+    submap = world_in(SCENE, sideways(1))
+    step = SETTINGS.max_translation * depth(submap, pose())
+    assert why(submap, pose(0.99 * step)) == ""
+    assert why(submap, pose(1.01 * step)) == "moved by 0.10 of the depth of the scene"
+    assert why(submap, pose(0, -2.0 * step)) == "moved by 0.20 of the depth of the scene"
 
 
 def test_twelve_degrees_are_a_new_direction() -> None:
-    world = world_in(SCENE, sideways(1))
+    submap = world_in(SCENE, sideways(1))
     turn = math.radians(SETTINGS.max_rotation_deg)
-    assert why(world, pose(0, 0, 0, 0, 0, 0.99 * turn)) == ""
-    assert why(world, pose(0, 0, 0, 0, 0, 1.1 * turn)) == "turned by 13.2 degrees"
+    assert why(submap, pose(0, 0, 0, 0, 0, 0.99 * turn)) == ""
+    assert why(submap, pose(0, 0, 0, 0, 0, 1.1 * turn)) == "turned by 13.2 degrees"
 
 
 def test_any_keyframe_around_that_is_near_is_enough() -> None:
-    world = world_in(SCENE, sideways(3, step=1.0))
-    assert why(world, sideways(1, start=0.98)[0]) == ""  # beside the second, far from the last
-    assert why(world, sideways(1, start=0.5)[0]).startswith("moved by 0.1")
+    submap = world_in(SCENE, sideways(3, step=1.0))
+    assert why(submap, sideways(1, start=0.98)[0]) == ""  # beside the second, far from the last
+    assert why(submap, sideways(1, start=0.5)[0]).startswith("moved by 0.1")
     turned = pose(0, 0, 0, 0, 0, math.radians(20.0))
     # far from two, and turned away from the third: what it turned by says why
-    assert why(world, turned @ sideways(1, start=0.98)[0]) == "turned by 20.0 degrees"
+    assert why(submap, turned @ sideways(1, start=0.98)[0]) == "turned by 20.0 degrees"
 
 
 def test_the_newest_keyframe_counts_wherever_it_is() -> None:
-    world = world_in(SCENE, sideways(3, step=1.0))
-    world.track.local_keyframes = torch.tensor([0])
-    assert why(world, sideways(1, start=1.0)[0]).startswith("moved")
-    assert why(world, sideways(1, start=2.0)[0]) == ""
+    submap = world_in(SCENE, sideways(3, step=1.0))
+    submap.tracking.local_keyframes = torch.tensor([0])
+    assert why(submap, sideways(1, start=1.0)[0]).startswith("moved")
+    assert why(submap, sideways(1, start=2.0)[0]) == ""
 
 
 def test_seeing_little_of_the_reference_is_a_reason() -> None:
-    world = world_in(SCENE, sideways(1))
-    assert why(world, pose(), share=0.8) == ""
-    assert why(world, pose(), share=0.78).startswith("sees 78% of the points")
-    assert why(world, pose(), share=0.3).startswith("sees 30% of the points")
+    submap = world_in(SCENE, sideways(1))
+    assert why(submap, pose(), share=0.8) == ""
+    assert why(submap, pose(), share=0.78).startswith("sees 78% of the points")
+    assert why(submap, pose(), share=0.3).startswith("sees 30% of the points")
 
 
 def test_a_reference_without_points_is_no_reason() -> None:
-    world = world_in(SCENE, sideways(1))
-    seen = world.map.points_seen_by(torch.tensor([0]))[:1]
-    world.track.reference_size = 0
-    tracked = tracked_at(pose(), seen, torch.arange(1))
-    assert why_keyframe(SCENE.view(50, pose()), tracked, world, SETTINGS) == ""
+    submap = world_in(SCENE, sideways(1))
+    seen = submap.map.points_seen_by(torch.tensor([0]))[:1]
+    submap.tracking.reference_size = 0
+    estimate = tracked_at(pose(), seen, torch.arange(1))
+    assert why_keyframe(SCENE.view(50, pose()), estimate, submap, SETTINGS) == ""
 
 
 def test_keyframes_keep_their_interval_forwards_and_backwards() -> None:
-    world = world_in(SCENE, sideways(1), first=20)
+    submap = world_in(SCENE, sideways(1), first=20)
     far = pose(3.0)
-    assert why(world, far, index=20) == ""
-    assert why(world, far, index=21) != ""
+    assert why(submap, far, index=20) == ""
+    assert why(submap, far, index=21) != ""
     for near, enough in ((24, 25), (16, 15)):
-        assert why(world, far, index=near, min_interval=5) == ""
-        assert why(world, far, index=enough, min_interval=5) != ""
+        assert why(submap, far, index=near, min_interval=5) == ""
+        assert why(submap, far, index=enough, min_interval=5) != ""
 
 
 def test_how_far_cameras_are_apart() -> None:
@@ -107,9 +107,9 @@ def test_how_far_cameras_are_apart() -> None:
 
 
 def test_a_live_camera_that_is_ahead_puts_a_keyframe_off_while_enough_is_seen() -> None:
-    world = world_in(SCENE, sideways(1))
-    far, age = pose(2.0 * SETTINGS.max_translation * depth(world, pose())), 3
-    assert why(world, far, index=age, waiting=age) != ""
-    assert why(world, far, index=age, waiting=age + 1) == ""
-    assert why(world, far, index=age, waiting=age + 1, share=0.38) != ""
-    assert why(world, far, index=age, waiting=age + 1, share=0.42) == ""
+    submap = world_in(SCENE, sideways(1))
+    far, age = pose(2.0 * SETTINGS.max_translation * depth(submap, pose())), 3
+    assert why(submap, far, index=age, backlog=age) != ""
+    assert why(submap, far, index=age, backlog=age + 1) == ""
+    assert why(submap, far, index=age, backlog=age + 1, share=0.38) != ""
+    assert why(submap, far, index=age, backlog=age + 1, share=0.42) == ""

@@ -52,7 +52,7 @@ def live(frames: int, pause: float = 0.0) -> LiveSequence:
     sequence = LiveSequence("camera", Source(frames, pause), CAMERA, backlog=frames)
     if not pause:
         sequence._begin()  # as the first frame does that is asked for
-    while not pause and sequence.waiting < frames:
+    while not pause and sequence.backlog < frames:
         time.sleep(0.01)
     return sequence
 
@@ -79,7 +79,7 @@ def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LivePref
             continue
         frame = reader[index]
         assert frame.index == index
-        assert frame.waiting == 7 - index  # also with one of them taken from the source before its turn
+        assert frame.backlog == 7 - index  # also with one of them taken from the source before its turn
         assert frame.image.shape[-1] == SIZE[0]  # for those who want it
         found.append(frame.features is not None)
         if frame.features is not None:
@@ -99,7 +99,7 @@ def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyP
         assert frames._worker._ours.poll(PATIENCE)
         frames[0], frames[1]
         deadline = time.monotonic() + 10
-        while frames._sequence.waiting == 0 and time.monotonic() < deadline:
+        while frames._sequence.backlog == 0 and time.monotonic() < deadline:
             time.sleep(0.01)
         assert frames._next is None or frames._is_sent  # nothing was taken that is not looked at
         assert frames[2].index == 2

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways, world_in
 from torchslam.config import Config, PoseValidationConfig
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking.backward_tracking import MISSES, track_back
-from torchslam.tracking.pose_confirmation import Held
+from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, track_back
+from torchslam.tracking.pose_confirmation import PendingFrame
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate
 
@@ -31,30 +31,30 @@ class Ledger:
         self.tried: list[int] = []
         self.dropped = 0
 
-    def take(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
-        self.taken[view.index] = tracked.T_cw
+    def take(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+        self.taken[view.index] = estimate.T_cw
 
-    def try_out(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> bool:
+    def try_out(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
         self.tried.append(view.index)
         return False
 
-    def keep(self, world: Submap, held: list[Held]) -> None:
-        for view, tracked, T_cr, reference in held:
-            self.taken[view.index] = tracked.T_cw
-            torch.testing.assert_close(T_cr @ world.map.T_cw[reference], tracked.T_cw)
+    def keep(self, submap: Submap, held: list[PendingFrame]) -> None:
+        for view, estimate, T_cr, reference in held:
+            self.taken[view.index] = estimate.T_cw
+            torch.testing.assert_close(T_cr @ submap.map.T_cw[reference], estimate.T_cw)
 
-    def drop(self, world: Submap) -> None:
+    def drop(self, submap: Submap) -> None:
         self.dropped += 1
 
 
 def walked(T_cw: Tensor, judge: PoseValidationConfig | None = None, noise: float = 0.0) -> Ledger:
     """What became of cameras at T_cw (F, 4, 4), the first the one before the world's first keyframe, frame 100."""
-    world = world_in(SCENE, sideways(4), first=100)
+    submap = world_in(SCENE, sideways(4), first=100)
     config = replace(Config(), pose_validation=judge or PoseValidationConfig())
     tracker, ledger = Tracker(CAMERA, config), Ledger()
-    tracker.follow(world, 0)
+    tracker.reset_to_keyframe(submap, 0)
     views = [SCENE.view(99 - offset, T, noise=noise) for offset, T in enumerate(T_cw)]
-    posed = track_back(tracker, world, views, config, ledger)
+    posed = track_back(tracker, submap, views, config, ledger)
     assert [view.index for view in posed] == list(ledger.taken)
     return ledger
 
@@ -83,14 +83,14 @@ def test_frames_before_the_map_get_their_true_poses() -> None:
 
 def test_a_few_frames_that_see_nothing_are_passed_over() -> None:
     T_cw = sideways(12, -0.02, start=-0.02)
-    T_cw[2 : 2 + MISSES - 1] = AWAY
-    T_cw[8 : 8 + MISSES - 1] = AWAY
+    T_cw[2 : 2 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
+    T_cw[8 : 8 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
     assert back(T_cw)[0] == [99, 98, 93, 92]
 
 
 def test_many_frames_that_see_nothing_end_the_way() -> None:
     T_cw = sideways(10, -0.02, start=-0.02)
-    T_cw[1 : 1 + MISSES] = AWAY
+    T_cw[1 : 1 + MAX_CONSECUTIVE_FAILURES] = AWAY
     assert back(T_cw)[0] == [99]
 
 
@@ -123,7 +123,7 @@ def test_strange_frames_are_kept_where_the_way_leads_to_the_earliest_one(
 def test_strange_frames_are_not_kept_where_the_way_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     doubting(monkeypatch, range(2, 100))
     T_cw = sideways(12, -0.02, start=-0.02)
-    T_cw[6 : 6 + MISSES] = AWAY
+    T_cw[6 : 6 + MAX_CONSECUTIVE_FAILURES] = AWAY
     ledger = walked(T_cw)
     assert list(ledger.taken) == [99, 98]
     assert ledger.dropped == 1
@@ -137,7 +137,7 @@ def test_strange_frames_are_kept_once_as_many_certain_ones_as_are_asked_for_foll
     for certain, posed in ((asked - 1, [99]), (asked, list(range(99, 96 - asked, -1)))):
         doubting(monkeypatch, {1, 2})
         away = T_cw.clone()
-        away[3 + certain : 3 + certain + MISSES] = AWAY
+        away[3 + certain : 3 + certain + MAX_CONSECUTIVE_FAILURES] = AWAY
         ledger = walked(away)
         assert list(ledger.taken) == posed
         assert ledger.tried == list(range(98, 96 - certain, -1))

@@ -11,7 +11,7 @@ from tests.map.simulated import tracked_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, transform
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.tracker import Tracker
@@ -24,7 +24,7 @@ def localizer(*overrides: str) -> Localizer:
     return Localizer(CAMERA, load_config(None, overrides))
 
 
-def world() -> Submap:
+def submap() -> Submap:
     return world_in(SCENE, sideways(4))
 
 
@@ -40,7 +40,7 @@ def world() -> Submap:
 def test_where_few_of_the_matches_agree_others_are_heard(
     poses: list[tuple[int, int] | None], chosen: int | None, heard: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, finder = world(), localizer()
+    here, finder = submap(), localizer()
     answers = [
         None
         if found is None
@@ -51,27 +51,27 @@ def test_where_few_of_the_matches_agree_others_are_heard(
     monkeypatch.setattr(finder, "_locate", lambda *_: next(asked))
     nobody = MatchIndices(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
     view = SCENE.view(50, pose())
-    tracked = finder.locate(here.map, view, iter([nobody] * len(poses)), here.track.local_points)
-    assert tracked is (None if chosen is None else answers[chosen])
+    estimate = finder.locate(here.map, view, iter([nobody] * len(poses)), here.tracking.local_points)
+    assert estimate is (None if chosen is None else answers[chosen])
     assert len(list(asked)) == len(poses) - heard
 
 
 def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
     here, finder = world_in(SCENE, sideways(12, step=0.6)), localizer("tracking.local_keyframes=1")
-    Tracker(CAMERA, load_config(None, ["tracking.local_keyframes=1"])).follow(here, 11)
+    Tracker(CAMERA, load_config(None, ["tracking.local_keyframes=1"])).reset_to_keyframe(here, 11)
     T_cw = sideways(1, start=0.05)[0]
     view = SCENE.view(50, T_cw)
     at = torch.nonzero(view.mask)[:, 0]
     there = ROWS[SCENE.shows(50)[at]]
     alive = here.map.points["is_valid"][there]
     matches = iter([MatchIndices(there[alive][:30], at[alive][:30])])
-    tracked = finder.locate(here.map, view, matches, here.track.local_points)
-    assert tracked is not None
-    torch.testing.assert_close(tracked.T_cw, T_cw, atol=1e-7, rtol=0)
-    near = finder.around(here.map, there[alive][:30])
+    estimate = finder.locate(here.map, view, matches, here.tracking.local_points)
+    assert estimate is not None
+    torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
+    near = finder.covisible_keyframes(here.map, there[alive][:30])
     assert near.tolist() == [0, 1]
-    assert set(tracked.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
-    assert tracked.inliers > 60
+    assert set(estimate.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
+    assert estimate.inliers > 60
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(2.44, True), (2.46, False)])
@@ -79,7 +79,7 @@ def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
 def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
     offset: float, agrees: bool, scale: float
 ) -> None:
-    here = world()
+    here = submap()
     seen = here.map.points_seen_by(torch.tensor([0]))
     T_cw = here.map.T_cw[0]
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
@@ -95,7 +95,7 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
 
 @pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
 def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
-    here = world()
+    here = submap()
     seen = here.map.points_seen_by(torch.tensor([0]))
     roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
     T_cw = roll @ here.map.T_cw[0]
@@ -115,7 +115,7 @@ def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: 
 
 
 def test_points_behind_the_camera_agree_with_nothing() -> None:
-    here = world()
+    here = submap()
     seen = here.map.points_seen_by(torch.tensor([0]))
     T_cw = pose(0, 0, 0, 0, math.pi)
     middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
@@ -129,7 +129,7 @@ def test_points_behind_the_camera_agree_with_nothing() -> None:
 
 def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
-    here = world()
+    here = submap()
     T_cw = here.map.T_cw[0]
     seen = here.map.points_seen_by(torch.tensor([0]))
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
@@ -146,7 +146,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
 
 
 def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
-    here = world()
+    here = submap()
     T_cw = here.map.T_cw[0]
     seen = here.map.points_seen_by(torch.tensor([0]))
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]

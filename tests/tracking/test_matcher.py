@@ -88,7 +88,7 @@ def test_it_is_asked_in_all_stages() -> None:
     states = [result.state for result in run.results]
     assert states[18:20] == [State.LOST, State.LOST]
     assert states[-1] is State.TRACKING
-    assert len(run.worlds) == 1
+    assert len(run.submaps) == 1
     asked = matcher.asked_by
     assert set(asked) == {"initialization", "provisional_map", "tracker", "new_points", "relocalization"}
     assert asked["tracker"] >= 20  # near the prediction, in every frame that is followed

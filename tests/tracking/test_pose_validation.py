@@ -13,7 +13,7 @@ from tests.map.simulated import tracked_at
 from tests.scene import pose
 from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
-from torchslam.map.tracking_state import TrackingState
+from torchslam.map.atlas import TrackingState
 from torchslam.tracking.pose_validation import deviations, jump, why_doubt
 from torchslam.types import PoseEstimate
 
@@ -26,10 +26,10 @@ def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> Pose
 
 
 def doubt(
-    tracked: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained: float = 1.0
+    estimate: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained_ratio: float = 1.0
 ) -> str:
-    track = replace(TrackingState.nowhere(HERE), error=error, explained=explained)
-    return why_doubt(tracked, expected, track, SETTINGS)
+    tracking = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
+    return why_doubt(estimate, expected, tracking, SETTINGS)
 
 
 def test_a_certain_pose_is_believed() -> None:
@@ -51,15 +51,15 @@ def test_errors_over_many_frames_must_be_noise() -> None:
 
 
 def test_enough_of_the_image_must_show_what_is_expected() -> None:
-    assert doubt(seen(coverage=SETTINGS.min_coverage_ratio)) == ""
-    assert doubt(seen(coverage=SETTINGS.min_coverage_ratio - 0.01)).startswith("only 19% of the image")
+    assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio)) == ""
+    assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio - 0.01)).startswith("only 19% of the image")
 
 
 def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
     least = SETTINGS.min_explained_ratio
-    assert doubt(seen(), explained=least) == ""
-    assert doubt(seen(explained=0.0)) == ""  # one frame alone proves nothing
-    assert doubt(seen(), explained=least - 0.01).startswith(
+    assert doubt(seen(), explained_ratio=least) == ""
+    assert doubt(seen(explained_ratio=0.0)) == ""  # one frame alone proves nothing
+    assert doubt(seen(), explained_ratio=least - 0.01).startswith(
         f"the map explains only {least - 0.01:.0%} of the image"
     )
 

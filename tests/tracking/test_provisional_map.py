@@ -12,7 +12,7 @@ from tests.scene import CAMERA, Scene, pose, world_in
 from torchslam.config import Config
 from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.provisional_map import INTERVAL, LEAST_SUPPORT, ProvisionalMap, support
+from torchslam.tracking.provisional_map import CHECK_INTERVAL, MIN_SUPPORT_RATIO, ProvisionalMap, support
 from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
@@ -28,13 +28,13 @@ def swung(degrees: float) -> Tensor:
     return T_cw
 
 
-def young(T_cw: Tensor, age: int = INTERVAL) -> ProvisionalMap:
+def young(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
     """A world with a frame at the origin and one at SIDE that the map has at T_cw, in a frame of its own."""
-    world = world_in(SCENE, torch.stack([pose(), SIDE]))
+    submap = world_in(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
-    world.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
-    youth = ProvisionalMap(world, [SCENE.view(0, pose())])
-    youth.grow(SCENE.view(1, SIDE))
+    submap.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
+    youth = ProvisionalMap(submap, [SCENE.view(0, pose())])
+    youth.add_frame(SCENE.view(1, SIDE))
     youth.age = age
     return youth
 
@@ -53,17 +53,17 @@ def supported(start: TwoViewMap, T_21: Tensor) -> float:
 
 
 def test_a_world_that_has_the_camera_where_it_was_has_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert young(SIDE).rival(CAMERA, Config()) is None
+    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
     looked: list[FrameFeatures] = []
     monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view) or (None, ""))
-    assert young(SIDE).rival(CAMERA, Config()) is None
+    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
     assert not looked  # it explains more than half of the matches: no motion can have twice as much support
-    assert young(swung(60)).rival(CAMERA, Config()) is None
+    assert young(swung(60)).find_contradicting_initialization(CAMERA, Config()) is None
     assert len(looked) == 2
 
 
 def test_the_rival_of_a_wrong_world_has_the_right_motion() -> None:
-    start = young(swung(60)).rival(CAMERA, Config())
+    start = young(swung(60)).find_contradicting_initialization(CAMERA, Config())
     assert start is not None
     wanted = SIDE.clone()
     wanted[:3, 3] /= SIDE[:3, 3].norm()
@@ -71,15 +71,17 @@ def test_the_rival_of_a_wrong_world_has_the_right_motion() -> None:
     assert (start.reference.index, start.view.index) == (0, 1)
 
 
-@pytest.mark.parametrize("age", range(1, 2 * INTERVAL + 1))
+@pytest.mark.parametrize("age", range(1, 2 * CHECK_INTERVAL + 1))
 def test_every_few_frames_are_looked_at(age: int) -> None:
-    assert (young(swung(60), age).rival(CAMERA, Config()) is not None) is (age % INTERVAL == 0)
+    assert (young(swung(60), age).find_contradicting_initialization(CAMERA, Config()) is not None) is (
+        age % CHECK_INTERVAL == 0
+    )
 
 
 def test_frames_that_make_no_start_contradict_nothing() -> None:
     youth = young(swung(60))
     youth.views[1] = SCENE.view(1, pose())
-    assert youth.rival(CAMERA, Config()) is None
+    assert youth.find_contradicting_initialization(CAMERA, Config()) is None
 
 
 def test_a_world_is_contradicted_when_it_has_less_than_half_of_the_support() -> None:
@@ -87,8 +89,8 @@ def test_a_world_is_contradicted_when_it_has_less_than_half_of_the_support() -> 
     for degrees in torch.linspace(2.5, 4.5, 21).tolist():
         T_21 = swung(degrees)
         share = supported(start, T_21) / supported(start, start.T_cw)
-        contradicted = young(T_21).rival(CAMERA, Config()) is not None
-        assert contradicted is (share < LEAST_SUPPORT)
+        contradicted = young(T_21).find_contradicting_initialization(CAMERA, Config()) is not None
+        assert contradicted is (share < MIN_SUPPORT_RATIO)
         if abs(share - 0.5) < 0.1:
             decided.add(contradicted)
     assert decided == {True, False}

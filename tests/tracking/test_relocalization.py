@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
 from torchslam.config import load_config
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.tracking.correspondences import (
     match_keyframe,
     match_points,
@@ -37,15 +37,15 @@ def found(
     located = relocalizer(*overrides).locate(SCENE.view(50, T_cw, noise=noise), candidates)
     if located is None:
         return None
-    world, tracked = located
-    torch.testing.assert_close(tracked.T_cw, T_cw, atol=0.02, rtol=0)
-    assert tracked.inliers > 100
-    return world
+    submap, estimate = located
+    torch.testing.assert_close(estimate.T_cw, T_cw, atol=0.02, rtol=0)
+    assert estimate.inliers > 100
+    return submap
 
 
 def test_a_frame_is_found_where_it_is_without_knowing_anything() -> None:
     right, _ = worlds()
-    right.track.local_points = right.track.local_points[:0]
+    right.tracking.local_points = right.tracking.local_points[:0]
     assert found(ANYWHERE, [(right, 0)]) is right
     assert found(sideways(1, start=0.6)[0], [(right, 0)]) is right
 

@@ -49,11 +49,11 @@ def test_nobody_waits_where_nobody_may() -> None:
 
 
 def test_a_young_world_counts_its_frames_from_the_start_on() -> None:
-    world = Atlas(CAMERA.params).begin()
-    youth = ProvisionalMap(world, views(0, 1))
+    submap = Atlas(CAMERA.params).create()
+    youth = ProvisionalMap(submap, views(0, 1))
     assert youth.age == 0
     for view in views(2, 3, 4):
-        youth.grow(view)
+        youth.add_frame(view)
     assert youth.age == 3
     assert [view.index for view in youth.views] == [0, 1, 2, 3, 4]
-    assert youth.world is world
+    assert youth.submap is submap

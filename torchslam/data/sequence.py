@@ -122,7 +122,7 @@ class Sequence(ABC):
         return 0
 
     @property
-    def waiting(self) -> int:
+    def backlog(self) -> int:
         """Frames of a live source that have come and were not taken yet."""
         return 0
 
@@ -131,7 +131,7 @@ class Sequence(ABC):
         """(1, 1, H, W) float32 in [0, 1]. Raises FrameError where it cannot be read or has another size."""
 
     def color(self, index: int) -> Tensor:
-        """(H, W, 3) uint8 red, green, blue; three times the same where the sequence is grey. Raises FrameError."""
+        """(H, W, 3) uint8 red, green, blue; three times the same where the sequence is gray. Raises FrameError."""
         return (self.image(index)[0, 0, :, :, None] * 255.0).round().to(torch.uint8).expand(-1, -1, 3)
 
     @abstractmethod
@@ -174,7 +174,7 @@ class Sequence(ABC):
             T_cw_groundtruth=self.pose(index),
             mask=self.mask(index),
             features=self.features(index),
-            waiting=self.waiting,
+            backlog=self.backlog,
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -236,8 +236,8 @@ class Sequence(ABC):
 
     def _describe_camera(self) -> str:
         if self._camera is None:
-            decides = "the images decide, unless --camera says it"
-            return f"missing: {decides if self.known_length is not None else '--camera gives it'}"
+            is_live = self.known_length is None
+            return f"missing; {'--camera is required' if is_live else 'estimated from the images unless --camera is given'}"
         numbers = " ".join(f"{number:.6g}" for number in self._camera.params.tolist())
         guessed = " (guessed)" if self.calibrated is Calibrated.GUESSED else ""
         return f"{self._camera.model} {numbers}{guessed}"
@@ -287,8 +287,8 @@ class Transformed(Sequence):
         return self._whole.dropped
 
     @property
-    def waiting(self) -> int:
-        return self._whole.waiting
+    def backlog(self) -> int:
+        return self._whole.backlog
 
     def image(self, index: int) -> Tensor:
         return self._whole.image(self._at(index))

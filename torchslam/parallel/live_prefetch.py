@@ -49,7 +49,7 @@ class LivePrefetcher(WithWorker):
         if self._is_sent:
             frame = self._with_features(frame)
         self._look_ahead(index + 1)
-        return replace(frame, waiting=self._sequence.waiting + (self._next is not None))
+        return replace(frame, backlog=self._sequence.backlog + (self._next is not None))
 
     def _with_features(self, frame: Frame) -> Frame:
         self._is_sent = False
@@ -59,7 +59,7 @@ class LivePrefetcher(WithWorker):
 
     def _look_ahead(self, index: int) -> None:
         """Have the next frame looked at, if it has come and there is somebody to do it."""
-        if not self._sequence.waiting or not self._worker.is_there():
+        if not self._sequence.backlog or not self._worker.is_there():
             return
         if not self._has_task:
             self._has_task = self._worker.send(self._task)

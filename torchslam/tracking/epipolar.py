@@ -60,7 +60,7 @@ def match_along_epipolar_lines(
     """
     rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
     (angles_1, _), (angles_2, sines) = (
-        around(T_21[:, :3, 3], rays) for rays in (rays_1, pad(there.normalized, (0, 1), value=1.0))
+        angle_around_axis(T_21[:, :3, 3], rays) for rays in (rays_1, pad(there.normalized, (0, 1), value=1.0))
     )
     width = epipolar_px / camera.focal * there.features.scales / sines.clamp(min=1e-12)
     width = torch.where(width < 1, torch.asin(width.clamp(max=1.0)), math.pi)
@@ -89,7 +89,7 @@ def match_along_epipolar_lines(
     return row // count, row % count, column % others
 
 
-def around(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def angle_around_axis(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     """(k, n), (k, n) angles of rays (k, n, 3) around axes (k, 3), radians, and the sines of their angles to these."""
     least = torch.nn.functional.one_hot(axes.abs().argmin(-1), 3).to(axes.dtype)
     across = torch.nn.functional.normalize(torch.linalg.cross(axes, least), dim=-1)

@@ -23,10 +23,12 @@ from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
 from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
-AWAY = 3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
-STILL_SHARE = 0.1  # of the matches, from which on it is asked whether they belong to the scene
-GONE_SHARE = 0.35  # of the keypoints that match where the camera stands still, at least
-EXPLAINED_SHARE = 0.5  # of them that the motion of the others must explain
+TRIANGULATION_GATE_SIGMA = (
+    3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
+)
+MIN_STATIC_RATIO = 0.1  # of the matches, from which on it is asked whether they belong to the scene
+MIN_MATCHED_RATIO = 0.35  # of the keypoints that match where the camera stands still, at least
+MIN_EXPLAINED_RATIO = 0.5  # of them that the motion of the others must explain
 
 
 class Initializer:
@@ -76,7 +78,7 @@ class Initializer:
             if scene is None:
                 return None, "some of the image stays in place, and it is not clear what moves"
             return self._relate_moving(view, first[scene], second[scene], scene_only=False)
-        if len(first) < GONE_SHARE * int(self.reference.mask.sum()):
+        if len(first) < MIN_MATCHED_RATIO * int(self.reference.mask.sum()):
             self.still = view.keypoints[second[motion < settings.max_static_px]]
             self._refer_to(view)
             return None, "what still matches stays in place, the rest has gone: took a new reference frame"
@@ -121,7 +123,7 @@ class Initializer:
         everyone = torch.ones_like(motion, dtype=torch.bool)
         still = motion < self.config.initialization.max_static_px
         if (
-            int(still.sum()) < STILL_SHARE * len(motion)
+            int(still.sum()) < MIN_STATIC_RATIO * len(motion)
             or int((~still).sum()) < self.config.initialization.min_matches
         ):
             return everyone
@@ -132,7 +134,7 @@ class Initializer:
         across, along = epipolar_offsets(others.T_21[0], pixels_1, pixels_2, self.camera, self.camera)
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
-        if float(explained.double().mean()) >= EXPLAINED_SHARE:
+        if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
             return everyone
         self.still = view.keypoints[second[still]]
         return ~still
@@ -191,7 +193,7 @@ def is_good(
     z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
     With "parallax": when the angle is large enough.
     """
-    is_close = fits(errors, AWAY**2)
+    is_close = fits(errors, TRIANGULATION_GATE_SIGMA**2)
     if settings.criterion == "parallax":
         return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
     relative_std = sigmas / (camera.focal * seen.angles.clamp(min=1e-9))

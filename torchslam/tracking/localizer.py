@@ -23,11 +23,18 @@ from torchslam.map.map import Map
 from torchslam.optim.core.numpy_backend import RobustKernel
 from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, nearby_pose
 from torchslam.tracking.correspondences import Projected, match_near, project_points
-from torchslam.tracking.match_selection import SENIOR, coverage, explained, spread, trusted, voices
+from torchslam.tracking.match_selection import (
+    MATURE_OBSERVATIONS,
+    coverage_ratio,
+    explained_ratio,
+    grid_weights,
+    select_mature,
+    subsample_per_cell,
+)
 from torchslam.tracking.matcher import DescriptorMatcher, MatchIndices
 from torchslam.types import FrameFeatures, PoseEstimate
 
-FAR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
+OUTLIER_GATE_FACTOR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
 
 
 class Localizer:
@@ -59,9 +66,9 @@ class Localizer:
         """
         best: PoseEstimate | None = None
         for pairs in candidates:
-            tracked = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
-            if tracked is not None and (best is None or tracked.inliers > best.inliers):
-                best = tracked
+            estimate = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
+            if estimate is not None and (best is None or estimate.inliers > best.inliers):
+                best = estimate
             if best is not None and best.inliers >= self.least_share * best.matches:
                 break
         return best
@@ -78,8 +85,8 @@ class Localizer:
         settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
         if len(point_ids) < settings.min_matches:
             return None
-        chosen = trusted(slam_map.points["times_found"][point_ids], settings.min_matches)
-        chosen = chosen[spread(view.keypoints[keypoints[chosen]], self.camera.size)]
+        chosen = select_mature(slam_map.points["times_found"][point_ids], settings.min_matches)
+        chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.size)]
         undistorted = self.undistorted(view.keypoints)
         points_w, heard = slam_map.positions_w[point_ids[chosen]], undistorted[keypoints[chosen]]
         T_cw = self._start(points_w, heard, expected_T_cw)
@@ -107,8 +114,8 @@ class Localizer:
             covariance=refined.covariance(),
             depth=float(refined.linearization.depths[inliers].median()),
             error=float(errors.median()),
-            coverage=coverage(slam_map, near, seen, self.camera.size),
-            explained=explained(view, at[inliers], self.camera.size),
+            coverage_ratio=coverage_ratio(slam_map, near, seen, self.camera.size),
+            explained_ratio=explained_ratio(view, at[inliers], self.camera.size),
             weights=None if weights is None else weights[inliers],
             expected=near.ids,
         )
@@ -129,9 +136,9 @@ class Localizer:
         """The local points, or those around what was matched where that is elsewhere in the map."""
         if len(local_points) and _are_among(point_ids, local_points):
             return local_points
-        return slam_map.points_seen_by(self.around(slam_map, point_ids))
+        return slam_map.points_seen_by(self.covisible_keyframes(slam_map, point_ids))
 
-    def around(self, slam_map: Map, point_ids: Tensor) -> Tensor:
+    def covisible_keyframes(self, slam_map: Map, point_ids: Tensor) -> Tensor:
         """(k,) the keyframe that sees most of the points (n,), and those that share most points with it."""
         keyframe = int(slam_map.observers(point_ids).argmax())
         near = slam_map.covisible(keyframe, self.settings.local_keyframes)
@@ -153,11 +160,13 @@ class Localizer:
         """
         problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
         linearization = problem.linearize(T_cw)
-        mask = fits(linearization.squared / noise.margin**2, FAR * self.measurement.max_chi_square)
-        old = mask & (slam_map.points["times_found"][ids] >= SENIOR)
+        mask = fits(
+            linearization.squared / noise.margin**2, OUTLIER_GATE_FACTOR * self.measurement.max_chi_square
+        )
+        old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = voices(pixels, self.camera.size)
+        weights = grid_weights(pixels, self.camera.size)
         kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
             refined = problem.minimize(linearization, weights * mask, kernel)

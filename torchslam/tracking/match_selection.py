@@ -15,10 +15,10 @@ from torchslam.types import FrameFeatures
 from torchslam.utils.indexing import is_among
 
 CELLS = (8, 6)  # the image as a grid, for what should be spread over it
-PER_CELL = 5  # matches of a cell that RANSAC hears
-CROWD = 8  # matches of a cell that count in full
-LEAST_ASKED = 5  # cells that old points are expected in, before it says anything that they are missing
-SENIOR = 10  # certain frames that found a point, before RANSAC hears it and its like alone
+MAX_MATCHES_PER_CELL = 5  # matches of a cell that RANSAC hears
+MAX_CELL_WEIGHT = 8  # matches of a cell that count in full
+MIN_COVERAGE_CELLS = 5  # cells that old points are expected in, before it says anything that they are missing
+MATURE_OBSERVATIONS = 10  # certain frames that found a point, before RANSAC hears it and its like alone
 
 
 def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -30,22 +30,22 @@ def cells(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return row * CELLS[0] + column
 
 
-def trusted(times_found: Tensor, least: int) -> Tensor:
+def select_mature(times_found: Tensor, least: int) -> Tensor:
     """(m,) rows of matches (n,) with points that many frames have found; all where they are fewer than `least`.
 
     What moves by itself agrees with the scene for a while at most: its points do not grow old.
     """
-    old = torch.nonzero(times_found >= SENIOR)[:, 0]
+    old = torch.nonzero(times_found >= MATURE_OBSERVATIONS)[:, 0]
     return old if len(old) >= least else torch.arange(len(times_found), device=times_found.device)
 
 
-def spread(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+def subsample_per_cell(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """(m,) rows of pixels (n, 2), a few of each cell of the image: each cell has a voice.
 
     Where one thing with much texture moves before a scene with little, most matches are its.
     """
     order, rank = _ranks(pixels, size)
-    return torch.sort(order[rank < PER_CELL]).values
+    return torch.sort(order[rank < MAX_MATCHES_PER_CELL]).values
 
 
 def evenly(pixels: Tensor, size: tuple[int, int], count: int) -> Tensor:
@@ -63,14 +63,14 @@ def _ranks(pixels: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     return order, torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
 
 
-def voices(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+def grid_weights(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """(n,) what each of the pixels (n, 2) counts, so that a crowded cell of the image does not outvote the others."""
     cell = cells(pixels, size)
     crowd = torch.bincount(cell, minlength=CELLS[0] * CELLS[1])[cell]
-    return (CROWD / crowd).clamp(max=1.0)
+    return (MAX_CELL_WEIGHT / crowd).clamp(max=1.0)
 
 
-def explained(view: FrameFeatures, keypoints: Tensor, size: tuple[int, int]) -> float:
+def explained_ratio(view: FrameFeatures, keypoints: Tensor, size: tuple[int, int]) -> float:
     """The share of the image's cells with several keypoints in which at least one of keypoints (m,) lies."""
     count = CELLS[0] * CELLS[1]
     there = torch.bincount(cells(view.keypoints[view.mask], size), minlength=count) >= 2
@@ -78,19 +78,19 @@ def explained(view: FrameFeatures, keypoints: Tensor, size: tuple[int, int]) -> 
     return float(used[there].double().mean()) if bool(there.any()) else 1.0
 
 
-def coverage(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
+def coverage_ratio(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
     """The share of the image's cells in which several old points were expected that has at least a fifth of them.
 
     1 where these cells are too few to tell anything.
 
     expected: points that should be in the image; seen: (m,) those of them that are where they should be
     """
-    old = slam_map.points["times_found"][expected.ids] >= SENIOR
+    old = slam_map.points["times_found"][expected.ids] >= MATURE_OBSERVATIONS
     cell = cells(expected.pixels[old], size)
     count = CELLS[0] * CELLS[1]
     wanted = torch.bincount(cell, minlength=count)
     found = torch.bincount(cell[is_among(expected.ids[old], seen)], minlength=count)
     asked = wanted >= 2
-    if int(asked.sum()) < LEAST_ASKED:
+    if int(asked.sum()) < MIN_COVERAGE_CELLS:
         return 1.0
     return float((5 * found >= wanted)[asked].double().mean())

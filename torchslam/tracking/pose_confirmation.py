@@ -5,14 +5,14 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.map.tracking_state import TrackingState
+from torchslam.map.atlas import TrackingState
 from torchslam.types import FrameFeatures, PoseEstimate
 
-Held = tuple[FrameFeatures, PoseEstimate, Tensor, int]
+PendingFrame = tuple[FrameFeatures, PoseEstimate, Tensor, int]
 """A frame, what was found in it, and its pose T_cr (4, 4) relative to a keyframe."""
 
 
-MOST = 1000
+MAX_PENDING_FRAMES = 1000
 """Frames held back at a time: none can wait for ever."""
 
 
@@ -22,10 +22,10 @@ class PoseConfirmation:
     def __init__(self, config: Config) -> None:
         self._after_doubt = config.pose_validation.num_confirming_frames
         self._after_return = config.relocalization.num_confirming_frames
-        self._held: list[Held] = []
+        self._held: list[PendingFrame] = []
         self._needed = 0
         self._doubtful = 0  # frames since the last certain one that is believed
-        self.came_back = False
+        self.is_relocalized = False
 
     def __bool__(self) -> bool:
         """Whether anything is held back."""
@@ -36,16 +36,18 @@ class PoseConfirmation:
         """What is waited for."""
         return f"to be confirmed by {self._needed} more frames"
 
-    def come_back(self, view: FrameFeatures, tracked: PoseEstimate, track: TrackingState) -> None:
+    def start_after_relocalization(
+        self, view: FrameFeatures, estimate: PoseEstimate, tracking: TrackingState
+    ) -> None:
         """Begin with a frame that was relocalised."""
-        self._held = [(view, tracked, track.T_cr, track.reference)]
-        self._needed, self.came_back = self._after_return, True
+        self._held = [(view, estimate, tracking.T_cr, tracking.reference)]
+        self._needed, self.is_relocalized = self._after_return, True
 
-    def hold(
+    def push(
         self,
         view: FrameFeatures,
-        tracked: PoseEstimate,
-        track: TrackingState,
+        estimate: PoseEstimate,
+        tracking: TrackingState,
         doubt: str,
         is_mapped: bool = False,
     ) -> None:
@@ -54,10 +56,10 @@ class PoseConfirmation:
         is_mapped: the map grew by what is held back and agrees with it for that reason alone: it takes as many certain
                    frames as there were doubtful ones
         """
-        self._held.append((view, tracked, track.T_cr, track.reference))
+        self._held.append((view, estimate, tracking.T_cr, tracking.reference))
         self._doubtful += bool(doubt)
         if doubt:
-            self._needed = self._after_return if self.came_back else self._after_doubt
+            self._needed = self._after_return if self.is_relocalized else self._after_doubt
             if is_mapped:
                 self._needed = max(self._needed, self._doubtful)
         else:
@@ -66,18 +68,18 @@ class PoseConfirmation:
     @property
     def is_full(self) -> bool:
         """Whether no more frames can be held back."""
-        return len(self._held) >= MOST
+        return len(self._held) >= MAX_PENDING_FRAMES
 
     def views(self) -> list[FrameFeatures]:
         """The frames that are held back, in order."""
         return [held[0] for held in self._held]
 
-    def release(self) -> list[Held]:
+    def confirm(self) -> list[PendingFrame]:
         """What was held back and is believed now; nothing is held any more."""
-        self._needed, self._doubtful, self.came_back = 0, 0, False
-        return self.hand_over()
+        self._needed, self._doubtful, self.is_relocalized = 0, 0, False
+        return self.pop_all()
 
-    def hand_over(self) -> list[Held]:
+    def pop_all(self) -> list[PendingFrame]:
         """What is held back, believed or not; frames that come later still have to confirm the camera's place."""
         held, self._held = self._held, []
         return held

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
 from torchslam.tracking.correspondences import match_keyframe
 from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import why_doubt
@@ -38,18 +37,20 @@ class Relocalizer:
         Candidates beside one that failed are left out: they see the same.
         """
         tried: list[tuple[Submap, Tensor]] = []
-        for world, keyframe in candidates:
+        for submap, keyframe in candidates:
             if len(tried) == self.tries:
                 return None
-            if any(world is other and bool((near == keyframe).any()) for other, near in tried):
+            if any(submap is other and bool((near == keyframe).any()) for other, near in tried):
                 continue
-            near = self._near(world.map, keyframe)
-            tracked = self.tracker.localizer.locate(
-                world.map, view, self._matches(world.map, keyframe, view), world.map.points_seen_by(near)
+            near = self._near(submap.map, keyframe)
+            estimate = self.tracker.localizer.locate(
+                submap.map, view, self._matches(submap.map, keyframe, view), submap.map.points_seen_by(near)
             )
-            if tracked is not None and not why_doubt(tracked, None, alone(world.track, tracked), self.judge):
-                return world, tracked
-            tried.append((world, near))
+            if estimate is not None and not why_doubt(
+                estimate, None, alone(submap.tracking, estimate), self.judge
+            ):
+                return submap, estimate
+            tried.append((submap, near))
         return None
 
     def _near(self, slam_map: Map, keyframe: int) -> Tensor:
@@ -61,6 +62,6 @@ class Relocalizer:
         yield match_keyframe(slam_map, keyframe, view, self.tracker.matcher)
 
 
-def alone(track: TrackingState, tracked: PoseEstimate) -> TrackingState:
+def alone(tracking: TrackingState, estimate: PoseEstimate) -> TrackingState:
     """What there is to judge a frame by that no others came before: itself."""
-    return replace(track, error=tracked.error, explained=tracked.explained)
+    return replace(tracking, error=estimate.error, explained_ratio=estimate.explained_ratio)

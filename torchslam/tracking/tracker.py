@@ -13,16 +13,15 @@ from torchslam.geometry import (
     Camera,
     se3_inverse,
 )
-from torchslam.geometry.motion import reorthonormalized
+from torchslam.geometry.transforms import reorthonormalized
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
 from torchslam.tracking.correspondences import match_near, match_points
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.matcher import Matcher, MatchIndices, make_matcher
 from torchslam.types import FrameFeatures, PoseEstimate
 
-MEMORY = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
+EMA_RATE = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
 
 
 class Tracker:
@@ -43,19 +42,19 @@ class Tracker:
 
     # --- the track -------------------------------------------------------------------------------------------
 
-    def follow(self, world: Submap, keyframe: int) -> None:
+    def reset_to_keyframe(self, submap: Submap, keyframe: int) -> None:
         """Go on from a keyframe: the last frame is at its place."""
-        T_cw = world.map.T_cw[keyframe]
-        seen = world.map.keyframes["point_ids"][keyframe]
-        world.track = replace(
-            self._around(world.map, keyframe, T_cw),
-            velocity=world.track.velocity,
-            seen_last=seen[seen >= 0],
-            error=world.track.error,
-            explained=world.track.explained,
+        T_cw = submap.map.T_cw[keyframe]
+        seen = submap.map.keyframes["point_ids"][keyframe]
+        submap.tracking = replace(
+            self._at_keyframe(submap.map, keyframe, T_cw),
+            velocity=submap.tracking.velocity,
+            last_inlier_points=seen[seen >= 0],
+            error=submap.tracking.error,
+            explained_ratio=submap.tracking.explained_ratio,
         )
 
-    def _around(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
+    def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
         """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
         near = slam_map.covisible(keyframe, self.settings.local_keyframes)
         local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
@@ -72,94 +71,96 @@ class Tracker:
             reference=keyframe,
             reference_size=well_observed(slam_map, keyframe, local_keyframes),
             velocity=None,
-            seen_last=local_points[:0],
+            last_inlier_points=local_points[:0],
             local_keyframes=local_keyframes,
             local_points=local_points,
         )
 
-    def predict(self, world: Submap) -> Tensor:
+    def predict(self, submap: Submap) -> Tensor:
         """(4, 4) where the next frame should be: constant velocity."""
-        if world.track.velocity is None or not self.settings.motion_model:
-            return world.T_cw
-        return reorthonormalized(world.track.velocity @ world.T_cw)
+        if submap.tracking.velocity is None or not self.settings.motion_model:
+            return submap.T_cw
+        return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
 
     # --- one frame -------------------------------------------------------------------------------------------
 
-    def track(self, world: Submap, view: FrameFeatures, is_sure: bool = True) -> PoseEstimate | None:
+    def track(self, submap: Submap, view: FrameFeatures, is_sure: bool = True) -> PoseEstimate | None:
         """Locate the frame that comes after the last one; None when it cannot be located.
 
         is_sure: the last frames are believed, so that the pose is looked for next to where they lead
         """
-        expected = self.predict(world)
-        candidates = self._candidates(world, view, expected)
-        tracked = self.localizer.locate(
-            world.map, view, candidates, world.track.local_points, expected if is_sure else None
+        expected = self.predict(submap)
+        candidates = self._candidates(submap, view, expected)
+        estimate = self.localizer.locate(
+            submap.map, view, candidates, submap.tracking.local_points, expected if is_sure else None
         )
-        if tracked is None:
-            world.track.velocity = None
+        if estimate is None:
+            submap.tracking.velocity = None
             return None
-        self.accept(world, view, tracked)
-        return tracked
+        self.update(submap, view, estimate)
+        return estimate
 
-    def _candidates(self, world: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
+    def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
-        slam_map, track, settings = world.map, world.track, self.settings
+        slam_map, tracking, settings = submap.map, submap.tracking, self.settings
         if settings.guided_matching:
-            alive = track.seen_last[slam_map.points["is_valid"][track.seen_last]]
+            alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
             yield match_near(slam_map, near, view, settings.search_radius_px, self.matcher, ratio=0.9)
-            local = self.localizer.project(slam_map, track.local_points, T_cw, view)
+            local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
             wide = settings.search_radius_px * settings.wide_radius_factor
             yield match_near(slam_map, local, view, wide, self.matcher, ratio=0.9)
         else:
-            local = self.localizer.project(slam_map, track.local_points, T_cw, view)
+            local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
-        yield match_points(slam_map, track.local_points, view, self.matching)
+        yield match_points(slam_map, tracking.local_points, view, self.matching)
 
-    def accept(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
+    def update(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Take a frame over into the track: velocity, reference keyframe, counters of the points."""
-        slam_map, track = world.map, world.track
-        track.velocity = tracked.T_cw @ se3_inverse(world.T_cw)
-        track.seen_last = tracked.point_ids
-        track.error += MEMORY * (tracked.error - track.error)
-        track.explained += MEMORY * (tracked.explained - track.explained)
-        self._count(slam_map, view, tracked)
-        shared = slam_map.observers(tracked.point_ids, track.local_keyframes)
-        best = int(track.local_keyframes[shared.argmax()])
-        if best == track.reference:
-            track.T_cr = tracked.T_cw @ se3_inverse(slam_map.T_cw[best])
+        slam_map, tracking = submap.map, submap.tracking
+        tracking.velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
+        tracking.last_inlier_points = estimate.point_ids
+        tracking.error += EMA_RATE * (estimate.error - tracking.error)
+        tracking.explained_ratio += EMA_RATE * (estimate.explained_ratio - tracking.explained_ratio)
+        self._update_last_seen(slam_map, view, estimate)
+        shared = slam_map.observers(estimate.point_ids, tracking.local_keyframes)
+        best = int(tracking.local_keyframes[shared.argmax()])
+        if best == tracking.reference:
+            tracking.T_cr = estimate.T_cw @ se3_inverse(slam_map.T_cw[best])
         else:
-            world.track = replace(
-                self._around(slam_map, best, tracked.T_cw),
-                velocity=track.velocity,
-                seen_last=track.seen_last,
-                error=track.error,
-                explained=track.explained,
+            submap.tracking = replace(
+                self._at_keyframe(slam_map, best, estimate.T_cw),
+                velocity=tracking.velocity,
+                last_inlier_points=tracking.last_inlier_points,
+                error=tracking.error,
+                explained_ratio=tracking.explained_ratio,
             )
 
-    def start_at(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate) -> None:
+    def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Begin a track anew, wherever in the map: at a frame that was located without one."""
-        best = int(world.map.observers(tracked.point_ids).argmax())
-        self._count(world.map, view, tracked)
-        world.track = replace(
-            self._around(world.map, best, tracked.T_cw), velocity=None, seen_last=tracked.point_ids
+        best = int(submap.map.observers(estimate.point_ids).argmax())
+        self._update_last_seen(submap.map, view, estimate)
+        submap.tracking = replace(
+            self._at_keyframe(submap.map, best, estimate.T_cw),
+            velocity=None,
+            last_inlier_points=estimate.point_ids,
         )
 
-    def expect(self, slam_map: Map, tracked: PoseEstimate) -> None:
+    def count_visible(self, slam_map: Map, estimate: PoseEstimate) -> None:
         """A frame is believed: the points that it should see were there to be seen."""
         if self.counts:
-            expected = tracked.point_ids if tracked.expected is None else tracked.expected
+            expected = estimate.point_ids if estimate.expected is None else estimate.expected
             slam_map.points["times_visible"][expected] += 1
 
-    def vouch(self, slam_map: Map, tracked: PoseEstimate) -> None:
+    def count_found(self, slam_map: Map, estimate: PoseEstimate) -> None:
         """A frame is believed: it speaks for the points that it saw."""
         if self.counts:
-            slam_map.points["times_found"][tracked.point_ids] += 1
+            slam_map.points["times_found"][estimate.point_ids] += 1
 
-    def _count(self, slam_map: Map, view: FrameFeatures, tracked: PoseEstimate) -> None:
+    def _update_last_seen(self, slam_map: Map, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """The points that a frame saw remember when that was."""
         if self.counts:
-            slam_map.points["last_seen_frame"][tracked.point_ids] = view.index
+            slam_map.points["last_seen_frame"][estimate.point_ids] = view.index
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:

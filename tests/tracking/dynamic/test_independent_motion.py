@@ -50,7 +50,7 @@ def is_thing(view: FrameFeatures, scene: Scene = SCENE) -> Tensor:
     return torch.arange(len(view.mask)) >= len(scene)
 
 
-def tracked(view: FrameFeatures, T_cw: Tensor, keypoints: Tensor) -> PoseEstimate:
+def estimate(view: FrameFeatures, T_cw: Tensor, keypoints: Tensor) -> PoseEstimate:
     return PoseEstimate(T_cw, keypoints, keypoints, len(keypoints), torch.eye(6).double(), DEPTH)
 
 
@@ -63,10 +63,10 @@ def watched(
 ) -> Iterator[tuple[FrameFeatures, FrameFeatures, Movement]]:
     """Each view, what is left of it, and what is said; the scene is what agrees with the pose."""
     for view in views:
-        cleared = by.clear_of(view)
+        cleared = by.mask_out(view)
         agrees = torch.nonzero(cleared.mask & ~is_thing(view))[:, 0]
         pose_now = camera_at(view.index) if T_cw is None else T_cw
-        yield view, cleared, by.observe(view, tracked(view, pose_now, agrees))
+        yield view, cleared, by.observe(view, estimate(view, pose_now, agrees))
 
 
 def test_what_moves_is_found_when_two_looks_differ_and_then_left_out() -> None:
@@ -98,8 +98,8 @@ def test_near_and_far_is_not_moving(depth: float) -> None:
     by = watcher()
     for index in range(2 * EVERY):
         view = joined(SCENE.view(index, camera_at(index)), other.view(index, camera_at(index)))
-        by.clear_of(view)
-        assert by.observe(view, tracked(view, camera_at(index), torch.arange(50))) == Movement()
+        by.mask_out(view)
+        assert by.observe(view, estimate(view, camera_at(index), torch.arange(50))) == Movement()
 
 
 def test_the_least_error_decides() -> None:
@@ -130,8 +130,8 @@ def test_strays_that_go_each_their_way_are_no_group() -> None:
             view,
             keypoints=torch.where(is_thing(view)[:, None], view.keypoints + jumps, view.keypoints),
         )
-        by.clear_of(view)
-        assert not by.observe(view, tracked(view, camera_at(index), torch.arange(50))).words
+        by.mask_out(view)
+        assert not by.observe(view, estimate(view, camera_at(index), torch.arange(50))).words
 
 
 def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
@@ -139,7 +139,7 @@ def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
     *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
     for index in range(2 * EVERY, 6 * EVERY):
         view = frame(index)
-        left_out = view.mask & ~by.clear_of(view).mask
+        left_out = view.mask & ~by.mask_out(view).mask
         assert (left_out & is_thing(view)).sum() > 0.8 * (view.mask & is_thing(view)).sum()
         assert (left_out & ~is_thing(view)).sum() < 0.2 * view.mask.sum()
 
@@ -149,7 +149,7 @@ def test_it_is_given_up_when_it_was_not_seen_to_move_for_long() -> None:
         by = watcher(max_unseen_frames=limit)
         *_, _ = watched(by, [frame(index) for index in range(EVERY + 1)])
         for index in range(EVERY + 1, EVERY + 4):
-            cleared = by.clear_of(frame(index))
+            cleared = by.mask_out(frame(index))
         assert bool((~cleared.mask & frame(index).mask).any()) is kept
 
 
@@ -157,7 +157,7 @@ def test_it_is_given_up_when_it_has_gone() -> None:
     by = watcher()
     *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
     alone = SCENE.view(2 * EVERY, camera_at(2 * EVERY))
-    assert torch.equal(by.clear_of(alone).mask, alone.mask)
+    assert torch.equal(by.mask_out(alone).mask, alone.mask)
 
 
 def test_what_has_more_of_the_image_than_the_map_is_not_left_out_but_doubted() -> None:
@@ -165,13 +165,13 @@ def test_what_has_more_of_the_image_than_the_map_is_not_left_out_but_doubted() -
     by = watcher()
     for index in range(EVERY + 1):
         view = frame(index, speed=0.1)
-        cleared = by.clear_of(view)
+        cleared = by.mask_out(view)
         T_cw = camera_at(index) @ thing_at(index, 0.1)
-        said = by.observe(view, tracked(view, T_cw, torch.nonzero(is_thing(view))[:, 0]))
+        said = by.observe(view, estimate(view, T_cw, torch.nonzero(is_thing(view))[:, 0]))
     assert said.is_doubt
     assert "move against the map" in said.words
     assert torch.equal(cleared.mask, view.mask)
-    assert torch.equal(by.clear_of(view).mask, view.mask)
+    assert torch.equal(by.mask_out(view).mask, view.mask)
 
 
 def test_a_map_that_goes_over_to_what_was_known_to_move_is_doubted() -> None:
@@ -180,10 +180,10 @@ def test_a_map_that_goes_over_to_what_was_known_to_move_is_doubted() -> None:
     doubts = []
     for index in range(2 * EVERY + 1, 4 * EVERY + 1):
         view = frame(index)
-        by.clear_of(view)
+        by.mask_out(view)
         # The pose is relative to the thing from here on, without a jump.
         T_cw = camera_at(index) @ thing_at(index, 0.03) @ se3_inverse(thing_at(2 * EVERY, 0.03))
-        doubts.append(by.observe(view, tracked(view, T_cw, torch.arange(len(SCENE)))).is_doubt)
+        doubts.append(by.observe(view, estimate(view, T_cw, torch.arange(len(SCENE)))).is_doubt)
     assert any(doubts)
 
 
@@ -192,19 +192,19 @@ def test_where_most_of_the_image_moves_the_pose_is_doubted() -> None:
     *_, (view, _, said) = watched(by, [frame(index) for index in range(EVERY + 1)])
     assert not said.is_doubt
     cell = torch.nonzero(view.mask & ~is_thing(view))[:1, 0]  # one keypoint agrees with the map
-    assert by.observe(view, tracked(view, camera_at(view.index), cell)).is_doubt
-    assert not watcher(max_area_ratio=100.0).observe(view, tracked(view, camera_at(0), cell)).is_doubt
+    assert by.observe(view, estimate(view, camera_at(view.index), cell)).is_doubt
+    assert not watcher(max_area_ratio=100.0).observe(view, estimate(view, camera_at(0), cell)).is_doubt
 
 
 def test_poses_of_two_worlds_are_not_compared() -> None:
     by = watcher()
     for index in range(2 * EVERY):
         view = frame(index)
-        by.clear_of(view)
+        by.mask_out(view)
         if index == EVERY - 1:
             by.forget_last()
         said = by.observe(
-            view, tracked(view, camera_at(index) @ pose(3.0 * (index >= EVERY), 0, 0), torch.arange(50))
+            view, estimate(view, camera_at(index) @ pose(3.0 * (index >= EVERY), 0, 0), torch.arange(50))
         )
         assert said == Movement()
 
@@ -213,6 +213,6 @@ def test_frames_of_another_session_are_not_compared() -> None:
     by = watcher()
     for index in range(EVERY + 1):
         view = replace(frame(index), session=int(index == EVERY))
-        by.clear_of(view)
-        said = by.observe(view, tracked(view, camera_at(index), torch.arange(50)))
+        by.mask_out(view)
+        said = by.observe(view, estimate(view, camera_at(index), torch.arange(50)))
     assert said == Movement()

@@ -44,7 +44,7 @@ def with_logo(
     )
 
 
-def stillness(**changes: float) -> StaticOverlayDetector:
+def overlay_detector(**changes: float) -> StaticOverlayDetector:
     return StaticOverlayDetector(CAMERA, replace(StaticOverlayConfig(), **changes), MatchingConfig())
 
 
@@ -56,31 +56,31 @@ def observed(by: StaticOverlayDetector, T_cw: Tensor, *, logo: bool = True, **op
 
 
 def test_a_logo_is_known_when_it_stayed_twice() -> None:
-    by = stillness()
+    by = overlay_detector()
     known = observed(by, turning(3))
     assert known[:2] == [0, 0]
     assert known[2] > LOGO
     view = with_logo(SCENE.view(9, sideways(1)[0]))
     assert by.covers(view.keypoints[-LOGO:]).all()
-    cleared = by.clear_of(view)
+    cleared = by.mask_out(view)
     assert not cleared.mask[-LOGO:].any()
     scene = view.mask[:-LOGO] & (view.keypoints[:-LOGO] - torch.tensor([283.5, 199.0])).abs().amax(-1).gt(30)
     assert torch.equal(cleared.mask[:-LOGO] & scene, scene)
 
 
 def test_before_that_nothing_is_left_out() -> None:
-    by = stillness()
+    by = overlay_detector()
     observed(by, turning(2))
     view = with_logo(SCENE.view(9, sideways(1)[0]))
-    assert by.clear_of(view) is view
+    assert by.mask_out(view) is view
     assert not by.covers(view.keypoints).any()
-    more = stillness(min_evidence=3)
+    more = overlay_detector(min_evidence=3)
     observed(more, turning(3))
-    assert more.clear_of(view) is view
+    assert more.mask_out(view) is view
 
 
 def test_cells_around_a_keypoint_that_stays_are_covered_too() -> None:
-    by = stillness()
+    by = overlay_detector()
     observed(by, turning(3))
     corner = torch.tensor([[270.0, 190.0]]).double()  # cell 67 (268 to 272), 47 (188 to 192)
     for x, y, covered in (
@@ -95,7 +95,7 @@ def test_cells_around_a_keypoint_that_stays_are_covered_too() -> None:
 
 def test_the_edge_of_the_image_is_covered_as_its_middle_is() -> None:
     corners = torch.tensor([[0.0, 0.0], [319.4, 0.0], [0.0, 239.4], [319.4, 239.4]] * 2).double()
-    by = stillness()
+    by = overlay_detector()
     by.add(corners)
     by.add(corners)
     assert by.covers(corners).all()
@@ -105,33 +105,33 @@ def test_the_edge_of_the_image_is_covered_as_its_middle_is() -> None:
 
 
 def test_a_scene_alone_makes_nothing_known() -> None:
-    by = stillness()
+    by = overlay_detector()
     assert observed(by, turning(5), logo=False) == [0] * 5
     assert not by.covers(SCENE.view(0, pose()).keypoints).any()
 
 
 def test_a_camera_that_stands_proves_nothing() -> None:
-    by = stillness()
+    by = overlay_detector()
     assert observed(by, turning(6, 0.0)) == [0] * 6
-    assert observed(stillness(), sideways(4, 0.4)) == [0] * 4  # what is far stays
+    assert observed(overlay_detector(), sideways(4, 0.4)) == [0] * 4  # what is far stays
 
 
 def test_small_steps_add_up_to_one_that_tells() -> None:
-    by = stillness()
+    by = overlay_detector()
     known = observed(by, turning(31, STEP / 10))
     assert sum(known) > LOGO
     assert known[1:3] == [0] * 2
 
 
 def test_few_that_stay_are_chance() -> None:
-    assert observed(stillness(), turning(3), keypoints=8)[2] > 0
-    by = stillness()
+    assert observed(overlay_detector(), turning(3), keypoints=8)[2] > 0
+    by = overlay_detector()
     assert observed(by, turning(6), keypoints=7) == [0] * 6
 
 
 def test_chance_takes_back_what_is_not_known_yet() -> None:
     """It stays once and is gone. Five frames later it is back, five later it stayed once more, then twice."""
-    by = stillness()
+    by = overlay_detector()
     T_cw = turning(14, step=0.04)
     results = []
     for index in range(14):
@@ -142,7 +142,7 @@ def test_chance_takes_back_what_is_not_known_yet() -> None:
 
 
 def test_where_nothing_stayed_it_pauses() -> None:
-    by = stillness()
+    by = overlay_detector()
     T_cw = turning(8, step=0.04)
     looked = []
     for index in range(8):
@@ -154,7 +154,7 @@ def test_where_nothing_stayed_it_pauses() -> None:
 
 def test_a_logo_may_wander_a_little() -> None:
     for shift, found in ((1.4, True), (1.6, False)):
-        by = stillness()
+        by = overlay_detector()
         T_cw = turning(3)
         results = [
             by.observe(with_logo(SCENE.view(index, T), shift=shift * (index % 2)), T, 4.0)
@@ -164,12 +164,12 @@ def test_a_logo_may_wander_a_little() -> None:
 
 
 def test_another_session_or_world_is_not_compared() -> None:
-    by = stillness()
+    by = overlay_detector()
     T_cw = turning(4)
     for index, T in enumerate(T_cw):
         view = replace(with_logo(SCENE.view(index, T)), session=index)
         assert by.observe(view, T, 4.0) == 0
-    by = stillness()
+    by = overlay_detector()
     for index, T in enumerate(T_cw):
         by.forget_last()
         assert by.observe(with_logo(SCENE.view(index, T)), T, 4.0) == 0
@@ -178,7 +178,7 @@ def test_another_session_or_world_is_not_compared() -> None:
 def test_most_of_the_image_must_have_moved() -> None:
     """By more than four pixels: a turn by a little less than a fiftieth, or more."""
     for pixels, told in ((2.5, False), (4.4, True)):
-        by = stillness()
+        by = overlay_detector()
         known = observed(by, torch.stack([pose(0, 0, 0, 0, pixels / 200.0 * index) for index in range(3)]))
         assert (known[2] > 0) is told
 
@@ -186,11 +186,11 @@ def test_most_of_the_image_must_have_moved() -> None:
 def test_evidence_from_elsewhere_counts_as_much() -> None:
     pixels = 40.0 + 10 * torch.arange(8, dtype=torch.float64)[:, None].expand(8, 2)
     for times, enough, known in ((1, 8, False), (2, 8, True), (2, 7, False)):
-        by = stillness()
+        by = overlay_detector()
         for _ in range(times):
             by.add(pixels[:enough])
         assert bool(by.covers(pixels[:enough]).all()) is known
-    off = stillness(enabled=False)
+    off = overlay_detector(enabled=False)
     off.add(pixels)
     off.add(pixels)
     assert not off.covers(pixels).any()

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.formats.image_file import grey_to_tensor
+from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -105,7 +105,7 @@ class LiveSequence(Sequence):
         return self._dropped
 
     @property
-    def waiting(self) -> int:
+    def backlog(self) -> int:
         return len(self._arrived)
 
     def part(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Sequence:
@@ -134,7 +134,7 @@ class LiveSequence(Sequence):
         self._given = index + 1
         if (frame.shape[1], frame.shape[0]) != self.size:
             raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
-        return grey_to_tensor(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+        return gray_to_tensor(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
 
     def image_name(self, index: int) -> str:
         return f"{self.name}#{index}"

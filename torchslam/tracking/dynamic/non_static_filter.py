@@ -16,28 +16,28 @@ class NonStaticFilter:
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.config = config
-        self.stillness = StaticOverlayDetector(camera, config.static_overlay, config.matching)
+        self.static_overlay = StaticOverlayDetector(camera, config.static_overlay, config.matching)
         self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
 
-    def clear_of(self, view: FrameFeatures) -> FrameFeatures:
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints that are known not to belong; views come in order of time."""
         self._seen = view
-        self._steady = self.stillness.clear_of(view)
-        return self.independent_motion.clear_of(self._steady)
+        self._steady = self.static_overlay.mask_out(view)
+        return self.independent_motion.mask_out(self._steady)
 
-    def moves(self, tracked: PoseEstimate) -> Movement:
+    def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
         """What of the newest view moves against the scene, by the pose that was found for it."""
         if not self.config.independent_motion.enabled:
             return NOTHING
-        return self.independent_motion.observe(self._steady, tracked)
+        return self.independent_motion.observe(self._steady, estimate)
 
-    def stays(self, T_cw: Tensor, depth: float) -> bool:
+    def update_overlay(self, T_cw: Tensor, depth: float) -> bool:
         """Whether pixels of the newest view became known to stay; its pose (4, 4), and the depth of the scene."""
         if not self.config.static_overlay.enabled:
             return False
-        return self.stillness.observe(self._seen, T_cw, depth) > 0
+        return self.static_overlay.observe(self._seen, T_cw, depth) > 0
 
     def forget_last(self) -> None:
         """The next frame cannot be compared with the ones before: its pose is in another world."""
-        self.stillness.forget_last()
+        self.static_overlay.forget_last()
         self.independent_motion.forget_last()
