@@ -12,8 +12,8 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
+from torchslam.map.atlas import Submap
+from torchslam.map.atlas import TrackingState
 from torchslam.system.run import Run
 from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult, Trajectory
 
@@ -31,9 +31,9 @@ def camera() -> Camera:
 def trajectory() -> Trajectory:
     """An arc around the origin, cameras upright in a world whose y points down, looking ahead."""
     angles = torch.linspace(0.0, 2.0, FRAMES, dtype=torch.float64)
-    centres_w = torch.stack([2 * angles.cos(), 0.1 * angles, 2 * angles.sin()], dim=-1)
+    centers_w = torch.stack([2 * angles.cos(), 0.1 * angles, 2 * angles.sin()], dim=-1)
     R_wc = so3_exp(torch.stack([torch.zeros_like(angles), -angles, torch.zeros_like(angles)], dim=-1))
-    return Trajectory(100.0 + torch.arange(FRAMES, dtype=torch.float64) / 30, rigid(R_wc, centres_w))
+    return Trajectory(100.0 + torch.arange(FRAMES, dtype=torch.float64) / 30, rigid(R_wc, centers_w))
 
 
 @pytest.fixture
@@ -55,24 +55,24 @@ def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
 
 
 @pytest.fixture
-def world(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> Submap:
+def submap(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> Submap:
     """The map and the frames that are tracked, on the trajectory."""
-    made = Submap(0, TrackingState.nowhere(trajectory.T_wc), slam_map)
+    made = Submap(0, TrackingState.empty(trajectory.T_wc), slam_map)
     nothing = torch.zeros(0, dtype=torch.int64)
     for result in results:
         if result.T_cw is not None:
             view = replace(slam_map.view(0), index=result.index, timestamp=result.timestamp)
             T_cw = se3_inverse(trajectory.T_wc[result.index])
             seen = PoseEstimate(T_cw, nothing, nothing, 0, torch.eye(6, dtype=torch.float64), 1.0)
-            made.history.add(view, seen, T_cw @ se3_inverse(slam_map.T_cw[0]), 0)
+            made.posed_frames.add(view, seen, T_cw @ se3_inverse(slam_map.T_cw[0]), 0)
     return made
 
 
 @pytest.fixture
-def run(world: Submap, camera: Camera, results: list[StepResult]) -> Run:
+def run(submap: Submap, camera: Camera, results: list[StepResult]) -> Run:
     """A run with one world."""
     return Run(
-        worlds=(world,),
+        submaps=(submap,),
         camera=camera,
         config=Config(),
         results=results,
@@ -114,7 +114,7 @@ def _result(index: int, state: State) -> StepResult:
         timestamp=100.0 + index / 30,
         state=state,
         T_cw=T_cw,
-        world=0 if is_tracking else None,
+        submap=0 if is_tracking else None,
         is_keyframe=is_keyframe,
         matches=100 + index if is_tracking else 8,
         inliers=90 + index if is_tracking else 0,

@@ -53,7 +53,7 @@ class DownloadError(TorchslamError):
 
 
 class InitializationError(TorchslamError):
-    """No map could be initialised; the message says why (standstill, pure rotation, too few matches)."""
+    """No map could be initialized; the message says why (standstill, pure rotation, too few matches)."""
 
 
 class ClipError(TorchslamError):

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchslam.data.association import interpolate_poses, nearest
 from torchslam.errors import TrajectoryError
-from torchslam.geometry.alignment import umeyama
+from torchslam.geometry.similarity import umeyama
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.types import Trajectory
@@ -131,9 +131,9 @@ def evaluate(
 
 
 def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
-    """The ATE of poses that were given in several worlds: RMS over all of them, metres.
+    """The ATE of poses that were given in several submaps: RMS over all of them, metres.
 
-    Each part is aligned by a similarity of its own. When these poses were given, nothing was known of how their worlds
+    Each part is aligned by a similarity of its own. When these poses were given, nothing was known of how their submaps
     lie to each other; what was learned later would either better or worsen what was given then. The price: errors
     between the parts do not show. Options as `evaluate` has them by default. Parts with fewer than three true poses,
     which fit any path, are left out; raises TrajectoryError where none is left.
@@ -143,7 +143,7 @@ def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
     ]
     if not errors:
         raise TrajectoryError(
-            f"no world has {MIN_POSES} estimated poses with a true one within {TOLERANCE:g} s"
+            f"no submap has {MIN_POSES} estimated poses with a true one within {TOLERANCE:g} s"
         )
     return float(_rms(torch.cat(errors).square()))
 
@@ -165,7 +165,7 @@ def ate(
     Returns (...), differentiable, with a gradient of zero on exact data; NaN, with a gradient of zero, where fewer than
     `MIN_POSES` rows count. Aligned by a similarity, or by a rigid transform without `with_scale`.
     """
-    centres, truth = _centres(T_cw), _centres(T_cw_groundtruth)
+    centres, truth = _centers(T_cw), _centers(T_cw_groundtruth)
     s, R, t = umeyama(centres, truth, mask, with_scale)
     moved = s[..., None, None] * centres @ R.mT + t[..., None, :]
     error = _rms((moved - truth).square().sum(-1), mask)
@@ -189,7 +189,7 @@ def rpe(
     """
     if not 1 <= delta < T_cw.shape[-3]:
         raise ValueError(f"delta must be between 1 and {T_cw.shape[-3] - 1}, got {delta}")
-    s, _, _ = umeyama(_centres(T_cw), _centres(T_cw_groundtruth), mask, with_scale)
+    s, _, _ = umeyama(_centers(T_cw), _centers(T_cw_groundtruth), mask, with_scale)
     motion, true_motion = _motions(T_cw, delta), _motions(T_cw_groundtruth, delta)
     motion = rigid(motion[..., :3, :3], s[..., None, None] * motion[..., :3, 3])
     error = se3_inverse(true_motion) @ motion
@@ -231,7 +231,7 @@ def _enough(T_cw: Tensor, mask: Tensor | None) -> Tensor:
     return rows.sum(-1) >= MIN_POSES
 
 
-def _centres(T_cw: Tensor) -> Tensor:
+def _centers(T_cw: Tensor) -> Tensor:
     """(..., N, 3) camera centres in the world."""
     return se3_inverse(T_cw)[..., :3, 3]
 

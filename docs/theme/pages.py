@@ -1,4 +1,4 @@
-"""Pages that are made when the site is built: the settings, the command line, and what lies outside of docs/."""
+"""Generated pages of the site: the settings, the command line, the map file, and files from outside of docs/."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTSIDE = ("experiments/**/*.md", "experiments/**/*.png", "CONTRIBUTING.md", "CHANGELOG.md")
-"""What of the repository becomes a part of the site, where it lies."""
+"""Files of the repository that become part of the site at their own path."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -32,12 +32,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links of a file in the root of the repository lead into docs/; here they begin there."""
+    """Make the links of CONTRIBUTING.md into docs/ relative to docs/."""
     return markdown.replace("](docs/", "](") if page.file.src_uri == "CONTRIBUTING.md" else markdown
 
 
 def _settings() -> str:
-    """Every setting with what it is, its default and its range, as `torchslam config` prints them."""
+    """Return the page with every setting, its description, default and range."""
     from torchslam.config import Config
 
     parts = [
@@ -45,7 +45,7 @@ def _settings() -> str:
         "`torchslam config > mine.toml` prints all of these as a file that `--config mine.toml` reads; "
         "`--set section.name=value` changes one. In Python they are the fields of "
         '<autoref optional identifier="torchslam.config.Config"><code>Config</code></autoref> and of its sections. '
-        "A value that is not allowed is an error that says what is.",
+        "A value that is not allowed raises an error that lists the allowed ones.",
     ]
     parts += _sections(Config(), "")
     return "\n\n".join(parts) + "\n"
@@ -76,21 +76,21 @@ def _sections(settings: Any, prefix: str) -> Iterator[str]:
     if rows:
         title = f"## `[{prefix}]`" if prefix else "## Outside of sections"
         yield "\n".join(
-            [title, "", "| setting | what it is | default | allowed |", "|---|---|---|---|", *rows]
+            [title, "", "| setting | description | default | allowed |", "|---|---|---|---|", *rows]
         )
     for name, value in inner:
         yield from _sections(value, f"{prefix}.{name}" if prefix else name)
 
 
 def _commands() -> str:
-    """What every command says of itself under `--help`."""
+    """Return the page with the help text of every command."""
     from torchslam.cli.main import COMMANDS, build_parser
 
     os.environ["COLUMNS"] = "100"
     parts = [
         "# Command line",
-        "Exit status: 0 done, 2 an error (one line on stderr says which), 3 no map could be initialised or no frame be "
-        "localised, 4 some sequences of a batch ended with an error, 130 and 143 ended by Ctrl-C and by SIGTERM. "
+        "Exit status: 0 done, 2 an error (one line on stderr says which), 3 no map could be initialized or no "
+        "frame could be localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM. "
         "`python -m torchslam` is the same command.",
     ]
     for name, (_, summary) in COMMANDS.items():
@@ -104,23 +104,23 @@ def _commands() -> str:
 
 
 def _map_file() -> str:
-    """The columns of `map.safetensors`."""
-    from torchslam.map import schema
-    from torchslam.map.file import FORMAT
+    """Return the page with the columns of `map.safetensors`."""
+    from torchslam.map.file import FORMAT, TABLES
 
     parts = [
-        f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds everything that a run keeps: of each world its "
-        "tables, and `camera.params`. A tensor `worlds.0.points.positions_w` is a column of a table of world 0; row by "
-        "row, the columns of a table belong together. Letters in a shape: N keypoints of a frame, D numbers of a "
-        "descriptor. Floats are float64 as a run writes them; a descriptor is bytes or floats.",
-        "`torchslam.map.file.read_atlas(path)` reads and checks it; so does `SLAM.load(path)`, to go on in it. "
-        "Any safetensors reader gets at the tensors.",
+        f"# The map file\n\n`map.safetensors` (format {FORMAT}) holds the atlas: the tables of each submap, and "
+        "`camera.params`. A tensor `submaps.0.points.positions_w` is a column of the table of points of submap 0; all "
+        "columns of a table have the same rows. The metadata entry `torchslam` is JSON with the keys `format`, "
+        "`camera`, `submaps` (their numbers), `num_created` and `sessions`. Letters in a shape: N keypoints of a "
+        "frame, D numbers of a descriptor. Floats are float64 as a run writes them; a descriptor is bytes or floats.",
+        "`torchslam.map.file.read_atlas(path)` reads and checks it; so does `SLAM.load(path)`, to continue in it. "
+        "Any safetensors reader can read the tensors.",
     ]
-    for name in ("points", "keyframes", "frames", "observations"):
+    for name, schema in TABLES.items():
         rows = []
-        for column, each in getattr(schema, name.upper()).items():
+        for column, each in schema.items():
             shape = ", ".join(map(str, each.shape)) + "," * (len(each.shape) == 1)
             rows.append(f"| `{column}` | ({shape}) | {each.kind} | {each.about} |")
-        head = [f"## {name}", "", "| column | a row | kind | what it is |", "|---|---|---|---|"]
+        head = [f"## {name}", "", "| column | shape of a row | kind | description |", "|---|---|---|---|"]
         parts.append("\n".join([*head, *rows]))
     return "\n\n".join(parts) + "\n"

@@ -93,7 +93,7 @@ def row(name: str, kind: str, figures: dict[str, Any]) -> list[str]:
         return [*cells, "none", *["–"] * (len(HEADER) - len(cells) - 1)]
     return [
         *cells,
-        str(figures["initialised_at"]),
+        str(figures["initialized_at"]),
         str(figures["keyframes"]),
         str(figures["points"]),
         f"{figures['ate_m']:.2g}",

@@ -21,8 +21,8 @@ def inliers_of_pairs(features: Features) -> Tensor:
     """(84, 84) int64: inliers of the relative pose of each pair that is a question, 0 where there is no pose."""
     _, asked = lookalike_truth()
     inliers = torch.zeros(asked.shape, dtype=torch.int64)
-    centre = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    params = torch.tensor((FOCAL, FOCAL, *centre), dtype=torch.float64)
+    center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+    params = torch.tensor((FOCAL, FOCAL, *center), dtype=torch.float64)
     camera = Camera("pinhole", params, SIZE)
     for later, earlier in asked.nonzero().tolist():
         first, second = features[later : later + 1], features[earlier : earlier + 1]

@@ -1,4 +1,4 @@
-"""The images that places are recognised in, their features, and which pairs of them show the same place."""
+"""The images that places are recognized in, their features, and which pairs of them show the same place."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from experiments.common import DATA_DIR
 from torchslam.data import open_sequence
-from torchslam.data.formats.image_file import read_grey
+from torchslam.data.formats.image_file import read_gray
 from torchslam.features import ORB
 from torchslam.geometry import se3_inverse, so3_log
 from torchslam.types import Features
@@ -45,7 +45,7 @@ def collect() -> Collection:
     orb = ORB(1000)
     folder = DATA_DIR / "lookalike" / "images"
     files = [folder / f"{number:03d}.jpg" for number in range(1, LOOKALIKE_IMAGES + 1)]
-    found = [orb(read_grey(file, file.name)) for file in files]
+    found = [orb(read_gray(file, file.name)) for file in files]
     ranges, T_cw = {"lookalike": range(len(found))}, {}
     for name, (path, stride) in SEQUENCES.items():
         sequence = open_sequence(path if ":" in path else DATA_DIR / path, stride=stride)
@@ -73,12 +73,12 @@ def lookalike_truth() -> tuple[Tensor, Tensor]:
 
 
 def sequence_truth(T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Three (n, n) masks: pairs of the same place, of certainly different views, and of neighbours in time."""
-    centres = se3_inverse(T_cw)[:, :3, 3]
-    distance = torch.cdist(centres, centres)
+    """Three (n, n) masks: pairs of the same place, of certainly different views, and of neighbors in time."""
+    centers = se3_inverse(T_cw)[:, :3, 3]
+    distance = torch.cdist(centers, centers)
     R = T_cw[:, :3, :3]
     angle = torch.rad2deg(torch.linalg.vector_norm(so3_log(R[:, None] @ R.mT), dim=-1))
     number = torch.arange(len(T_cw))
-    neighbours = (number[:, None] - number).abs() < GAP
-    same = (distance < NEAR_M) & (angle < NEAR_DEG) & ~neighbours
-    return same, ((distance > FAR_M) | (angle > FAR_DEG)) & ~neighbours, neighbours
+    neighbors = (number[:, None] - number).abs() < GAP
+    same = (distance < NEAR_M) & (angle < NEAR_DEG) & ~neighbors
+    return same, ((distance > FAR_M) | (angle > FAR_DEG)) & ~neighbors, neighbors

@@ -1,4 +1,4 @@
-"""Which way of recognising places should one take, and what does it cost? See README.md."""
+"""Which way of recognizing places should one take, and what does it cost? See README.md."""
 
 from __future__ import annotations
 
@@ -98,11 +98,11 @@ def quality(scores: Tensor, collection: Collection) -> list[str]:
     for name in MEASURED:
         where = collection.ranges[name]
         rows = scores[where.start : where.stop].clone()
-        near, far, neighbours = sequence_truth(collection.T_cw[name])
+        near, far, neighbors = sequence_truth(collection.T_cw[name])
         true, counted = torch.zeros_like(rows, dtype=torch.bool), torch.ones_like(rows, dtype=torch.bool)
         true[:, where.start : where.stop] = near
         counted[:, where.start : where.stop] = near | far  # every image of another sequence is another place
-        rows[:, where.start : where.stop][neighbours] = -1.0
+        rows[:, where.start : where.stop][neighbors] = -1.0
         precision, _ = average_precision(rows[counted], true[counted])
         cells.append(f"{precision:.2f}, {recall_at(rows, true, 1):.2f}, {recall_at(rows, true, 5):.2f}")
     return cells

@@ -47,7 +47,7 @@ def sample(descriptors: Tensor, count: int, seed: int = 0) -> Tensor:
 
 
 def k_majority(descriptors: Tensor, num_words: int, rounds: int) -> Tensor:
-    """Binary words (num_words, 32) by k-majority, k-means whose centres take the more frequent value of each bit.
+    """Binary words (num_words, 32) by k-majority, k-means whose centers take the more frequent value of each bit.
 
     Starts at the first descriptors; a word that nothing is near to stays as it is. Source: Grana et al., "A fast
     approach for integrating ORB descriptors in the bag of words model", 2013.

@@ -30,7 +30,7 @@ def main() -> None:
     ]
     rows = []
     for (name, label, _), result in zip(cases, figures_of_all(runs, options), strict=True):
-        since_start = result["frames"] - (result["initialised_at"] or 0)
+        since_start = result["frames"] - (result["initialized_at"] or 0)
         share = result["ate_m"] / result["path_length_m"]
         rows.append(
             [name, label, f"{result['posed']} of {result['frames']}", f"{result['lost']} of {since_start}",

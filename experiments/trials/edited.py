@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.formats.image_file import grey_to_tensor
+from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.types import Trajectory
@@ -19,7 +19,7 @@ RATE = 30.0
 """Frames per second of what was put together, whatever the rate of its parts."""
 
 Edit = Callable[[np.ndarray, int], np.ndarray]
-"""From a grey image (H, W) uint8 and the number of the frame in the edited sequence to another image."""
+"""From a gray image (H, W) uint8 and the number of the frame in the edited sequence to another image."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +68,25 @@ class Edited(Sequence):
         self._T_cw_of = poses
 
     def pose(self, index: int) -> Tensor | None:
-        """(4, 4) true T_cw of a frame; None where it is unknown. Never that of a neighbour in time."""
+        """(4, 4) true T_cw of a frame; None where it is unknown. Never that of a neighbor in time."""
         return self._T_cw_of.get(index)
 
     def image(self, index: int) -> Tensor:
         shot = self._shots[index]
-        grey = np.rint(255 * shot.source.image(shot.index)[0, 0].numpy()).astype(np.uint8)
+        gray = np.rint(255 * shot.source.image(shot.index)[0, 0].numpy()).astype(np.uint8)
         if shot.edit is not None:
-            grey = shot.edit(grey, index)
-        return grey_to_tensor(fitted(grey, self.size))
+            gray = shot.edit(gray, index)
+        return gray_to_tensor(fitted(gray, self.size))
 
     def image_name(self, index: int) -> str:
         shot = self._shots[index]
         return f"{self.name}#{index}, from {shot.source.image_name(shot.index)}"
 
 
-def fitted(grey: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def fitted(gray: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The image (H, W) with another (width, height)."""
-    height, width = grey.shape
+    height, width = gray.shape
     if (width, height) == size:
-        return np.ascontiguousarray(grey)
+        return np.ascontiguousarray(gray)
     shrinks = size[0] <= width and size[1] <= height
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

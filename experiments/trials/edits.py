@@ -20,25 +20,25 @@ LOGO_AT, LOGO_SIZE = 8, (64, 32)  # pixels from the upper left corner; width and
 BLUR_TURN_DEG = 13  # from frame to frame
 WAVE_FRAMES = 9  # in which the shear of a rolling shutter comes back
 CORNER_LIGHT = 0.1  # share that is left of it in the corners, as with a cheap wide lens
-SPOTS, SPOT_SEED, SPOT_SIGMA, SPOT_GREY = 40, 3, 6, 60
+SPOTS, SPOT_SEED, SPOT_SIGMA, SPOT_GRAY = 40, 3, 6, 60
 
 
-def black(grey: np.ndarray, _: int) -> np.ndarray:
+def black(gray: np.ndarray, _: int) -> np.ndarray:
     """No light."""
-    return np.zeros_like(grey)
+    return np.zeros_like(gray)
 
 
-def exposure_step(grey: np.ndarray, frame: int) -> np.ndarray:
+def exposure_step(gray: np.ndarray, frame: int) -> np.ndarray:
     """Every second stretch of frames has a quarter of the light."""
     gain = EXPOSURE if (frame // EXPOSURE_FRAMES) % 2 else 1.0
-    return (gain * grey).astype(np.uint8)
+    return (gain * gray).astype(np.uint8)
 
 
 def brighter(gain: float) -> Edit:
     """Too long an exposure: so many times the light, and what is brighter than white is white."""
 
-    def edit(grey: np.ndarray, _: int) -> np.ndarray:
-        return np.rint(gain * grey.astype(np.float64)).clip(0, WHITE).astype(np.uint8)
+    def edit(gray: np.ndarray, _: int) -> np.ndarray:
+        return np.rint(gain * gray.astype(np.float64)).clip(0, WHITE).astype(np.uint8)
 
     return edit
 
@@ -46,26 +46,26 @@ def brighter(gain: float) -> Edit:
 def noise(sigma: float) -> Edit:
     """Gaussian, new in every frame."""
 
-    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
-        added = grey + np.random.default_rng(frame).normal(0, sigma, grey.shape)
+    def edit(gray: np.ndarray, frame: int) -> np.ndarray:
+        added = gray + np.random.default_rng(frame).normal(0, sigma, gray.shape)
         return added.clip(0, WHITE).astype(np.uint8)
 
     return edit
 
 
 def pale(contrast: float) -> Edit:
-    """Fog, or a bad lens: so much of the contrast is left, around middle grey, and the noise of a grey value."""
+    """Fog, or a bad lens: so much of the contrast is left, around middle gray, and the noise of a gray value."""
     noisy, middle = noise(1.0), WHITE / 2
 
-    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
-        return noisy(np.rint(middle + contrast * (grey - middle)).astype(np.uint8), frame)
+    def edit(gray: np.ndarray, frame: int) -> np.ndarray:
+        return noisy(np.rint(middle + contrast * (gray - middle)).astype(np.uint8), frame)
 
     return edit
 
 
 def jpeg(quality: int) -> Edit:
-    def edit(grey: np.ndarray, _: int) -> np.ndarray:
-        _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    def edit(gray: np.ndarray, _: int) -> np.ndarray:
+        _, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, quality])
         decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         assert decoded is not None
         return decoded
@@ -79,10 +79,10 @@ def motion_blur(length: int) -> Edit:
     line[length // 2] = 1 / length
     middle = (length - 1) / 2
 
-    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
+    def edit(gray: np.ndarray, frame: int) -> np.ndarray:
         turn = cv2.getRotationMatrix2D((middle, middle), BLUR_TURN_DEG * frame % 180, 1)
         kernel = cv2.warpAffine(line, turn, (length, length))
-        return cv2.filter2D(grey, -1, kernel / kernel.sum())
+        return cv2.filter2D(gray, -1, kernel / kernel.sum())
 
     return edit
 
@@ -90,11 +90,11 @@ def motion_blur(length: int) -> Edit:
 def rolling(amplitude: float) -> Edit:
     """Rows are read one after the other while the camera shakes: shifted sideways by a sine of some pixels."""
 
-    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
-        height, width = grey.shape
+    def edit(gray: np.ndarray, frame: int) -> np.ndarray:
+        height, width = gray.shape
         x, y = _grid(width, height)
         x += amplitude * np.sin(2 * np.pi * (y / height + frame / WAVE_FRAMES), dtype=np.float32)
-        return cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     return edit
 
@@ -104,10 +104,10 @@ def overlay(size: tuple[int, int]) -> Edit:
     width, height = size
     mark = logo((width // 4, height // 8))
 
-    def edit(grey: np.ndarray, _: int) -> np.ndarray:
-        marked = _put(grey, mark, 10)
-        for colour, y, thickness in ((WHITE, 40, 2), (0, 41, 1)):
-            cv2.putText(marked, CAPTION, (width // 2, y), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, thickness)
+    def edit(gray: np.ndarray, _: int) -> np.ndarray:
+        marked = _put(gray, mark, 10)
+        for color, y, thickness in ((WHITE, 40, 2), (0, 41, 1)):
+            cv2.putText(marked, CAPTION, (width // 2, y), cv2.FONT_HERSHEY_SIMPLEX, 0.9, color, thickness)
         return marked
 
     return edit
@@ -115,7 +115,7 @@ def overlay(size: tuple[int, int]) -> Edit:
 
 def small_logo() -> Edit:
     mark = logo(LOGO_SIZE)
-    return lambda grey, _: _put(grey, mark, LOGO_AT)
+    return lambda gray, _: _put(gray, mark, LOGO_AT)
 
 
 def logo(size: tuple[int, int]) -> np.ndarray:
@@ -132,10 +132,10 @@ def occluder(texture: np.ndarray, share: float, speed: int) -> Edit:
     width = texture.shape[1]
     wide = int(share * width)
 
-    def edit(grey: np.ndarray, frame: int) -> np.ndarray:
+    def edit(gray: np.ndarray, frame: int) -> np.ndarray:
         left = speed * frame % (width + wide) - wide
         start, stop = max(left, 0), min(left + wide, width)
-        covered = grey.copy()
+        covered = gray.copy()
         covered[:, start:stop] = texture[:, start - left : stop - left]
         return covered
 
@@ -143,7 +143,7 @@ def occluder(texture: np.ndarray, share: float, speed: int) -> Edit:
 
 
 def lens_dirt(size: tuple[int, int]) -> Edit:
-    """Soft grey spots that stay where they are, in images of (width, height)."""
+    """Soft gray spots that stay where they are, in images of (width, height)."""
     width, height = size
     rng = np.random.default_rng(SPOT_SEED)
     cover: np.ndarray = np.zeros((height, width), np.float32)
@@ -151,15 +151,15 @@ def lens_dirt(size: tuple[int, int]) -> Edit:
         place = int(rng.integers(width)), int(rng.integers(height))
         cv2.circle(cover, place, int(rng.integers(5, 40)), float(rng.uniform(0.3, 0.9)), cv2.FILLED)
     cover = cv2.GaussianBlur(cover, (0, 0), SPOT_SIGMA)
-    return lambda grey, _: (grey * (1 - cover) + SPOT_GREY * cover).astype(np.uint8)
+    return lambda gray, _: (gray * (1 - cover) + SPOT_GRAY * cover).astype(np.uint8)
 
 
-def vignette(grey: np.ndarray, _: int) -> np.ndarray:
+def vignette(gray: np.ndarray, _: int) -> np.ndarray:
     """Light falls off with the square of the distance from the middle, to little in the corners."""
-    height, width = grey.shape
+    height, width = gray.shape
     x, y = _grid(width, height)
     from_middle = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
-    return np.rint(grey * (1 - (1 - CORNER_LIGHT) * from_middle**2)).astype(np.uint8)
+    return np.rint(gray * (1 - (1 - CORNER_LIGHT) * from_middle**2)).astype(np.uint8)
 
 
 def turned(camera: Camera, angle: float) -> Edit:
@@ -168,15 +168,15 @@ def turned(camera: Camera, angle: float) -> Edit:
     What was out of the image is black.
     """
 
-    def edit(grey: np.ndarray, _: int) -> np.ndarray:
-        height, width = grey.shape
+    def edit(gray: np.ndarray, _: int) -> np.ndarray:
+        height, width = gray.shape
         pixels = torch.from_numpy(np.stack(_grid(width, height), -1)).reshape(-1, 2).to(camera.params)
         R = so3_exp(pixels.new_tensor((0.0, angle, 0.0)))
         sources, seen = camera.project(camera.unproject(pixels) @ R)
         outside = -float(width)
         sources = torch.where(seen[:, None], sources, outside).reshape(height, width, 2)
         x, y = (part.contiguous().numpy() for part in sources.to(torch.float32).unbind(-1))
-        return cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
     return edit
 
@@ -187,7 +187,7 @@ def _grid(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     return x.copy(), y.copy()
 
 
-def _put(grey: np.ndarray, mark: np.ndarray, corner: int) -> np.ndarray:
-    marked = grey.copy()
+def _put(gray: np.ndarray, mark: np.ndarray, corner: int) -> np.ndarray:
+    marked = gray.copy()
     marked[corner : corner + mark.shape[0], corner : corner + mark.shape[1]] = mark
     return marked

@@ -37,12 +37,12 @@ class Round(Sequence):
     def __init__(self, frames: int = ROUND + BEYOND) -> None:
         phase = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / ROUND)
         sway = 0.1 * torch.sin(phase / 2.3)  # no two rounds are the same
-        centres_w = torch.stack((2 * phase.cos(), sway, 2 * phase.sin()), -1)
+        centers_w = torch.stack((2 * phase.cos(), sway, 2 * phase.sin()), -1)
         zero = torch.zeros_like(phase)
         R_wc = so3_exp(torch.stack((zero, math.pi / 2 - phase, zero), -1))
         camera = Camera.pinhole(400.0, 400.0, 319.5, 239.5, size=(640, 480))
         timestamps = phase * ROUND / (2 * math.pi) / 30
-        super().__init__("round", "poses", camera, timestamps, Trajectory(timestamps, rigid(R_wc, centres_w)))
+        super().__init__("round", "poses", camera, timestamps, Trajectory(timestamps, rigid(R_wc, centers_w)))
 
     @classmethod
     def shots(cls) -> Edited:
@@ -61,7 +61,7 @@ def check(run: Run, sequence: Sequence) -> list[list[str]]:
     """Rows: the derivative of the ATE along camera parameters and pixels, by the gradient and by differences."""
     graph = run.graph
     T_true = torch.stack([pose for i in graph.frame_ids.tolist() if (pose := sequence.pose(i)) is not None])
-    assert len(graph.worlds) == 1
+    assert len(graph.submaps) == 1
     assert len(T_true) == len(graph.T_cw)
     pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
     ate(solve(_moved(graph, pixels, params)).T_cw, T_true).backward()

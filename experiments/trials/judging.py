@@ -58,7 +58,7 @@ def moves(positions: Tensor, distance: float) -> Tensor:
 
 
 def wrong(T_wc: Tensor, truth_wc: Tensor, path_extent: float) -> Tensor:
-    """(n,) bool which of the poses T_wc (n, 4, 4), of one world, are wrong.
+    """(n,) bool which of the poses T_wc (n, 4, 4), of one submap, are wrong.
 
     truth_wc: (n, 4, 4) their true poses, in the order of time; path_extent: of the whole true path
     """

@@ -35,14 +35,14 @@ TOLD = 8  # stretches of states, and recalls, of which the table tells
 class Outcome:
     """What a run over an edited sequence came to.
 
-    posed:    frames with a pose in the main world that can have one, `possible` of which there are
-    strays:   frames with a pose in the main world that cannot have one
-    worlds:   frames of each world, the main one first
+    posed:    frames with a pose in the main submap that can have one, `possible` of which there are
+    strays:   frames with a pose in the main submap that cannot have one
+    submaps:   frames of each submap, the main one first
     ate:      in units of the truth; None where too little is posed
     extent:   of the true path
-    misled:   frames called tracking whose pose in the main world is wrong, as it was given or in the end
-    states:   one per frame; recalls: places recognised; apart: by the truth, how far away the furthest of them is:
-              metres and degrees; None without truth
+    misled:   frames called tracking whose pose in the main submap is wrong, as it was given or in the end
+    states:   one per frame; recalls: places recognized; apart: by the truth, how far away the furthest of them is:
+              meters and degrees; None without truth
     seconds:  of the processor, for the whole run, or the rest after a cut, with reading of images and the last
               adjustment
     ms:       of the processor, for `SLAM.step`, median
@@ -52,7 +52,7 @@ class Outcome:
     posed: int
     possible: int
     strays: int
-    worlds: list[int]
+    submaps: list[int]
     ate: float | None
     extent: float
     misled: list[int]
@@ -105,7 +105,7 @@ def _begin(trial: Trial, sequence: Edited, config: Config) -> tuple[SLAM, RunPro
 
 
 def _in_map(sequence: Edited, config: Config) -> SLAM:
-    """A system that only localises, in the saved map of another run."""
+    """A system that only localizes, in the saved map of another run."""
     slam = SLAM(sequence.camera, config)
     slam.run(sequence)
     with tempfile.TemporaryDirectory() as folder:
@@ -124,7 +124,7 @@ def _outcome(run: Run, sequence: Edited, seconds: float, taken: list[float]) -> 
         posed=posed,
         possible=int(sequence.belongs.sum()),
         strays=len(final) - posed,
-        worlds=sorted((world.history.count(run.session) for world in run.worlds), reverse=True),
+        submaps=sorted((submap.posed_frames.count(run.session) for submap in run.submaps), reverse=True),
         ate=ate,
         extent=0.0 if truth is None else extent(truth.positions_w),
         misled=misled(run, sequence),
@@ -138,17 +138,17 @@ def _outcome(run: Run, sequence: Edited, seconds: float, taken: list[float]) -> 
 
 
 def final_poses(run: Run) -> dict[int, Tensor]:
-    """T_cw (4, 4) of the frames of the main world, by their numbers, as the run left them."""
-    if run.main is None or len(run.main.history) == 0:
+    """T_cw (4, 4) of the frames of the main submap, by their numbers, as the run left them."""
+    if run.main is None or len(run.main.posed_frames) == 0:
         return {}
-    frames = run.main.history.frames
-    T_cw = run.main.history.T_cw(run.main.map)
+    frames = run.main.posed_frames.frames
+    T_cw = run.main.posed_frames.T_cw(run.main.map)
     rows = torch.nonzero(frames["session"] == run.session)[:, 0]
     return {int(frames["frame_index"][row]): T_cw[row] for row in rows.tolist()}
 
 
 def online_poses(run: Run) -> dict[int, Tensor]:
-    """T_cw (4, 4) of the frames that were tracking in the main world, by their numbers, as they were given.
+    """T_cw (4, 4) of the frames that were tracking in the main submap, by their numbers, as they were given.
 
     Uncertain poses are no claim: many of them would tell the judge what is right.
     """
@@ -158,18 +158,18 @@ def online_poses(run: Run) -> dict[int, Tensor]:
     return {
         result.index: result.T_cw
         for result in run.results
-        if result.T_cw is not None and result.world == number and result.state is State.TRACKING
+        if result.T_cw is not None and result.submap == number and result.state is State.TRACKING
     }
 
 
 def misled(run: Run, sequence: Edited) -> list[int]:
-    """The frames that were called tracking and whose pose in the main world, given or final, is wrong."""
+    """The frames that were called tracking and whose pose in the main submap, given or final, is wrong."""
     bad = wrong_frames(final_poses(run), sequence) | wrong_frames(online_poses(run), sequence)
     return [result.index for result in run.results if result.state is State.TRACKING and result.index in bad]
 
 
 def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
-    """Those of the frames whose poses T_cw, in one world, are wrong: any pose is where none can be."""
+    """Those of the frames whose poses T_cw, in one submap, are wrong: any pose is where none can be."""
     strays = {index for index in poses if not sequence.belongs[index]}
     pairs = {
         index: (poses[index], pose) for index in sorted(poses) if (pose := sequence.pose(index)) is not None
@@ -184,19 +184,19 @@ def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
 
 
 def furthest(recalls: list[LoopClosureRecord], sequence: Edited) -> tuple[float, float] | None:
-    """The largest distance, in metres, and the largest angle, in degrees, between a frame and the place it recalled."""
-    metres, degrees = [], []
+    """The largest distance, in meters, and the largest angle, in degrees, between a frame and the place it recalled."""
+    meters, degrees = [], []
     for recall in recalls:
         here, there = sequence.pose(recall.frame), sequence.pose(recall.place)
         if here is None or there is None:
             continue
         motion = se3_inverse(here) @ there
-        metres.append(float((se3_inverse(here) - se3_inverse(there))[:3, 3].norm()))
+        meters.append(float((se3_inverse(here) - se3_inverse(there))[:3, 3].norm()))
         degrees.append(math.degrees(float(so3_log(motion[:3, :3]).norm())))
-    return (max(metres), max(degrees)) if metres else None
+    return (max(meters), max(degrees)) if meters else None
 
 
-HEADER = ["trial", "posed", "worlds", "ATE", "wrong & tracking", "states", "recalls", "s, ms a frame"]
+HEADER = ["trial", "posed", "submaps", "ATE", "wrong & tracking", "states", "recalls", "s, ms a frame"]
 
 
 def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
@@ -204,7 +204,7 @@ def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
     return [
         name,
         f"{outcome.posed} of {outcome.possible}" + f", and {outcome.strays} strays" * bool(outcome.strays),
-        " + ".join(map(str, outcome.worlds)) or "none",
+        " + ".join(map(str, outcome.submaps)) or "none",
         _ate(outcome, unit),
         _misled(outcome),
         states_in_short(outcome.states),
@@ -214,7 +214,7 @@ def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
 
 
 def states_in_short(states: list[State]) -> str:
-    """How often each state came in a row, initialising, tracking, uncertain and lost by their letters."""
+    """How often each state came in a row, initializing, tracking, uncertain and lost by their letters."""
     stretches = [f"{LETTERS[state]}{len(list(group))}" for state, group in groupby(states)]
     return " ".join(stretches[:TOLD]) + " …" * (len(stretches) > TOLD)
 
@@ -232,7 +232,7 @@ def _misled(outcome: Outcome) -> str:
 
 def _recalls(outcome: Outcome) -> str:
     told = [
-        f"{recall.frame}→{recall.place}" + " in another world" * (recall.world != recall.other)
+        f"{recall.frame}→{recall.place}" + " in another submap" * (recall.submap != recall.other)
         for recall in outcome.recalls
     ]
     text = ", ".join(told[:TOLD]) + f" and {len(told) - TOLD} more" * (len(told) > TOLD)

@@ -1,4 +1,4 @@
-"""Does the system know when it is wrong, come back, keep worlds apart, and close the right loops? See README.md."""
+"""Does the system know when it is wrong, come back, keep submaps apart, and close the right loops? See README.md."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Trial:
     """One run over an edited sequence.
 
     settings: of the configuration
-    map_of:   makes another sequence, of which the map is made first, saved and loaded to localise in
+    map_of:   makes another sequence, of which the map is made first, saved and loaded to localize in
     cut_at:   share of the frames after which the run is killed and gone on with from its last checkpoint
     unit:     of the ATE; without one it is told as a share of the extent of the true path
     is_differentiated: whether the gradient of the run is checked afterwards
@@ -169,7 +169,7 @@ TRIALS: dict[str, Trial] = {
         for fault in (ON_THE_ROAD if name == "kitti07" else FAULTS)
         if (name, fault) != ("shelf_bin", "none")  # plain/shelf_bin is the same
     },
-    "localise/redkitchen": Trial(
+    "localize/redkitchen": Trial(
         partial(every_second, "redkitchen", 1), map_of=partial(every_second, "redkitchen", 0)
     ),
     "resume/redkitchen": Trial(partial(frames, "redkitchen"), cut_at=0.6),

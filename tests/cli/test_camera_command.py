@@ -79,7 +79,7 @@ def test_a_calibration_that_is_not_ours_stays(
     ("extra", "message"),
     [
         (["--features", "simulated"], "simulated features are made with the camera"),
-        (["--refine-camera", "--map", "nothing"], "a --map has the camera that it was made with"),
+        (["--refine-camera", "--map", "nothing"], "--refine-camera cannot be combined with --map"),
     ],
 )
 def test_what_does_not_go_together(

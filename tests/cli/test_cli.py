@@ -75,7 +75,7 @@ def test_run_writes_all_results(finished: Path) -> None:
     figures = json.loads((finished / "metrics.json").read_text())
     assert figures["frames"] == 16
     assert len(read_trajectory(finished / "trajectory.txt")) == figures["posed"]
-    assert len(read_trajectory(finished / "online.txt")) == figures["frames"] - figures["initialised_at"]
+    assert len(read_trajectory(finished / "online.txt")) == figures["frames"] - figures["initialized_at"]
     assert figures["online_ate_m"] < 0.05 * figures["path_length_m"]
     assert len(read_trajectory(finished / "keyframes.txt")) == figures["keyframes"]
     assert read_map(finished / "map.safetensors")[0].num_points == figures["points"]
@@ -169,8 +169,8 @@ def test_standstill_is_no_map_and_says_why(tmp_path: Path, capsys: pytest.Captur
         capsys, "run", "synthetic:standstill?frames=8", "--output", str(tmp_path), *FAST
     )
     assert status == 3
-    assert "no map was initialised in 8 frames" in err
-    assert json.loads((tmp_path / "metrics.json").read_text())["initialised_at"] is None
+    assert "no map was initialized in 8 frames" in err
+    assert json.loads((tmp_path / "metrics.json").read_text())["initialized_at"] is None
     assert (tmp_path / "trajectory.txt").exists()
     assert main(["plot", str(tmp_path)]) == 0
 

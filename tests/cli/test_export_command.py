@@ -56,7 +56,7 @@ def test_colmap_finds_the_error_of_the_map(results: Path, tmp_path: Path) -> Non
     assert made.num_points3D() == slam_map.num_points
 
 
-def test_colours_are_those_of_the_images(results: Path, tmp_path: Path) -> None:
+def test_colors_are_those_of_the_images(results: Path, tmp_path: Path) -> None:
     """Where a point is seen, the image is as bright as the point, more or less: corners are where it changes."""
     assert export(results, "colmap", tmp_path / "model") == 0
     slam_map, _ = read_map(results / "map.safetensors")
@@ -66,8 +66,8 @@ def test_colours_are_those_of_the_images(results: Path, tmp_path: Path) -> None:
         image = cv2.imread(str(tmp_path / "model" / "images" / f"{frame:06d}.png"))
         rows = seen.keyframe_index == keyframe
         u, v = seen.pixels[rows].round().long().T.numpy()
-        colours = slam_map.points["colors"][seen.point_index[rows]].numpy()
-        differences.append(np.abs(image[v, u, ::-1].astype(int) - colours))
+        colors = slam_map.points["colors"][seen.point_index[rows]].numpy()
+        differences.append(np.abs(image[v, u, ::-1].astype(int) - colors))
     assert np.median(np.concatenate(differences)) < 12
     assert float(slam_map.points["colors"].float().std()) > 40
 
@@ -154,33 +154,33 @@ def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.Capture
     assert export(copy, "colmap", tmp_path / "b", "--no-images") == 0
     change(copy, source=None)
     assert export(copy, "nerfstudio", tmp_path / "c") == 2
-    assert "does not say where the images" in capsys.readouterr().err
+    assert "the location of the images is unknown" in capsys.readouterr().err
 
 
 def test_other_worlds(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved = read_atlas(copy / "map.safetensors")
-    (world,) = saved.worlds
-    world.number = 2
-    write_atlas(copy / "map.safetensors", [world], saved.camera)
+    (submap,) = saved.atlas
+    submap.number = 2
+    write_atlas(copy / "map.safetensors", [submap], saved.camera)
     assert export(copy, "ply", tmp_path / "a.ply") == 2
-    assert "no world 0: there are 2" in capsys.readouterr().err
-    assert export(copy, "ply", tmp_path / "a.ply", "--world", "2") == 0
+    assert "no submap 0: there are 2" in capsys.readouterr().err
+    assert export(copy, "ply", tmp_path / "a.ply", "--submap", "2") == 0
     shutil.copy(copy / "trajectory.txt", copy / "trajectory_2.txt")
     (copy / "trajectory.txt").unlink()
-    assert export(copy, "tum", tmp_path / "a.txt", "--world", "2") == 0
+    assert export(copy, "tum", tmp_path / "a.txt", "--submap", "2") == 0
     write_atlas(copy / "map.safetensors", [], saved.camera)
-    change(copy, world=None, failure="the camera stood still")
+    change(copy, submap=None, failure="the camera stood still")
     assert export(copy, "colmap", tmp_path / "b") == 2
-    assert "there is no map: the camera stood still" in capsys.readouterr().err
+    assert "contains no map: the camera stood still" in capsys.readouterr().err
 
 
-def test_a_run_that_only_localised_has_its_trajectory(
+def test_a_run_that_only_localized_has_its_trajectory(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(copy, session=1)
     assert export(copy, "kitti", tmp_path / "kitti") == 0
     assert export(copy, "colmap", tmp_path / "a") == 2
-    assert "only localised" in capsys.readouterr().err
+    assert "only localized" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("to", ["ply", "tum", "kitti"])
@@ -188,4 +188,4 @@ def test_there_is_nothing_to_undistort(
     results: Path, to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(results, to, tmp_path / "a", "--undistort") == 2
-    assert "no images in an export to" in capsys.readouterr().err
+    assert "contains no images" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.trajectory_file import write_trajectory
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.conventions import opengl, quaternion_wxyz
+from torchslam.geometry.transforms import opengl, quaternion_wxyz
 from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.refine.pose_refinement import align_to_input
 from torchslam.types import Trajectory

@@ -18,7 +18,7 @@ RED = GREEN[..., [1, 0, 2]]
 
 
 @pytest.mark.parametrize(
-    ("image", "channels", "grey"),
+    ("image", "channels", "gray"),
     [
         (RED, "rgb", 0.299 * 200),
         (RED, "bgr", 0.114 * 200),
@@ -26,13 +26,13 @@ RED = GREEN[..., [1, 0, 2]]
         (np.dstack([RED, GREEN[..., :1]]), "rgba", 0.299 * 200),
         (np.dstack([RED, GREEN[..., :1]]), "bgra", 0.114 * 200),
         (GREEN[..., 1], "rgb", 200),
-        (GREEN[..., 1:2], "grey", 200),
+        (GREEN[..., 1:2], "gray", 200),
     ],
 )
-def test_channels(image: np.ndarray, channels: str, grey: float) -> None:
+def test_channels(image: np.ndarray, channels: str, gray: float) -> None:
     tensor = image_tensor(image, channels)
     assert (tensor.shape, tensor.dtype) == ((1, 1, 4, 6), torch.float32)
-    assert float(tensor.mean()) == pytest.approx(grey / 255, abs=0.6 / 255)
+    assert float(tensor.mean()) == pytest.approx(gray / 255, abs=0.6 / 255)
     for kind in (np.float32, np.float64):
         scaled = image_tensor((image / 255).astype(kind), channels)
         torch.testing.assert_close(scaled, tensor, atol=0.6 / 255, rtol=0)
@@ -41,8 +41,8 @@ def test_channels(image: np.ndarray, channels: str, grey: float) -> None:
 @pytest.mark.parametrize(
     ("image", "channels", "message"),
     [
-        (RED, "hsv", "channels must be one of grey, rgb"),
-        (RED, "grey", r"must be \(H, W\)"),
+        (RED, "hsv", "channels must be one of gray, rgb"),
+        (RED, "gray", r"must be \(H, W\)"),
         (RED, "rgba", r"\(H, W, 4\) for channels 'rgba', not \(4, 6, 3\)"),
         (RED[0, 0], "rgb", r"not \(3,\)"),
         (RED[:0], "rgb", r"not \(0, 6, 3\)"),

@@ -23,7 +23,7 @@ def test_nearest_is_brute_force(times: list[float], reference: list[float]) -> N
 
 
 def _turning(count: int) -> Trajectory:
-    """Constant motion: half a metre along x and 0.3 rad about z a second."""
+    """Constant motion: half a meter along x and 0.3 rad about z a second."""
     times = torch.arange(count, dtype=torch.float64)
     xi = times[:, None] * torch.tensor([0.5, 0, 0, 0, 0, 0.3], dtype=torch.float64)
     return Trajectory(times, se3_exp(xi))

@@ -71,8 +71,8 @@ def test_wrong_arguments(text: str, message: str) -> None:
 def test_presets(name: str) -> None:
     for calibration in PRESETS[name].cameras:
         camera = parse_camera(name, calibration.size)
-        centre = torch.tensor([(camera.width - 1) / 2, (camera.height - 1) / 2], dtype=torch.float64)
-        assert (camera.params[2:4] - centre).abs().max() < 20
+        center = torch.tensor([(camera.width - 1) / 2, (camera.height - 1) / 2], dtype=torch.float64)
+        assert (camera.params[2:4] - center).abs().max() < 20
         assert 0.4 < float(camera.focal) / camera.width < 0.9
         assert camera.size == calibration.size
 

@@ -65,7 +65,7 @@ def test_seven_scenes_as_a_whole(seven_scenes: Path) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("left", VGA), ("lcam_front", (640, 640))])
 def test_tartanair(tmp_path: Path, write_picture: Write, name: str, size: tuple[int, int]) -> None:
-    """The camera moves forward, to the right and down by 3, 2 and 1 metres, then turns to the right."""
+    """The camera moves forward, to the right and down by 3, 2 and 1 meters, then turns to the right."""
     for index in range(2):
         write_picture(tmp_path / f"image_{name}" / f"{index:06d}_{name}.png", index, size)
     half = np.sqrt(0.5)  # a quarter turn about down
@@ -118,7 +118,7 @@ P_rect_02: 60 0 31 -30 0 60 23 0 0 0 1 0
 
 @pytest.fixture
 def kitti_raw(tmp_path: Path, write_picture: Write) -> Callable[..., Path]:
-    """A drive north by a metre a frame; the second of four frames is missing."""
+    """A drive north by a meter a frame; the second of four frames is missing."""
 
     def write(kind: str = "sync", camera: str = "00") -> Path:
         day = tmp_path / "2011_09_26"
@@ -152,14 +152,14 @@ def test_kitti_raw(kitti_raw: Callable[..., Path]) -> None:
     assert sequence.kind == "KITTI raw, image_00"
     T_02 = sequence.pose(0) @ torch.linalg.inv(sequence.pose(1))
     expected = torch.eye(4, dtype=torch.float64)
-    expected[2, 3] = 2.0  # two metres forward
+    expected[2, 3] = 2.0  # two meters forward
     torch.testing.assert_close(T_02, expected, atol=1e-4, rtol=0)
-    position = sequence.groundtruth.positions_w[0]  # half a metre behind the GPS, which looks north
+    position = sequence.groundtruth.positions_w[0]  # half a meter behind the GPS, which looks north
     torch.testing.assert_close(position, torch.tensor([0, -0.5, 0], dtype=torch.float64), atol=1e-9, rtol=0)
 
 
 def test_right_of_the_first_camera(kitti_raw: Callable[..., Path]) -> None:
-    """P_rect_02 puts its camera half a metre to the right of camera 0: east, on the way north."""
+    """P_rect_02 puts its camera half a meter to the right of camera 0: east, on the way north."""
     sequence = open_sequence(kitti_raw(camera="02"))
     position = sequence.groundtruth.positions_w[0]
     torch.testing.assert_close(position, torch.tensor([0.5, -0.5, 0], dtype=torch.float64), atol=1e-9, rtol=0)

@@ -20,7 +20,7 @@ from tests.fuzz.__main__ import _outcomes
 from tests.fuzz.inputs import clear, numbers, outcome
 from tests.fuzz.readers import Reader, readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
-from torchslam.data.formats.image_file import read_grey
+from torchslam.data.formats.image_file import read_gray
 from torchslam.data.readers.eth3d_tum import read_image_list
 from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
 
@@ -101,7 +101,7 @@ def test_calibration_files(tmp_path: Path, name: str, text: str) -> None:
 def test_images(tmp_path: Path, start: bytes, rest: bytes) -> None:
     (tmp_path / "image").write_bytes(start + rest)
     with contextlib.suppress(FrameError):
-        assert read_grey(tmp_path / "image", "here").shape[:2] == (1, 1)
+        assert read_gray(tmp_path / "image", "here").shape[:2] == (1, 1)
 
 
 def spin(root: Path) -> None:

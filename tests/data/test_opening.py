@@ -171,16 +171,16 @@ def test_nothing_is_read_without_a_limit(
     for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm"):
         image = tmp_path / f"0.{suffix}"
         write_picture(image)
-        assert image_files.read_grey(image, "here").shape == (1, 1, 48, 64)
+        assert image_files.read_gray(image, "here").shape == (1, 1, 48, 64)
         with monkeypatch.context() as patch:
             patch.setattr(image_files, "MAX_PIXELS", 48 * 64 - 1)
             with pytest.raises(FrameError, match=rf"0\.{suffix} is not an image"):
-                image_files.read_grey(image, "here")
+                image_files.read_gray(image, "here")
         if suffix != "png":
             image.unlink()
     monkeypatch.setattr(image_files, "MAX_BYTES", 100)
     with pytest.raises(FrameError, match="more than the 100 of an image"):
-        image_files.read_grey(tmp_path / "0.png", "here")
+        image_files.read_gray(tmp_path / "0.png", "here")
     (tmp_path / "calibration.txt").write_text("60 60 32 24\n" * 20)
     monkeypatch.setattr("torchslam.data.formats.text_file.MAX_BYTES", 100)
     with pytest.raises(CalibrationError, match="more than the 100 of a text"):

@@ -24,10 +24,10 @@ SIZE = (160, 120)
 K = np.array(((125.0, 0, 79.5), (0, 125.0, 59.5), (0, 0, 1)))
 
 
-def _plain(origin: tuple[float, float, float], size: tuple[float, float], grey: int) -> Rectangle:
-    """A rectangle of one grey level that faces the z axis."""
+def _plain(origin: tuple[float, float, float], size: tuple[float, float], gray: int) -> Rectangle:
+    """A rectangle of one gray level that faces the z axis."""
     side = 2 ** (MIP_LEVELS - 1)
-    texture = np.full((side, side), grey, np.uint8)
+    texture = np.full((side, side), gray, np.uint8)
     return Rectangle(np.array(origin), np.array((1.0, 0, 0)), np.array((0, 1.0, 0)), size, texture)
 
 
@@ -219,7 +219,7 @@ def test_the_corridors_are_never_seen_twice() -> None:
     apart = (torch.arange(len(positions))[:, None] - torch.arange(len(positions))).abs() >= 150
     assert float(torch.cdist(positions, positions)[apart].min()) > 2.5
     # The first room painted white, the others black.
-    white, black = (np.full((32, 32), grey, np.uint8) for grey in (255, 0))
+    white, black = (np.full((32, 32), gray, np.uint8) for gray in (255, 0))
     built = _built(corridors)
     painted = [
         Rectangle(one.origin, one.axis_u, one.axis_v, one.size, white if row < len(built) / 4 else black)

@@ -31,7 +31,7 @@ from torchslam.types import State, StepResult, Trajectory
 N = 40
 SIZE = (64, 48)
 RNG = np.random.default_rng(0)
-GREY = RNG.integers(0, 256, (SIZE[1], SIZE[0]), dtype=np.uint8)
+GRAY = RNG.integers(0, 256, (SIZE[1], SIZE[0]), dtype=np.uint8)
 
 
 def similar(T_wc: Tensor) -> Tensor:
@@ -148,14 +148,14 @@ def test_wrong_frames_are_known_by_their_numbers_and_strangers_have_no_pose() ->
 def test_only_tracking_frames_of_the_main_world_mislead(
     monkeypatch: pytest.MonkeyPatch, run: Run, results: list[StepResult]
 ) -> None:
-    """Frames 0 to 2 are initialising, 3 to 17 tracking, 18 to 21 lost, 22 to 29 tracking."""
+    """Frames 0 to 2 are initializing, 3 to 17 tracking, 18 to 21 lost, 22 to 29 tracking."""
     sequence, poses = walk_with(range(2, 5))
     _, given = walk_with(range(17, 20))
     monkeypatch.setattr(outcome, "final_poses", lambda _: {i: poses[i] for i in range(30)})
     with monkeypatch.context() as patch:
         patch.setattr(outcome, "online_poses", lambda _: {i: given[i] for i in range(30)})
         assert misled(run, sequence) == [3, 4, 17]
-    other = [replace(result, world=1 if result.index == 10 else result.world) for result in results]
+    other = [replace(result, submap=1 if result.index == 10 else result.submap) for result in results]
     assert 10 in online_poses(run)
     assert 10 not in online_poses(replace(run, results=other))
     doubtful = [replace(result, state=State.UNCERTAIN) for result in results]
@@ -212,10 +212,10 @@ def test_kidnapped_frames_have_no_pose_and_the_rest_goes_on() -> None:
 
 
 def test_light_noise_and_blur() -> None:
-    assert (edits.exposure_step(GREY, 39) == GREY).all()
-    assert (edits.exposure_step(GREY, 40) == GREY // 4).all()
-    assert (edits.exposure_step(GREY, 80) == GREY).all()
-    assert not edits.black(GREY, 0).any()
+    assert (edits.exposure_step(GRAY, 39) == GRAY).all()
+    assert (edits.exposure_step(GRAY, 40) == GRAY // 4).all()
+    assert (edits.exposure_step(GRAY, 80) == GRAY).all()
+    assert not edits.black(GRAY, 0).any()
     levels = np.array([0, 20, 85, 86, 255], np.uint8)
     assert edits.brighter(3.0)(levels, 0).tolist() == [0, 60, 255, 255, 255]
     flat = np.full((200, 200), 128, np.uint8)
@@ -265,7 +265,7 @@ def test_a_rolling_shutter_shifts_rows_by_a_sine() -> None:
     assert (later == bent).all()
 
 
-def test_dirt_is_grey_and_stays() -> None:
+def test_dirt_is_gray_and_stays() -> None:
     edit = edits.lens_dirt((320, 240))
     white = np.full((240, 320), 255, np.uint8)
     assert (edit(white, 0) == edit(white, 9)).all()
@@ -279,7 +279,7 @@ def test_halved_cameras_see_points_at_the_middle_of_four_pixels() -> None:
     (whole, _), (half, _) = camera.project(point), halved(camera).project(point)
     torch.testing.assert_close(half, (whole + 0.5) / 2 - 0.5)
     assert halved(camera).size == (160, 120)
-    assert (fitted(np.kron(GREY, np.ones((2, 2), np.uint8)), SIZE) == GREY).all()
+    assert (fitted(np.kron(GRAY, np.ones((2, 2), np.uint8)), SIZE) == GRAY).all()
 
 
 def test_a_turned_image_is_what_the_turned_camera_sees() -> None:
@@ -383,4 +383,4 @@ def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pyte
     made = Edited("round", Round(3).camera, [Shot(Round(3), index) for index in range(3)])
     result, _ = outcome.perform(Trial(lambda: made))
     assert (result.ate, result.misled, result.recalls, result.posed, result.possible) == (None, [], [], 0, 3)
-    assert "no map was initialised" in cells("x", result, "m")[3]
+    assert "no map was initialized" in cells("x", result, "m")[3]

@@ -463,7 +463,7 @@ def _change_column(tensors: dict[str, Any], rng: random.Random) -> None:
     if kind == 0:
         del tensors[name]
     elif kind == 1:
-        tensors[rng.choice(("x", name + ".x", "worlds.9.points.x", "\u2028"))] = values.clone()
+        tensors[rng.choice(("x", name + ".x", "submaps.9.points.x", "\u2028"))] = values.clone()
     elif kind == 2:
         tensors[name] = values[: rng.randrange(len(values) + 1)].clone() if values.ndim else values[None]
     elif kind == 3:

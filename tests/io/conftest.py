@@ -1,5 +1,5 @@
 """The fixtures of a small run."""
 
-from tests.sample_run import camera, results, run, slam_map, trajectory, world
+from tests.sample_run import camera, results, run, slam_map, submap, trajectory
 
-__all__ = ["camera", "results", "run", "slam_map", "trajectory", "world"]
+__all__ = ["camera", "results", "run", "slam_map", "submap", "trajectory"]

@@ -19,13 +19,13 @@ def test_frames_come_back_without_poses(tmp_path: Path, results: list[StepResult
 
 
 def test_the_state_and_the_world_of_a_frame_have_columns(tmp_path: Path, results: list[StepResult]) -> None:
-    doubtful = [replace(results[0], state=State.UNCERTAIN, world=12), replace(results[1], world=None)]
+    doubtful = [replace(results[0], state=State.UNCERTAIN, submap=12), replace(results[1], submap=None)]
     write_frames(tmp_path / "frames.csv", doubtful)
     lines = (tmp_path / "frames.csv").read_text().splitlines()
-    assert lines[0].startswith("index,timestamp,state,world,keyframe,")
+    assert lines[0].startswith("index,timestamp,state,submap,keyframe,")
     assert lines[1].startswith("0,100.0,uncertain,12,0,")
     assert lines[2].split(",")[2:4] == ["initializing", ""]
-    assert [frame.world for frame in read_frames(tmp_path / "frames.csv")] == [12, None]
+    assert [frame.submap for frame in read_frames(tmp_path / "frames.csv")] == [12, None]
 
 
 def test_no_frames(tmp_path: Path) -> None:

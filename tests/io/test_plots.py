@@ -80,7 +80,7 @@ def test_picture_is_drawn_and_the_same_again(
 
 
 @pytest.mark.parametrize("name", ["top_view", "errors", "tracking", "stages", "features"])
-def test_axes_are_labelled_with_units(name: str, figures: dict[str, Callable[[], Figure]]) -> None:
+def test_axes_are_labeled_with_units(name: str, figures: dict[str, Callable[[], Figure]]) -> None:
     axes = figures[name]().axes
     assert any("(" in panel.get_xlabel() or panel.get_xlabel() == "frame" for panel in axes)
     assert any(panel.get_ylabel() for panel in axes)
@@ -153,19 +153,19 @@ def test_the_path_is_broken_where_poses_are_missing(trajectory: Trajectory, poin
 def test_spans_without_a_pose_are_shaded(results: list[StepResult]) -> None:
     axes = plots.plot_tracking(results).axes[0]
     spans = {patch.get_label(): patch for patch in axes.patches}
-    assert spans.keys() == {"initialising", "lost"}
+    assert spans.keys() == {"initializing", "lost"}
     lost = spans["lost"]
     assert lost.get_x() == pytest.approx(18 / 30)
     assert lost.get_width() == pytest.approx(4 / 30)
 
 
-def test_uncertain_spans_are_shaded_in_their_own_colour(results: list[StepResult]) -> None:
+def test_uncertain_spans_are_shaded_in_their_own_color(results: list[StepResult]) -> None:
     doubtful = [
         replace(result, state=State.UNCERTAIN) if 6 <= result.index < 9 else result for result in results
     ]
     patches = plots.plot_tracking(doubtful).axes[0].patches
     spans = {patch.get_label(): patch for patch in patches if not patch.get_label().startswith("_")}
-    assert spans.keys() == {"initialising", "lost", "uncertain"}
+    assert spans.keys() == {"initializing", "lost", "uncertain"}
     assert spans["uncertain"].get_x() == pytest.approx(6 / 30)
     assert spans["uncertain"].get_width() == pytest.approx(3 / 30)
     assert len({patch.get_facecolor() for patch in spans.values()}) == 3

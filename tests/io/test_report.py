@@ -9,7 +9,7 @@ import torch
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
 from torchslam.io.report import metrics, quality, result_warnings, summary, table
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory
 
@@ -19,18 +19,18 @@ def test_counts(run: Run) -> None:
     assert figures["frames"] == 31
     assert figures["posed"] == 23
     assert figures["lost"] == 4
-    assert figures["initialised_at"] == 3
-    assert figures["posed_share_after_initialisation"] == pytest.approx(23 / 27)
+    assert figures["initialized_at"] == 3
+    assert figures["posed_ratio_after_initialization"] == pytest.approx(23 / 27)
     assert figures["keyframes"] == 6
     assert figures["points"] == 119
     assert figures["skipped"] == ["image 31 is not an image"]
-    assert (figures["session"], figures["world"]) == (0, 0)
-    counts = {"world": 0, "keyframes": 6, "points": 119, "posed": 23, "uncertain": 0, "lost": 4}
-    assert figures["worlds"] == [counts]
+    assert (figures["session"], figures["submap"]) == (0, 0)
+    counts = {"submap": 0, "keyframes": 6, "points": 119, "posed": 23, "uncertain": 0, "lost": 4}
+    assert figures["submaps"] == [counts]
 
 
 def test_quality(run: Run) -> None:
-    graph = run.history.graph(run.map, run.camera)
+    graph = run.posed_frames.graph(run.map, run.camera)
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
     pixels, valid = run.camera.project(points_c)
     assert valid.any()
@@ -46,7 +46,7 @@ def test_quality(run: Run) -> None:
         "0.0% of the frames uncertain"
     )
     assert "quality" not in summary(figures | {"reprojection_px": None})
-    assert quality(replace(run, worlds=())) == quality(replace(run, session=7))
+    assert quality(replace(run, submaps=())) == quality(replace(run, session=7))
     assert quality(replace(run, session=7)) == {"reprojection_px": None, "track_length": None}
 
 
@@ -60,34 +60,34 @@ def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: 
     ] * said
 
 
-def test_counts_of_several_worlds_and_sessions(run: Run, world: Submap) -> None:
-    """Frames 10 to 14 uncertain in world 0; from frame 22 in world 3, which has as many frames of another session."""
-    other = Submap(3, world.track)
-    other.map.add_keyframe(replace(world.map.view(0), session=2), world.map.T_cw[0])
+def test_counts_of_several_worlds_and_sessions(run: Run, submap: Submap) -> None:
+    """Frames 10 to 14 uncertain in submap 0; from frame 22 in submap 3, which has as many frames of another session."""
+    other = Submap(3, submap.tracking)
+    other.map.add_keyframe(replace(submap.map.view(0), session=2), submap.map.T_cw[0])
     for index in range(30):
-        view = replace(world.map.view(0), index=index, session=int(index < 22))
-        tracked = PoseEstimate(
-            world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
+        view = replace(submap.map.view(0), index=index, session=int(index < 22))
+        estimate = PoseEstimate(
+            submap.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
         )
-        other.history.add(view, tracked, torch.eye(4, dtype=torch.float64), 0)
+        other.posed_frames.add(view, estimate, torch.eye(4, dtype=torch.float64), 0)
     results = [
         replace(
             result,
             state=State.UNCERTAIN if 10 <= result.index < 15 else result.state,
-            world=3 if result.index >= 22 else result.world,
+            submap=3 if result.index >= 22 else result.submap,
         )
         for result in run.results
     ]
-    figures = metrics(replace(run, worlds=(world, other), results=results))
-    assert figures["world"] == 0  # most frames of this session, not of all
-    assert [counts["posed"] for counts in figures["worlds"]] == [23, 8]
-    assert [counts["uncertain"] for counts in figures["worlds"]] == [5, 0]
-    assert [counts["lost"] for counts in figures["worlds"]] == [4, 0]
+    figures = metrics(replace(run, submaps=(submap, other), results=results))
+    assert figures["submap"] == 0  # most frames of this session, not of all
+    assert [counts["posed"] for counts in figures["submaps"]] == [23, 8]
+    assert [counts["uncertain"] for counts in figures["submaps"]] == [5, 0]
+    assert [counts["lost"] for counts in figures["submaps"]] == [4, 0]
     words = summary(figures)
-    assert words["world"] == "0, the main one of 2; world 3: 8 frames posed, 1 keyframes"
+    assert words["submap"] == "0, the main one of 2; submap 3: 8 frames posed, 1 keyframes"
     assert words["lost"] == "4 frames; 5 had an uncertain pose"
-    again = metrics(replace(run, worlds=(world, other), results=results, session=1))
-    assert again["world"] == 3
+    again = metrics(replace(run, submaps=(submap, other), results=results, session=1))
+    assert again["submap"] == 3
     assert summary(again)["session"] == "1, which made 0 of the keyframes"
 
 
@@ -103,7 +103,7 @@ def test_times(run: Run) -> None:
 
 def test_a_map_that_was_given_up_does_not_count_as_the_start(run: Run) -> None:
     given_up = [replace(run.results[0], state=State.TRACKING), *run.results[1:]]
-    assert metrics(replace(run, results=given_up))["initialised_at"] == 3
+    assert metrics(replace(run, results=given_up))["initialized_at"] == 3
 
 
 def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
@@ -126,7 +126,7 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
         "31, 1 of them unreadable",
         "23 (74.2%)",
         "85.2% since the start at frame 3",
-        "2.0000 true metres",
+        "2.0000 true meters",
     ):
         assert part in words
 
@@ -134,12 +134,12 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
 def test_a_run_without_a_map(run: Run) -> None:
     failed = replace(
         run,
-        worlds=(),
+        submaps=(),
         results=run.results[:3],
-        failure="no map was initialised in 3 frames: the camera does not move",
+        failure="no map was initialized in 3 frames: the camera does not move",
     )
     figures = metrics(failed)
-    assert figures["initialised_at"] is None
+    assert figures["initialized_at"] is None
     assert figures["posed"] == figures["points"] == figures["keyframes"] == 0
     assert figures["failure"].endswith("the camera does not move")
     assert summary(figures) == {"frames": "4, 1 of them unreadable and skipped", "map": "none"}

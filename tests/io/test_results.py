@@ -14,8 +14,8 @@ from torchslam.io.pictures import draw
 from torchslam.io.report import metrics
 from torchslam.io.results import read_results, results_in, write_results
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
-from torchslam.map.submap import Submap
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate
 
@@ -27,15 +27,17 @@ def write(run: Run, directory: Path) -> None:
 
 
 @pytest.fixture
-def two(run: Run, world: Submap) -> Run:
-    """A second world with two frames."""
-    other = Submap(3, world.track)
-    other.map.add_keyframe(replace(world.map.view(0), index=18, timestamp=100.6), world.map.T_cw[0])
+def two(run: Run, submap: Submap) -> Run:
+    """A second submap with two frames."""
+    other = Submap(3, submap.tracking)
+    other.map.add_keyframe(replace(submap.map.view(0), index=18, timestamp=100.6), submap.map.T_cw[0])
     for index in (18, 19):
-        view = replace(world.map.view(0), index=index, timestamp=100 + index / 30)
-        seen = PoseEstimate(world.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0)
-        other.history.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
-    return replace(run, worlds=(other, world))
+        view = replace(submap.map.view(0), index=index, timestamp=100 + index / 30)
+        seen = PoseEstimate(
+            submap.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
+        )
+        other.posed_frames.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
+    return replace(run, submaps=(other, submap))
 
 
 def test_what_is_written_reads_back(tmp_path: Path, run: Run) -> None:
@@ -47,7 +49,7 @@ def test_what_is_written_reads_back(tmp_path: Path, run: Run) -> None:
     results = read_results(tmp_path / "new")
     torch.testing.assert_close(results.trajectory.T_wc, run.trajectory.T_wc, rtol=0, atol=1e-8)
     assert len(results.keyframes) == 6
-    assert [frame.world for frame in results.frames] == [result.world for result in run.results]
+    assert [frame.submap for frame in results.frames] == [result.submap for result in run.results]
     assert results.session == 0
 
 
@@ -59,9 +61,9 @@ def test_the_poses_as_they_were_given_have_a_file(tmp_path: Path, run: Run) -> N
 
 
 def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
-    """Frames 3 to 9 given in world 5, 10 to 17 in 4; those became world 0. World 7, of 22 to 24, is another one."""
-    worlds = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
-    results = [replace(one, world=worlds.get(one.index, one.world)) for one in run.results]
+    """Frames 3 to 9 given in submap 5, 10 to 17 in 4; those became submap 0. Submap 7, of 22 to 24, is another one."""
+    submaps = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
+    results = [replace(one, submap=submaps.get(one.index, one.submap)) for one in run.results]
     recalls = (
         LoopClosureRecord(30, 9, 5, 4),
         LoopClosureRecord(40, 30, 0, 0),
@@ -73,7 +75,7 @@ def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
     assert [len(part) for part in joined.online_parts] == [5, 8, 7]
     assert joined.online_parts[2].timestamps[0] == run.results[3].timestamp
     assert [len(part) for part in replace(joined, recalls=()).online_parts] == [5]
-    assert replace(joined, worlds=()).online_parts == []
+    assert replace(joined, submaps=()).online_parts == []
 
 
 def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
@@ -82,8 +84,8 @@ def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
     write(two, tmp_path)
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == 23
     assert len(read_trajectory(tmp_path / "trajectory_3.txt")) == 2
-    assert json.loads((tmp_path / "metrics.json").read_text())["world"] == 0
-    assert [world.number for world in read_atlas(tmp_path / "map.safetensors").worlds] == [3, 0]
+    assert json.loads((tmp_path / "metrics.json").read_text())["submap"] == 0
+    assert [submap.number for submap in read_atlas(tmp_path / "map.safetensors").atlas] == [3, 0]
     assert read_results(tmp_path).map.num_keyframes == 6
     write(run, tmp_path)
     assert not (tmp_path / "trajectory_3.txt").exists()
@@ -100,16 +102,16 @@ def test_pictures_say_which_world_they_show(
     )
     write(two, tmp_path)
     draw(read_results(tmp_path), tmp_path)
-    assert "world 0, the main one of 2" in titles["top_view"].replace("\n", " ")
-    write(replace(two, worlds=two.worlds[1:]), tmp_path)
+    assert "submap 0, the main one of 2" in titles["top_view"].replace("\n", " ")
+    write(replace(two, submaps=two.submaps[1:]), tmp_path)
     draw(read_results(tmp_path), tmp_path)
-    assert "world" not in titles["top_view"]
+    assert "submap" not in titles["top_view"]
 
 
-def test_a_run_that_only_localised_is_drawn(tmp_path: Path, run: Run, world: Submap) -> None:
-    world.history.frames["session"][:] = 1
-    localised = replace(run, session=1, sessions=1)
-    write(localised, tmp_path)
+def test_a_run_that_only_localized_is_drawn(tmp_path: Path, run: Run, submap: Submap) -> None:
+    submap.posed_frames.frames["session"][:] = 1
+    localized = replace(run, session=1, sessions=1)
+    write(localized, tmp_path)
     assert read_atlas(tmp_path / "map.safetensors").sessions == 1
     results = read_results(tmp_path)
     assert len(results.keyframes) == 0
@@ -146,5 +148,5 @@ def test_other_figures_are_refused(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
     for content in ("[]", '{"frames": 3}'):
         (tmp_path / "metrics.json").write_text(content)
-        with pytest.raises(ResultsError, match=r"metrics\.json: not the figures of a run: .*world"):
+        with pytest.raises(ResultsError, match=r"metrics\.json: not the figures of a run: .*submap"):
             read_results(tmp_path)

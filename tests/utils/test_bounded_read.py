@@ -12,7 +12,7 @@ import pytest
 from torchslam.config import load_config
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
 from torchslam.data.formats.given_poses import read_poses
-from torchslam.data.formats.image_file import read_grey
+from torchslam.data.formats.image_file import read_gray
 from torchslam.errors import LONGEST, TorchslamError
 from torchslam.features.learned import XFeat
 from torchslam.io.frames_file import read_frames
@@ -22,7 +22,7 @@ from torchslam.utils.bounded_read import check_regular, parse_json, read_bytes, 
 READERS: dict[str, Callable[[Path], object]] = {
     "trajectory": read_trajectory,
     "calibration": read_calibration,
-    "image": lambda path: read_grey(path, str(path)),
+    "image": lambda path: read_gray(path, str(path)),
     "poses": read_poses,
     "configuration": load_config,
     "map": read_atlas,

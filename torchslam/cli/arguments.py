@@ -1,6 +1,6 @@
-"""Arguments that several commands share, and what they say about sequence and configuration.
+"""Command-line arguments shared by several commands.
 
-torch is imported where a sequence is opened or a device is named: the help needs neither.
+torch is imported only where a sequence is opened or a device is named, so that the help appears at once.
 """
 
 from __future__ import annotations
@@ -31,37 +31,39 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """With which camera a sequence is read, and which of its frames."""
+    """Add the arguments for the camera and the selection of frames."""
     parser.add_argument(
         "--camera",
         metavar="CAMERA",
         help="FX,FY,CX,CY[,K1,K2,P1,P2,K3] in pixels; a calibration file (OpenCV, ROS, Kalibr, ORB-SLAM3, COLMAP, "
-        f"nerfstudio); a preset ({PRESETS}); a guess that the images improve: fov=65 (degrees), "
-        "f=0.8w (image widths), exif; or auto: the images decide. Replaces the calibration found with the images",
+        f"nerfstudio); a preset ({PRESETS}); an initial guess that is refined from the images: fov=65 (degrees), "
+        "f=0.8w (image widths), exif; or auto (estimated from the images). Overrides the calibration of the sequence",
     )
-    reading = parser.add_argument_group("which frames, and how")
+    reading = parser.add_argument_group("frame selection")
     reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
     reading.add_argument("--stop", metavar="N|TIME", help="end before this frame: 240, 20s or 2:00")
-    reading.add_argument("--stride", type=positive, default=1, metavar="N", help="take every N-th frame")
+    reading.add_argument("--stride", type=positive, default=1, metavar="N", help="use every N-th frame")
     reading.add_argument(
         "--fps",
         type=float,
         metavar="RATE",
-        help="take at most RATE frames per second; images without times are taken to be RATE a second (else 30)",
+        help="use at most RATE frames per second; also the frame rate of images without timestamps (default: 30)",
     )
-    reading.add_argument("--limit", type=positive, metavar="N", help="take only the first N of these frames")
+    reading.add_argument("--limit", type=positive, metavar="N", help="use only the first N of these frames")
     reading.add_argument(
-        "--resize", metavar="WxH|W|FACTOR", help="640x480, 640 or 0.5: the images, and the camera with them"
+        "--resize",
+        metavar="WxH|W|FACTOR",
+        help="resize the images and adapt the camera: 640x480, 640 (width) or 0.5",
     )
     reading.add_argument(
         "--mask",
         metavar="FILE|DIR",
-        help="image of the size of the frames, black where no features are wanted; or a folder with one per frame",
+        help="mask image, black where no features are wanted; or a folder with one mask per frame",
     )
 
 
 def sequence(options: argparse.Namespace) -> Sequence:
-    """The sequence that the arguments of `add_sequence` name; what is to know about it goes to stderr."""
+    """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr."""
     from torchslam.data import open_sequence
 
     found = open_sequence(
@@ -84,7 +86,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config",
         metavar="FILE|NAME",
-        help=f"TOML file of settings, or one that comes with torchslam: {', '.join(names())}; the rest are defaults",
+        help=f"TOML file of settings or built-in configuration ({', '.join(names())}); other keys keep their default",
     )
     parser.add_argument(
         "--set",
@@ -92,30 +94,32 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="SECTION.KEY=VALUE",
-        help="change one setting, for example features.num_keypoints=2000; may be repeated",
+        help="change one setting, for example features.num_keypoints=2000; can be repeated",
     )
     parser.add_argument(
         "--features",
         metavar="NAME",
-        help=f"front end (features.kind): {', '.join(CHOICES['features.kind'])}, a registered name, or PACKAGE:NAME",
+        help=f"feature extractor (features.kind): {', '.join(CHOICES['features.kind'])}, a plugin, or PACKAGE:NAME",
     )
-    parser.add_argument("--weights", metavar="FILE", help="weights of a learned front end (features.weights)")
+    parser.add_argument(
+        "--weights", metavar="FILE", help="weights of a learned feature extractor (features.weights)"
+    )
     parser.add_argument(
         "--matcher",
         metavar="NAME",
-        help="matcher (matching.matcher): descriptors, a registered name, or PACKAGE:NAME",
+        help="matcher (matching.matcher): descriptors, lightglue, a plugin, or PACKAGE:NAME",
     )
-    parser.add_argument("--scale", choices=CHOICES["scale"], help="length of a map unit (scale)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of all random choices (seed)")
+    parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
 
 
 def config(options: argparse.Namespace) -> Config:
-    """The configuration that the arguments of `add_config` name: the file, then --set, then the other options."""
+    """Load the configuration given by the arguments of `add_config`: the file, then --set, then the other options."""
     return load_config(options.config, overrides(options))
 
 
 def overrides(options: argparse.Namespace) -> list[str]:
-    """What the arguments of `add_config` change in the file, as `section.key=value`."""
+    """Return the changes that the arguments of `add_config` make to the file, as `section.key=value`."""
     named = {
         "features.kind": options.features,
         "features.weights": options.weights,
@@ -130,9 +134,9 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device",
         type=_device,
-        default="cpu",  # a word: a device would need torch
+        default="cpu",  # a string: a device would need torch
         metavar="DEVICE",
-        help="where to compute, for example cuda (default: %(default)s)",
+        help="device to compute on, for example cuda (default: %(default)s)",
     )
 
 
@@ -159,7 +163,7 @@ def _device(text: str) -> torch.device:
 
 
 def not_negative(text: str) -> int:
-    """A number from 0 on, of an argument."""
+    """Parse a non-negative integer argument."""
     number = int(text)
     if number < 0:
         raise argparse.ArgumentTypeError(f"must be at least 0, not {number}")
@@ -167,7 +171,7 @@ def not_negative(text: str) -> int:
 
 
 def positive(text: str) -> int:
-    """A number from 1 on, of an argument."""
+    """Parse a positive integer argument."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")

@@ -51,11 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="replace results of other settings, files or versions, which are errors otherwise",
     )
-    parser.add_argument(
-        "--no-pictures", action="store_true", help="write no plots and no view.html"
-    )
+    parser.add_argument("--no-pictures", action="store_true", help="write no plots and no view.html")
     spread = parser.add_argument_group("distribution")
-    spread.add_argument("--shard", metavar="I/N|auto", help="run every N-th row, starting with row I (from 0)")
+    spread.add_argument(
+        "--shard", metavar="I/N|auto", help="run every N-th row, starting with row I (from 0)"
+    )
     spread.add_argument(
         "--engine",
         choices=ENGINES,

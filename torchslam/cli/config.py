@@ -1,6 +1,6 @@
-"""Print every setting with what it is, its range and its default, as TOML that --config reads.
+"""Print every setting with its description, range and default, as TOML for --config.
 
-With --config and --set it prints what a run with them would use.
+With --config and --set, the values that a run would use are printed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Render a room, run SLAM on it, evaluate and draw: the system in one command, without any data."""
+"""Run SLAM on a rendered room, evaluate and plot it: the whole system without any data."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ SEQUENCE = "synthetic:room"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--output", "-o", type=Path, default=Path("results/demo"), metavar="DIR", help="default: %(default)s"
+        "--output",
+        "-o",
+        type=Path,
+        default=Path("results/demo"),
+        metavar="DIR",
+        help="folder for the results (default: %(default)s)",
     )
     arguments.add_device(parser)
     arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    plan = Plan(
-        SEQUENCE, options.output, options.device, overwrite=True
-    )  # the same room again: nobody's work is lost
+    # The results can be reproduced, so overwriting loses nothing.
+    plan = Plan(SEQUENCE, options.output, options.device, overwrite=True)
     return run(open_sequence(SEQUENCE), arguments.config(options), plan)

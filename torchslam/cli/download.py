@@ -1,4 +1,4 @@
-"""Fetch a public sequence: with a progress bar, taking up a transfer that broke off."""
+"""Download a public sequence; an interrupted transfer is resumed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("data"),
         metavar="DIR",
-        help="where its folder goes; default: %(default)s",
+        help="folder to place the sequence in (default: %(default)s)",
     )
-    parser.add_argument("--sha256", metavar="HEX", help="checksum of the archive: another one is deleted")
-    parser.add_argument("--url", default=ETH3D_URL, help="server that has the archives; default: %(default)s")
+    parser.add_argument("--sha256", metavar="HEX", help="expected checksum; another archive is deleted")
+    parser.add_argument("--url", default=ETH3D_URL, help="server of the archives (default: %(default)s)")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -1,14 +1,14 @@
-"""Give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo.
+"""Export map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo.
 
-  colmap      sparse/0/ with the model, binary and text, and images/; keyframes, points, tracks
-  nerfstudio  transforms.json (OpenGL axes, z up), sparse_pc.ply and images/; keyframes, of which a slow camera has
-              few: --frames all gives a trainer more images
-  ply         the points in the colours of the images, the keyframes in red, z up
-  rerun       a recording (.rrd): points, path, every camera; images and keypoints of the keyframes, undistorted, z up
-  tum, kitti  every pose, camera to world: a file with times; a folder with poses.txt and times.txt
+  colmap      sparse/0/ with the model (binary and text) and images/: keyframes, points and tracks
+  nerfstudio  transforms.json (OpenGL axes, z up), sparse_pc.ply and images/: keyframes; a slow camera has few, and
+              --frames all provides more images for training
+  ply         colored points, keyframes in red, z up
+  rerun       recording (.rrd): points, path and all cameras; undistorted images and keypoints of the keyframes; z up
+  tum, kitti  all poses, camera to world: a file with timestamps; a folder with poses.txt and times.txt
 
-Lengths are in map units. Up is the mean up direction of the keyframes' cameras: gravity is not known. Images are read
-again from the sequence that the run read.
+Lengths are in map units. Up is the mean up direction of the keyframes, since gravity is unknown. Images are read again
+from the sequence of the run.
 
 Then, for example, `ns-train splatfacto --data DIR/export/nerfstudio`, `train.py -s DIR/export/colmap` (3D Gaussian
 Splatting knows pinhole cameras alone: --undistort), `rerun DIR/export/recording.rrd`, `evo_traj tum
@@ -29,7 +29,7 @@ from torchslam.cli import arguments
 from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.colmap import colmap_camera, write_colmap
 from torchslam.io.export.images import WITHOUT, Images, open_images, write_images
 from torchslam.io.export.kitti import write_kitti
@@ -40,8 +40,8 @@ from torchslam.io.export.scene import Scene, scene_of
 from torchslam.io.export.undistortion import undistorted
 from torchslam.io.report import table
 from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
+from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
-from torchslam.map.submap import Submap
 from torchslam.system.run import keyframe_rows, keyframe_trajectory
 from torchslam.types import Trajectory
 
@@ -54,7 +54,7 @@ class Job:
     """What is to be exported, and where to.
 
     directory: of the results; figures: of the run, from there
-    world, camera: from its map
+    submap, camera: from its map
     source:    what the images are read from, and
     fps:       at what rate, where the run was told; None where they are not wanted, or nothing says where they are
     undistort: whether images and keypoints are to be as of a pinhole camera
@@ -62,7 +62,7 @@ class Job:
 
     directory: Path
     figures: dict[str, Any]
-    world: Submap
+    submap: Submap
     camera: Camera
     output: Path
     keyframes_alone: bool
@@ -78,22 +78,22 @@ class Job:
     @property
     def R_up(self) -> torch.Tensor:
         """(3, 3) from the map's world to the upright one: the same for every format."""
-        return upright_rotation(se3_inverse(self.world.map.T_cw).double())
+        return upright_rotation(se3_inverse(self.submap.map.T_cw).double())
 
     def scene(self) -> tuple[Scene, Images | None]:
         """What is seen, and the images if they are wanted. Raises ResultsError where they are gone."""
-        scene = scene_of(self.world, self.camera, self.session, self.keyframes_alone)
+        scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone)
         images = None
         if self.source is not None:
             images = open_images(self.source, scene, self.undistort, self.fps)
         return (undistorted(scene) if self.undistort else scene), images
 
     def trajectory(self) -> Trajectory:
-        """The poses of the run in the world. Of all frames they are read: one that only localised is not in the map."""
+        """The poses of the run in the submap; those of all frames are read, since localization adds none to the map."""
         if self.keyframes_alone:
-            return keyframe_trajectory(self.world.map, self.session)
-        is_main = self.world.number == self.figures["world"]
-        name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(self.world.number)
+            return keyframe_trajectory(self.submap.map, self.session)
+        is_main = self.submap.number == self.figures["submap"]
+        name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(self.submap.number)
         return read_trajectory(self.directory / name)
 
 
@@ -113,30 +113,34 @@ class Target:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
-    parser.add_argument("--to", choices=TARGETS, required=True, help="for which program")
+    parser.add_argument("--to", choices=TARGETS, required=True, help="export format")
     parser.add_argument(
-        "--output", "-o", type=Path, metavar="PATH", help=f"file or folder to write; default: in DIR/{FOLDER}"
+        "--output",
+        "-o",
+        type=Path,
+        metavar="PATH",
+        help=f"file or folder to write (default: in DIR/{FOLDER})",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     parser.add_argument(
-        "--frames", choices=("all", "keyframes"), help="which of the posed frames; default: see above"
+        "--frames",
+        choices=("all", "keyframes"),
+        help="which of the posed frames to export (default: see above)",
     )
     parser.add_argument(
-        "--world", type=arguments.not_negative, metavar="N", help="another world than the main one"
+        "--submap", type=arguments.not_negative, metavar="N", help="submap to export (default: the main one)"
     )
     parser.add_argument(
-        "--undistort", action="store_true", help="images and keypoints as of a pinhole camera (rerun: always)"
+        "--undistort", action="store_true", help="undistort images and keypoints (always done for rerun)"
     )
-    parser.add_argument(
-        "--sequence", metavar="PATH", help="where the sequence of the run is now, if it was moved"
-    )
-    parser.add_argument("--no-images", action="store_true", help="do without images")
+    parser.add_argument("--sequence", metavar="PATH", help="new location of the sequence, if it was moved")
+    parser.add_argument("--no-images", action="store_true", help="export no images")
 
 
 def execute(options: argparse.Namespace) -> int:
     target = TARGETS[options.to]
     if options.undistort and not target.is_of_images:
-        raise ConfigError(f"--undistort: there are no images in an export to {options.to}")
+        raise ConfigError(f"--undistort: an export to {options.to} contains no images")
     if options.to == "rerun":
         import_rerun()
     job = _job(options, target)
@@ -152,22 +156,22 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
     figures, saved = read_metrics(directory), read_atlas(directory / MAP)
-    number = figures["world"] if options.world is None else options.world
-    worlds = {world.number: world for world in saved.worlds}
-    if not worlds:
-        raise ResultsError(f"{directory}: there is no map: {figures.get('failure', '')}")
-    if number not in worlds:
-        raise ResultsError(f"{directory}: no world {number}: there are {', '.join(map(str, worlds))}")
+    number = figures["submap"] if options.submap is None else options.submap
+    submaps = {submap.number: submap for submap in saved.atlas}
+    if not submaps:
+        raise ResultsError(f"{directory}: contains no map: {figures.get('failure', '')}")
+    if number not in submaps:
+        raise ResultsError(f"{directory}: no submap {number}: there are {', '.join(map(str, submaps))}")
     keyframes_alone = options.frames == "keyframes" or (options.frames is None and target.keyframes)
     source = None
     if target.is_of_images and not options.no_images:
         source = options.sequence or figures.get("source")
         if source is None:
-            raise ResultsError(f"{directory}: does not say where the images of the run are: {WITHOUT}")
+            raise ResultsError(f"{directory}: the location of the images is unknown: {WITHOUT}")
     return Job(
         directory=directory,
         figures=figures,
-        world=worlds[number],
+        submap=submaps[number],
         camera=saved.camera,
         output=options.output or directory / FOLDER / target.name,
         keyframes_alone=keyframes_alone,
@@ -181,7 +185,7 @@ def _make_way(output: Path, overwrite: bool) -> None:
     """Make the folder that an export goes to. Raises ResultsError where it would replace something."""
     is_taken = any(output.iterdir()) if output.is_dir() else output.exists()
     if is_taken and not overwrite:
-        raise ResultsError(f"{output}: is there already: --overwrite replaces it")
+        raise ResultsError(f"{output}: already exists; --overwrite replaces it")
     output.parent.mkdir(parents=True, exist_ok=True)
 
 
@@ -211,8 +215,8 @@ def _figures(job: Job, scene: Scene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
     frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
     if job.keyframes_alone:
-        posed = job.world.history.count(job.session)
-        frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all takes all of them"
+        posed = job.submap.posed_frames.count(job.session)
+        frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all exports all of them"
     return {
         "frames": frames,
         "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
@@ -221,9 +225,9 @@ def _figures(job: Job, scene: Scene) -> dict[str, str]:
 
 
 def _ply(job: Job) -> dict[str, str]:
-    write_map_cloud(job.output, job.world.map, job.session)
-    keyframes = len(keyframe_rows(job.world.map, job.session))
-    return {"points": f"{job.world.map.num_points}, and {keyframes} keyframes"}
+    write_map_cloud(job.output, job.submap.map, job.session)
+    keyframes = len(keyframe_rows(job.submap.map, job.session))
+    return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 
 
 def _tum(job: Job) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Say what would be read from a sequence: frames, size, rate, calibration, ground truth."""
+"""Describe a sequence: frames, size, rate, calibration, ground truth."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The command line: `torchslam run | batch | refine | demo | eval | plot | export | info | config | download`.
 
-Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialised or no frame be localised,
-4 some sequences of a batch with an error, 130 and 143 ended by Ctrl-C and by SIGTERM.
+Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialized or no frame could be
+localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ INTERRUPTED = 130
 
 # Module, and the first line of its docstring: only that of the command at hand is imported.
 COMMANDS = {
-    "run": ("run", "run SLAM on a sequence and write trajectory, map, figures and pictures"),
+    "run": ("run", "run SLAM on a sequence and write trajectory, map, metrics and plots"),
     "batch": (
         "batch",
-        "run many sequences, each once, with one table: alone, as shards of an array of jobs, or on Ray",
+        "run many sequences and write one table: in one process, as shards of a job array, or on Ray",
     ),
     "refine": (
         "refine",
-        "make poses of another program better by the images, and write them in the form that they had",
+        "refine the poses of another program from the images and write them in their original format",
     ),
     "demo": (
         "demo",
-        "render a room, run SLAM on it, evaluate and draw: the system in one command, without any data",
+        "run SLAM on a rendered room, evaluate and plot it: the whole system without any data",
     ),
     "eval": ("evaluate", "compare two trajectories in TUM format: absolute and relative errors"),
     "plot": (
         "plot",
-        "draw the pictures of a run and make its view.html again, from the files in its folder of results",
+        "redraw the plots and view.html of a run from its results folder",
     ),
     "export": (
         "export",
-        "give map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
+        "export map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
     ),
-    "info": ("info", "say what would be read from a sequence: frames, size, rate, calibration, ground truth"),
+    "info": ("info", "describe a sequence: frames, size, rate, calibration, ground truth"),
     "config": (
         "config",
-        "print every setting with what it is, its range and its default, as TOML that --config reads",
+        "print every setting with its description, range and default, as TOML for --config",
     ),
     "download": (
         "download",
-        "fetch a public sequence: with a progress bar, taking up a transfer that broke off",
+        "download a public sequence; an interrupted transfer is resumed",
     ),
 }
 

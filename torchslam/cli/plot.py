@@ -1,4 +1,4 @@
-"""Draw the pictures of a run and make its view.html again, from the files in its folder of results."""
+"""Redraw the plots and view.html of a run from its results folder."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class ProgressBar:
                 bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
             )
         self._adjusting.total = iterations
-        self._adjusting.update(iteration + 1 - self._adjusting.n)  # worlds begin anew
+        self._adjusting.update(iteration + 1 - self._adjusting.n)  # submaps begin anew
         self._stopping.check()
 
     def __enter__(self) -> ProgressBar:

@@ -184,7 +184,9 @@ def _describe_camera(refined: Refined, sequence: Sequence) -> str:
         against = contradiction(sequence.camera, found) or "the images do not contradict it"
         return f"focal length {focal:.1f} px, as given; {against}"
     std = found.std * focal
-    return f"focal length {focal:.1f} ± {std:.1f} px from the images, given {float(sequence.camera.focal):.1f}"
+    return (
+        f"focal length {focal:.1f} ± {std:.1f} px from the images, given {float(sequence.camera.focal):.1f}"
+    )
 
 
 def _describe_poses(refined: Refined, sequence: Sequence) -> dict[str, str]:

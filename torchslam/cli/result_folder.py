@@ -64,4 +64,4 @@ class Checkpoints:
         self._path.unlink(missing_ok=True)
 
     def _keyframes(self) -> int:
-        return sum(world.map.num_keyframes for world in self._run[0].worlds)
+        return sum(submap.map.num_keyframes for submap in self._run[0].atlas)

@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--map",
         type=Path,
         metavar="DIR|FILE",
-        help="continue a saved map: a map file, or a results folder, whose configuration is used unless --config is given",
+        help="continue a saved map: a map file, or a results folder, whose configuration is the default for --config",
     )
     parser.add_argument(
         "--localize", action="store_true", help="with --map: only localize, without changing the map"
@@ -122,7 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     if options.map is not None and (options.refine_camera or options.refine_distortion):
-        raise ConfigError("--refine-camera cannot be combined with --map: a map keeps the camera that it was built with")
+        raise ConfigError("--refine-camera cannot be combined with --map: a map keeps its camera")
     if options.localize and options.map is None:
         raise ConfigError("--localize requires --map")
     if options.view:

@@ -22,7 +22,7 @@ def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """Poses of a trajectory at other times, along the geodesic between the two neighbours in time.
+    """Poses of a trajectory at other times, along the geodesic between the two neighbors in time.
 
     timestamps (N,) seconds -> T_wc (N, 4, 4), valid (N,): whether some pose lies within `tolerance` seconds.
     Before the first and after the last pose the end pose is taken; invalid rows are finite.

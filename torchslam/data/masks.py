@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import size_text
 from torchslam.data.formats.frame_names import natural
-from torchslam.data.formats.image_file import SUFFIXES, read_grey
+from torchslam.data.formats.image_file import SUFFIXES, read_gray
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
 
@@ -47,15 +47,15 @@ class Masked(Transformed):
 
     def _read(self, path: Path) -> Tensor:
         try:
-            grey = read_grey(path, "--mask")
+            gray = read_gray(path, "--mask")
         except FrameError as error:
             raise SequenceError(str(error)) from error
-        size = (grey.shape[-1], grey.shape[-2])
+        size = (gray.shape[-1], gray.shape[-2])
         if size != self.size:
             raise SequenceError(
                 f"{path}: the mask is {size_text(size)}, the images are {size_text(self.size)}"
             )
-        return grey > 0
+        return gray > 0
 
 
 def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:

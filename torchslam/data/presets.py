@@ -14,7 +14,7 @@ def _published(size: Size, *numbers: float) -> Calibration:
 
 
 _CAMERAS: dict[str, tuple[Calibration, ...]] = {
-    # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, calibration of the colour cameras;
+    # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, calibration of the color cameras;
     # the images of fr3 are undistorted already.
     "tum-fr1": (_published(VGA, 517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),),
     "tum-fr2": (_published(VGA, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),),
@@ -32,7 +32,7 @@ _CAMERAS: dict[str, tuple[Calibration, ...]] = {
         _published((1242, 375), 721.5377, 721.5377, 609.5593, 172.854),
         _published((1226, 370), 707.0912, 707.0912, 601.8873, 183.1104),
     ),
-    # The dataset gives no calibration of the colour camera: 525 is the Kinect's nominal focal length.
+    # The dataset gives no calibration of the color camera: 525 is the Kinect's nominal focal length.
     "7-scenes": (replace(_published(VGA, 525.0, 525.0, 319.5, 239.5), guessed=True),),
     # https://github.com/castacks/tartanair_tools/blob/master/data_type.md (90 degrees over 640 pixels); the second
     # version of the dataset has the same angle over square images.

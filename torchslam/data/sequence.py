@@ -236,8 +236,9 @@ class Sequence(ABC):
 
     def _describe_camera(self) -> str:
         if self._camera is None:
-            is_live = self.known_length is None
-            return f"missing; {'--camera is required' if is_live else 'estimated from the images unless --camera is given'}"
+            if self.known_length is None:
+                return "missing; --camera is required"
+            return "missing; estimated from the images unless --camera is given"
         numbers = " ".join(f"{number:.6g}" for number in self._camera.params.tolist())
         guessed = " (guessed)" if self.calibrated is Calibrated.GUESSED else ""
         return f"{self._camera.model} {numbers}{guessed}"

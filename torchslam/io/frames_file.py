@@ -1,4 +1,4 @@
-"""What happened to every frame, as a CSV file: state, world, matches, inliers, reason and milliseconds per stage."""
+"""State of every frame as a CSV file: state, submap, matches, inliers, reason and milliseconds per stage."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torchslam.errors import ResultsError
 from torchslam.types import State, StepResult
 from torchslam.utils.bounded_read import read_text
 
-COLUMNS = ("index", "timestamp", "state", "world", "keyframe", "matches", "inliers", "reason")
+COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason")
 STAGE_SUFFIX = "_ms"
 MAX_BYTES = 1 << 28
 """Of two million frames."""
 
 
 def write_frames(path: str | Path, results: Sequence[StepResult]) -> None:
-    """Write one row per frame; what a frame does not have (a world, a stage) is left empty. Poses are in online.txt."""
+    """Write one row per frame; a missing submap or stage is an empty cell. The poses are in online.txt."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*COLUMNS, *(stage + STAGE_SUFFIX for stage in stages)])
         for result in results:
             times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
-            world = "" if result.world is None else result.world
-            row = [result.index, repr(result.timestamp), result.state.value, world]
+            submap = "" if result.submap is None else result.submap
+            row = [result.index, repr(result.timestamp), result.state.value, submap]
             writer.writerow(
                 [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, *times]
             )
@@ -52,7 +52,7 @@ def _result(row: dict[str, str], where: str) -> StepResult:
             timestamp=_finite(row["timestamp"]),
             state=State(row["state"]),
             T_cw=None,
-            world=int(row["world"]) if row["world"] else None,
+            submap=int(row["submap"]) if row["submap"] else None,
             is_keyframe=bool(int(row["keyframe"])),
             matches=int(row["matches"]),
             inliers=int(row["inliers"]),
@@ -69,7 +69,7 @@ def _result(row: dict[str, str], where: str) -> StepResult:
 
 def _check_counts(row: dict[str, str]) -> None:
     """Raises ValueError for a count that no run has, and where columns are missing."""
-    for name in ("index", "world", "keyframe", "matches", "inliers"):
+    for name in ("index", "submap", "keyframe", "matches", "inliers"):
         if row[name] and not 0 <= int(row[name]) < 1 << 31:
             raise ValueError(f"{name} is {int(row[name])}")
     if row["reason"] is None:

@@ -64,11 +64,11 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     certainty = [
         S[:3, :3] @ covariances_w @ S[:3, :3].mT
         for covariances_w in (
-            results.map.centre_covariances_w()[keyframe_rows(results.map, results.session)],
+            results.map.center_covariances_w()[keyframe_rows(results.map, results.session)],
             results.map.points["covariances_w"][ids],
         )
     ]
-    shown = keyframes if len(keyframes) else None  # a run that only localised: its frames' axes instead
+    shown = keyframes if len(keyframes) else None  # a run that only localized: its frames' axes instead
     yield "scene", plots.plot_scene(trajectory, points_w, truth, shown, unit, title)
     yield (
         "top_view",
@@ -86,19 +86,19 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
 
 
 def _which(results: Results) -> str:
-    """Which of several worlds, or which session, a picture shows; nothing where there is one of each."""
-    figures, worlds = results.metrics, len(results.metrics["worlds"])
-    of = f" of world {figures['world']}, the main one of {worlds}" if worlds > 1 else ""
+    """Which of several submaps, or which session, a picture shows; nothing where there is one of each."""
+    figures, submaps = results.metrics, len(results.metrics["submaps"])
+    of = f" of submap {figures['submap']}, the main one of {submaps}" if submaps > 1 else ""
     return of + (f", session {results.session}" if results.session else "")
 
 
 def _truth(results: Results) -> Trajectory | None:
-    """The ground truth from the first frame to the last, of the world that is shown: elsewhere it may go far away."""
+    """The ground truth from the first frame to the last, of the submap that is shown: elsewhere it may go far away."""
     truth, frames = results.groundtruth, results.frames
     if truth is None:
         return None
     start, end = frames[0].timestamp, frames[-1].timestamp
-    if len(results.metrics["worlds"]) > 1:
+    if len(results.metrics["submaps"]) > 1:
         start, end = results.trajectory.timestamps[[0, -1]].tolist()
     during = (truth.timestamps >= start) & (truth.timestamps <= end)
     return Trajectory(truth.timestamps[during], truth.T_wc[during])

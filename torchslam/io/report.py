@@ -1,4 +1,4 @@
-"""The figures of a run: as a dictionary for metrics.json, and as a table for people."""
+"""Metrics of a run: a dictionary for metrics.json and a summary table."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ FEW = 10
 def metrics(
     run: Run, evaluation: Evaluation | None = None, online_ate_m: float | None = None
 ) -> dict[str, Any]:
-    """The figures of a run.
+    """Compute the metrics of a run, the content of metrics.json.
 
-    frames counts all that the run met, unreadable ones included; posed those with a pose in the trajectory; uncertain
-    those whose pose was given as such, lost those that tracking gave up on; initialised_at is the index of the frame
-    that started the map, or None. posed, keyframes and points are of the main world, whose number is world, as far as
-    this run saw it; worlds has the counts of each world: see `world_counts`. session says which run over the map it is.
-    reprojection_px and track_length are of the main world, too: see `quality`.
-    Times are of `SLAM.step`, in milliseconds, image decoding apart; fps is their mean turned round. With ground
-    truth, the figures of the evaluation are added, and as online_ate_m that of the poses as they
-    were given, see `evaluation.ate_apart`.
+    - `frames`: frames of the run, unreadable ones included; `posed`: those with a pose in the trajectory;
+      `uncertain`: those whose pose was reported as uncertain; `lost`: those in which tracking was lost.
+    - `initialized_at`: index of the frame that initialized the map, or None.
+    - `submap`: number of the main submap; `posed`, `keyframes`, `points` and `quality` refer to it.
+    - `submaps`: counts of every submap, see `submap_counts`; `session`: number of the run on this map.
+    - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
+    - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online
+      (see `evaluation.ate_apart`).
     """
     totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
     start = None if run.failure else _start(run.results)
     figures: dict[str, Any] = {
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
-        "posed_share_after_initialisation": _posed_share(run, start),
+        "posed_ratio_after_initialization": _posed_share(run, start),
         "uncertain": sum(result.state is State.UNCERTAIN for result in run.results),
         "lost": sum(result.state is State.LOST for result in run.results),
-        "initialised_at": None if start is None else start.index,
+        "initialized_at": None if start is None else start.index,
         "keyframes": len(run.keyframes),
         "points": run.map.num_points,
         **quality(run),
         "session": run.session,
-        "world": None if run.main is None else run.main.number,
-        "worlds": world_counts(run),
+        "submap": None if run.main is None else run.main.number,
+        "submaps": submap_counts(run),
         "fps": 1e3 / mean(totals) if totals else 0.0,
         "ms_median": median(totals) if totals else 0.0,
         "ms_p95": float(torch.tensor(totals).quantile(0.95)) if totals else 0.0,
@@ -73,7 +73,7 @@ def quality(run: Run) -> dict[str, float | None]:
     found: dict[str, float | None] = {"reprojection_px": None, "track_length": None}
     if run.main is None or run.map.num_points == 0:
         return found
-    graph = run.history.graph(run.map, run.camera)
+    graph = run.posed_frames.graph(run.map, run.camera)
     rows = torch.nonzero(graph.sessions[graph.frame_index] == run.session)[:, 0]
     T_cw, points_w = graph.T_cw[graph.frame_index[rows]], graph.points_w[graph.point_index[rows]]
     pixels, valid = run.camera.project(transform(T_cw, points_w[:, None])[:, 0])
@@ -94,27 +94,27 @@ def result_warnings(figures: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def world_counts(run: Run) -> list[dict[str, int]]:
-    """Per world its number, keyframes and points, and of this run's frames those posed, uncertain and lost in it.
+def submap_counts(run: Run) -> list[dict[str, int]]:
+    """Per submap its number, keyframes and points, and of this run's frames those posed, uncertain and lost in it.
 
-    A frame is lost in the world in which the frame before it was posed, or lost.
+    A frame is lost in the submap in which the frame before it was posed, or lost.
     """
     uncertain, lost = Counter[int | None](), Counter[int | None]()
     last: int | None = None
     for result in run.results:
-        last = last if result.world is None else result.world
+        last = last if result.submap is None else result.submap
         uncertain[last] += result.state is State.UNCERTAIN
         lost[last] += result.state is State.LOST
     return [
         {
-            "world": world.number,
-            "keyframes": world.map.num_keyframes,
-            "points": world.map.num_points,
-            "posed": world.history.count(run.session),
-            "uncertain": uncertain[world.number],
-            "lost": lost[world.number],
+            "submap": submap.number,
+            "keyframes": submap.map.num_keyframes,
+            "points": submap.map.num_points,
+            "posed": submap.posed_frames.count(run.session),
+            "uncertain": uncertain[submap.number],
+            "lost": lost[submap.number],
         }
-        for world in run.worlds
+        for submap in run.submaps
     ]
 
 
@@ -138,11 +138,11 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
         rows["dropped"] = f"{figures['dropped']} frames (processing too slow)"
     if latency := figures.get("latency_ms"):
         rows["latency"] = f"{latency['median']:.0f} ms in the median, {latency['p95']:.0f} ms at 95 %"
-    if figures["initialised_at"] is None:
+    if figures["initialized_at"] is None:
         return rows | {"map": "none"}
     rows |= {
         "posed": f"{figures['posed']} ({figures['posed'] / frames:.1%}), "
-        f"{figures['posed_share_after_initialisation']:.1%} since the start at frame {figures['initialised_at']}",
+        f"{figures['posed_ratio_after_initialization']:.1%} since the start at frame {figures['initialized_at']}",
         "lost": f"{figures['lost']} frames; {figures['uncertain']} had an uncertain pose",
         "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
     }
@@ -161,19 +161,21 @@ def summary(figures: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _beside(figures: Mapping[str, Any]) -> dict[str, str]:
-    """The worlds beside the main one, and the sessions before this one, in words; nothing where there are none."""
+    """The submaps beside the main one, and the sessions before this one, in words; nothing where there are none."""
     rows = {}
     if figures["session"]:
-        (main,) = (world for world in figures["worlds"] if world["world"] == figures["world"])
+        (main,) = (submap for submap in figures["submaps"] if submap["submap"] == figures["submap"])
         rows["map"] = f"{main['keyframes']} keyframes, {main['points']} points"
         rows["session"] = f"{figures['session']}, which made {figures['keyframes']} of the keyframes"
     others = [
-        f"world {world['world']}: {world['posed']} frames posed, {world['keyframes']} keyframes"
-        for world in figures["worlds"]
-        if world["world"] != figures["world"]
+        f"submap {submap['submap']}: {submap['posed']} frames posed, {submap['keyframes']} keyframes"
+        for submap in figures["submaps"]
+        if submap["submap"] != figures["submap"]
     ]
     if others:
-        rows["world"] = f"{figures['world']}, the main one of {len(figures['worlds'])}; {'; '.join(others)}"
+        rows["submap"] = (
+            f"{figures['submap']}, the main one of {len(figures['submaps'])}; {'; '.join(others)}"
+        )
     return rows
 
 
@@ -188,7 +190,7 @@ def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
         "ATE": f"{figures['ate_m']:.4f} m RMSE{share}, Sim(3)-aligned; {figures['ate_se3_m']:.4f} m without the scale",
         **online,
         "RPE": f"{figures['rpe']['translation_m']:.4f} m, {figures['rpe']['rotation_deg']:.3f}° a frame",
-        "scale": f"{figures['scale']:.4f} true metres per map unit",
+        "scale": f"{figures['scale']:.4f} true meters per map unit",
         "path length": f"{length:.2f} m",
     }
 

@@ -14,22 +14,22 @@ import torch
 from torch import Tensor
 
 from torchslam.config import to_toml
-from torchslam.data.formats.image_file import read_grey
+from torchslam.data.formats.image_file import read_gray
 from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.frames_file import read_frames, write_frames
+from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.types import StepResult, Trajectory
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
 
 TRAJECTORY = "trajectory.txt"
-OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the world of that number
+OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
 ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
@@ -42,18 +42,18 @@ METRICS = "metrics.json"
 FRAMES = "frames.csv"
 EXAMPLE_IMAGE = "example.png"
 PLOTS = "plots"
-NEEDED = ("world", "worlds", "session", "posed", "keyframes")  # of metrics.json, to read and draw the rest
+NEEDED = ("submap", "submaps", "session", "posed", "keyframes")  # of metrics.json, to read and draw the rest
 
 
 @dataclass(frozen=True)
 class Results:
     """What a results folder holds, as far as pictures need it.
 
-    trajectory, keyframes: of the main world, camera to world, in the units of its map; without poses where none is
-    groundtruth:           in metres, where the sequence had it
-    others:                of the other worlds in which the run has poses, by their numbers
-    map:                   of the main world; empty where there is none
-    worlds, camera:        all of them, with their camera
+    trajectory, keyframes: of the main submap, camera to world, in the units of its map; without poses where none is
+    groundtruth:           in meters, where the sequence had it
+    others:                of the other submaps in which the run has poses, by their numbers
+    map:                   of the main submap; empty where there is none
+    submaps, camera:        all of them, with their camera
     frames:                one per frame, without poses
     metrics:               the content of metrics.json
     example_image:         (H, W) in [0, 1] of keyframe `example_keyframe(map, session)`, where it could be read
@@ -64,7 +64,7 @@ class Results:
     groundtruth: Trajectory | None
     others: dict[int, Trajectory]
     map: Map
-    worlds: tuple[Submap, ...]
+    submaps: tuple[Submap, ...]
     camera: Camera
     frames: list[StepResult]
     metrics: dict[str, Any]
@@ -87,13 +87,15 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
         old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
     write_trajectory(directory / ONLINE, run.online)
-    for world in run.worlds:
-        if world is not run.main and world.history.count(run.session):
-            write_trajectory(directory / OTHER_TRAJECTORY.format(world.number), world.trajectory(run.session))
+    for submap in run.submaps:
+        if submap is not run.main and submap.posed_frames.count(run.session):
+            write_trajectory(
+                directory / OTHER_TRAJECTORY.format(submap.number), submap.trajectory(run.session)
+            )
     write_trajectory(directory / KEYFRAMES, run.keyframes)
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
-    write_atlas(directory / MAP, run.worlds, run.camera, run.sessions)
+    write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
     write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
@@ -106,8 +108,8 @@ def read_results(directory: Path) -> Results:
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such folder of results")
     saved, figures = read_atlas(directory / MAP), read_metrics(directory)
-    main = [world.map for world in saved.worlds if world.number == figures["world"]]
-    beside = {world.number: directory / OTHER_TRAJECTORY.format(world.number) for world in saved.worlds}
+    main = [submap.map for submap in saved.atlas if submap.number == figures["submap"]]
+    beside = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
         trajectory=read_trajectory(directory / TRAJECTORY) if figures["posed"] else Trajectory.empty(),
@@ -115,11 +117,11 @@ def read_results(directory: Path) -> Results:
         groundtruth=read_trajectory(truth) if truth.exists() else None,
         others={number: read_trajectory(path) for number, path in beside.items() if path.exists()},
         map=main[0] if main else Map(),
-        worlds=tuple(saved.worlds),
+        submaps=tuple(saved.atlas),
         camera=saved.camera,
         frames=read_frames(directory / FRAMES),
         metrics=figures,
-        example_image=read_grey(example, str(example))[0, 0] if example.exists() else None,
+        example_image=read_gray(example, str(example))[0, 0] if example.exists() else None,
     )
 
 
@@ -149,16 +151,16 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
 
-def _are_worlds(value: object) -> bool:
+def _are_submaps(value: object) -> bool:
     return isinstance(value, list) and all(
-        isinstance(world, dict) and _is_count(world.get("world")) for world in value
+        isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in value
     )
 
 
 # What is read of metrics.json again, and what it must be.
 _FIGURES: dict[str, Callable[[Any], bool]] = {
-    "world": lambda value: value is None or _is_count(value),
-    "worlds": _are_worlds,
+    "submap": lambda value: value is None or _is_count(value),
+    "submaps": _are_submaps,
     "ate_m": _is_number,
     **dict.fromkeys(("session", "posed", "keyframes"), _is_count),
     "failure": lambda value: isinstance(value, str),

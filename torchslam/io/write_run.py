@@ -32,7 +32,7 @@ def write_run(
         plots: whether to draw the plots.
         viewer: whether to write the viewer page.
     """
-    colorize_points([world.map for world in run.worlds], sequence, run.session)
+    colorize_points([submap.map for submap in run.submaps], sequence, run.session)
     write_results(run, sequence, figures, folder)
     if not (plots or viewer):
         return

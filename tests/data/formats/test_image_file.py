@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchslam.data.formats.image_file import read_grey
+from torchslam.data.formats.image_file import read_gray
 from torchslam.errors import FrameError
 
 
@@ -29,17 +29,17 @@ def test_end_of_a_thumbnail_is_not_the_end_of_the_image(jpeg: Path) -> None:
     data = jpeg.read_bytes()
     both = _with_thumbnail(data, data)
     jpeg.write_bytes(both)
-    assert read_grey(jpeg, "here").shape == (1, 1, 48, 64)
+    assert read_gray(jpeg, "here").shape == (1, 1, 48, 64)
     jpeg.write_bytes(both[:-100])
     with pytest.raises(FrameError, match=r"here: .*image\.jpg is truncated"):
-        read_grey(jpeg, "here")
+        read_gray(jpeg, "here")
 
 
 def test_padding_after_the_end_and_before_markers_is_fine(jpeg: Path) -> None:
     data = jpeg.read_bytes()
-    image = read_grey(jpeg, "here")
+    image = read_gray(jpeg, "here")
     jpeg.write_bytes(data[:2] + b"\xff\xff" + data[2:] + bytes(512))
-    assert torch.equal(read_grey(jpeg, "here"), image)
+    assert torch.equal(read_gray(jpeg, "here"), image)
 
 
 def test_damaged_png(tmp_path: Path, write_picture: Callable) -> None:
@@ -49,18 +49,18 @@ def test_damaged_png(tmp_path: Path, write_picture: Callable) -> None:
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(bytes(data))
     with pytest.raises(FrameError, match="damaged"):
-        read_grey(path, "here")
+        read_gray(path, "here")
 
 
 def test_header_that_promises_too_much(tmp_path: Path) -> None:
     path = tmp_path / "image.pgm"
     path.write_bytes(b"P5\n3000000 3000000\n255\n" + bytes(100))
     with pytest.raises(FrameError, match="not an image"):
-        read_grey(path, "here")
+        read_gray(path, "here")
 
 
-def test_colour_becomes_grey_in_unit_range(tmp_path: Path, write_picture: Callable) -> None:
+def test_color_becomes_gray_in_unit_range(tmp_path: Path, write_picture: Callable) -> None:
     write_picture(tmp_path / "image.png")
-    image = read_grey(tmp_path / "image.png", "here")
+    image = read_gray(tmp_path / "image.png", "here")
     assert image.dtype == torch.float32
     assert 0 <= float(image.min()) < float(image.max()) <= 1

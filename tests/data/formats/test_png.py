@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from torchslam.data.formats.image_file import AS_GREY, decode_pixels
-from torchslam.data.formats.png import decode_grey
+from torchslam.data.formats.image_file import AS_GRAY, decode_pixels
+from torchslam.data.formats.png import decode_gray
 
 
 def by_opencv(data: bytes) -> np.ndarray | None:
-    return cv2.imdecode(np.frombuffer(data, np.uint8), AS_GREY)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), AS_GRAY)
 
 
 def encoded(image: np.ndarray, **options: object) -> bytes:
@@ -34,39 +34,39 @@ def test_same_pixels_as_opencv(shape: tuple[int, ...], dtype: type, seed: int) -
     noise = np.random.default_rng(seed).integers(0, np.iinfo(dtype).max + 1, shape)
     image: np.ndarray = noise.astype(dtype)
     data = encoded(image)
-    grey = decode_grey(data)
-    assert grey is not None
-    assert grey.dtype == dtype
-    np.testing.assert_array_equal(grey, by_opencv(data))
+    gray = decode_gray(data)
+    assert gray is not None
+    assert gray.dtype == dtype
+    np.testing.assert_array_equal(gray, by_opencv(data))
 
 
-def test_every_mixture_of_colours_is_the_grey_that_opencv_makes_of_it() -> None:
+def test_every_mixture_of_colors_is_the_gray_that_opencv_makes_of_it() -> None:
     levels = np.arange(0, 256, 5, dtype=np.uint8)
-    colours = np.stack(np.meshgrid(levels, levels, np.arange(256, dtype=np.uint8), indexing="ij"), -1)
-    data = encoded(colours.reshape(len(levels), -1, 3))
-    np.testing.assert_array_equal(decode_grey(data), by_opencv(data))
+    colors = np.stack(np.meshgrid(levels, levels, np.arange(256, dtype=np.uint8), indexing="ij"), -1)
+    data = encoded(colors.reshape(len(levels), -1, 3))
+    np.testing.assert_array_equal(decode_gray(data), by_opencv(data))
 
 
 def test_text_in_front_of_the_pixels_changes_nothing() -> None:
     text = PngImagePlugin.PngInfo()
     text.add_text("camera", "left")
     image = np.arange(256, dtype=np.uint8).reshape(8, 32)
-    np.testing.assert_array_equal(decode_grey(encoded(image, pnginfo=text, dpi=(72, 72))), image)
+    np.testing.assert_array_equal(decode_gray(encoded(image, pnginfo=text, dpi=(72, 72))), image)
 
 
 def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
-    colours = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
+    colors = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
     gamma = PngImagePlugin.PngInfo()
     gamma.add(b"gAMA", (45455).to_bytes(4, "big"))
     for data in (
-        encoded(colours, pnginfo=gamma),
-        encoded(np.dstack([colours, colours[..., :1]])),  # transparent
+        encoded(colors, pnginfo=gamma),
+        encoded(np.dstack([colors, colors[..., :1]])),  # transparent
         encoded(np.eye(8, dtype=bool)),  # of one bit
-        cv2.imencode(".jpg", colours)[1].tobytes(),
+        cv2.imencode(".jpg", colors)[1].tobytes(),
         b"",
     ):
-        assert decode_grey(data) is None
-    data = encoded(colours, pnginfo=gamma)
+        assert decode_gray(data) is None
+    data = encoded(colors, pnginfo=gamma)
     np.testing.assert_array_equal(decode_pixels(data), by_opencv(data))
 
 
@@ -75,10 +75,10 @@ def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
 def test_damage_is_never_read_as_something_else(at: int, value: int, lost: int) -> None:
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[at % len(data)] = value
-    grey = decode_grey(bytes(data[: len(data) - lost % len(data)]))
-    if grey is not None:
+    gray = decode_gray(bytes(data[: len(data) - lost % len(data)]))
+    if gray is not None:
         theirs = by_opencv(bytes(data))
-        assert theirs is None or np.array_equal(grey, theirs)
+        assert theirs is None or np.array_equal(gray, theirs)
 
 
 @settings(max_examples=200, deadline=None)
@@ -87,8 +87,8 @@ def test_headers_that_promise_something_else_are_left_to_opencv(width: int, heig
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[16:29] = width.to_bytes(4, "big") + height.to_bytes(4, "big") + kind
     data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
-    grey, theirs = decode_grey(bytes(data)), by_opencv(bytes(data))
-    assert grey is None or theirs is None or np.array_equal(grey, theirs)
+    gray, theirs = decode_gray(bytes(data)), by_opencv(bytes(data))
+    assert gray is None or theirs is None or np.array_equal(gray, theirs)
 
 
 def test_a_header_that_promises_too_much_is_not_decoded() -> None:

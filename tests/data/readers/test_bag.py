@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchslam.data import Calibrated, open_sequence
-from torchslam.data.readers.bag import COLOURS, to_grey
+from torchslam.data.readers.bag import COLORS, to_gray
 from torchslam.errors import CalibrationError, SequenceError
 
 pytest.importorskip("rosbags")
@@ -225,39 +225,39 @@ class Image:
         self.height, self.is_bigendian = data.shape[0], big
 
 
-@pytest.mark.parametrize("encoding", [each for each in COLOURS if COLOURS[each][0] > 2])
-def test_colours(encoding: str) -> None:
-    channels = COLOURS[encoding][0]
+@pytest.mark.parametrize("encoding", [each for each in COLORS if COLORS[each][0] > 2])
+def test_colors(encoding: str) -> None:
+    channels = COLORS[encoding][0]
     image = np.zeros((2, 5, channels), np.uint8)  # padded to rows of five pixels
     image[:, :, encoding.find("r") if "r" in encoding else 2] = 100
-    grey = to_grey(Image(image, encoding, 4, 5 * channels), "here")
-    assert grey.shape == (2, 4)
-    assert np.abs(grey - 0.299 * 100).max() <= 1
+    gray = to_gray(Image(image, encoding, 4, 5 * channels), "here")
+    assert gray.shape == (2, 4)
+    assert np.abs(gray - 0.299 * 100).max() <= 1
 
 
 @pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
 def test_luma(encoding: str, luma: int) -> None:
     image = np.full((2, 4, 2), 128, np.uint8)
     image[..., luma] = np.arange(8).reshape(2, 4) * 10 + 50
-    assert to_grey(Image(image, encoding, 4, 8), "here").tolist() == image[..., luma].tolist()
+    assert to_gray(Image(image, encoding, 4, 8), "here").tolist() == image[..., luma].tolist()
 
 
 @pytest.mark.parametrize(
     ("encoding", "place"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))]
 )
 def test_bayer(encoding: str, place: tuple[int, int]) -> None:
-    """Where only red pixels see something, the image is red, of which 0.299 is grey."""
+    """Where only red pixels see something, the image is red, of which 0.299 is gray."""
     image = np.zeros((16, 16), np.uint8)
     image[place[0] :: 2, place[1] :: 2] = 200
-    grey = to_grey(Image(image, f"bayer_{encoding}8", 16, 16), "here")
-    assert float(grey[4:-4, 4:-4].mean()) == pytest.approx(0.299 * 200, abs=1.5)
+    gray = to_gray(Image(image, f"bayer_{encoding}8", 16, 16), "here")
+    assert float(gray[4:-4, 4:-4].mean()) == pytest.approx(0.299 * 200, abs=1.5)
 
 
 def test_bytes_the_other_way_round() -> None:
     image = (np.arange(8).reshape(2, 4) * 1000).astype(">u2")
-    grey = to_grey(Image(image, "mono16", 4, 8, big=1), "here")
-    assert grey.dtype == np.uint16
-    assert grey.tolist() == image.tolist()
+    gray = to_gray(Image(image, "mono16", 4, 8, big=1), "here")
+    assert gray.dtype == np.uint16
+    assert gray.tolist() == image.tolist()
 
 
 @pytest.mark.parametrize(
@@ -270,4 +270,4 @@ def test_bytes_the_other_way_round() -> None:
 )
 def test_wrong_images(message: Image, error: str) -> None:
     with pytest.raises(SequenceError, match=f"here: .*{error}"):
-        to_grey(message, "here")
+        to_gray(message, "here")

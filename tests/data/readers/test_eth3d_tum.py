@@ -29,8 +29,8 @@ def test_reads_frames_camera_and_groundtruth(tum_folder: Folder) -> None:
     assert (frame.index, frame.timestamp) == (2, 1000.2)
     assert frame.image.shape == (1, 1, 48, 64)
     assert frame.image.dtype == torch.float32
-    grey = cv2.imread(str(folder / "rgb" / "2.png"), cv2.IMREAD_GRAYSCALE)
-    assert torch.equal(frame.image[0, 0], torch.from_numpy(grey).float() / 255)
+    gray = cv2.imread(str(folder / "rgb" / "2.png"), cv2.IMREAD_GRAYSCALE)
+    assert torch.equal(frame.image[0, 0], torch.from_numpy(gray).float() / 255)
     assert frame.T_cw_groundtruth is not None
     torch.testing.assert_close(frame.T_cw_groundtruth[:3, 3], torch.tensor([-0.2, 0, 0], dtype=torch.float64))
 

@@ -17,7 +17,7 @@ P2 = "P2: 70 0 31 4.2 0 71 23 0 0 0 1 0"
 
 @pytest.fixture
 def folder(tmp_path: Path, write_picture: Callable) -> Path:
-    """dataset/sequences/03 with three grey images, and dataset/poses/03.txt."""
+    """dataset/sequences/03 with three gray images, and dataset/poses/03.txt."""
     folder = tmp_path / "dataset" / "sequences" / "03"
     for index in range(3):
         write_picture(folder / "image_0" / f"{index:06d}.png", index)
@@ -44,7 +44,7 @@ def test_reads_frames_camera_and_poses(folder: Path) -> None:
     )
 
 
-def test_poses_are_those_of_the_colour_camera(folder: Path) -> None:
+def test_poses_are_those_of_the_color_camera(folder: Path) -> None:
     (folder / "image_0").rename(folder / "image_2")
     sequence = open_sequence(folder)
     # P2 = K [I | t] with t_x = 4.2 / 70 m: the camera sits 6 cm to the left, seen in its own axes.

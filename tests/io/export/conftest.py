@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from tests.sample_run import camera as camera
-from tests.sample_run import results, run, slam_map, trajectory, world
+from tests.sample_run import results, run, slam_map, submap, trajectory
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.io.export.scene import Scene
 
-__all__ = ["results", "run", "slam_map", "trajectory", "world"]
+__all__ = ["results", "run", "slam_map", "submap", "trajectory"]
 
 SIZE = (320, 240)
 PINHOLE = (200.0, 210.0, 158.0, 121.5)

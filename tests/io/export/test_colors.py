@@ -25,7 +25,7 @@ class Painted(Walk):
         return image
 
 
-def test_colours_are_the_mean_over_what_keyframes_see(slam_map: Map) -> None:
+def test_colors_are_the_mean_over_what_keyframes_see(slam_map: Map) -> None:
     keypoints = slam_map.keyframes["keypoints"]
     keypoints[:, :, 0].clamp_(max=SIZE[0] - 1)
     keypoints[:, :, 1].clamp_(max=SIZE[1] - 1)
@@ -39,7 +39,7 @@ def test_colours_are_the_mean_over_what_keyframes_see(slam_map: Map) -> None:
     assert slam_map.points["colors"][3].tolist() == [0, 0, 0]  # nobody sees a dead point
 
 
-def test_other_sessions_and_missing_images_leave_colours_as_they_are(slam_map: Map) -> None:
+def test_other_sessions_and_missing_images_leave_colors_as_they_are(slam_map: Map) -> None:
     slam_map.keyframes["session"][1:] = 1
     slam_map.points["colors"][:] = 77
     sequence = Painted(arc(30))
@@ -52,7 +52,7 @@ def test_other_sessions_and_missing_images_leave_colours_as_they_are(slam_map: M
     assert torch.equal(painted, torch.unique(seen))
 
 
-def test_keypoints_beyond_the_last_pixel_take_its_colour(slam_map: Map) -> None:
+def test_keypoints_beyond_the_last_pixel_take_its_color(slam_map: Map) -> None:
     slam_map.keyframes["keypoints"][:] = torch.tensor((SIZE[0] - 0.4, SIZE[1] - 0.4), dtype=torch.float64)
     colorize_points([slam_map], Painted(arc(30)), session=0)
     alive = slam_map.valid_points()

@@ -96,7 +96,7 @@ def test_a_sequence_that_is_gone_is_named(seen: Scene, tmp_path: Path) -> None:
         open_images(str(tmp_path / "nowhere"), seen)
 
 
-def test_a_video_has_colours_at_every_frame(seen: Scene, tmp_path: Path) -> None:
+def test_a_video_has_colors_at_every_frame(seen: Scene, tmp_path: Path) -> None:
     path = str(tmp_path / "film.avi")
     video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10.0, seen.camera.size)
     for index in range(FRAMES):
@@ -108,7 +108,7 @@ def test_a_video_has_colours_at_every_frame(seen: Scene, tmp_path: Path) -> None
         assert np.abs(images.bgr(index).astype(int) - picture(index, seen.camera)).mean() < 4
 
 
-def test_a_rendered_sequence_is_grey_three_times() -> None:
+def test_a_rendered_sequence_is_gray_three_times() -> None:
     sequence = open_sequence("synthetic:room?frames=2&blank=1").part(1)
     assert sequence.color(0).shape == (480, 640, 3)
     assert sequence.color(0).unique().tolist() == [128]

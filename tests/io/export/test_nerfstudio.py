@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.io.export.conftest import reprojection_error
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import VERTEX
 from torchslam.io.export.scene import Scene
@@ -50,7 +50,7 @@ def test_points_fall_on_their_keypoints(scene: Scene, folder: Path) -> None:
         x, y, z = ((points[ids] - T_wc[:3, 3]) @ T_wc[:3, :3]).T
         x, y = distort(about, x / -z, -y / -z)
         u, v = about["fl_x"] * x + about["cx"], about["fl_y"] * y + about["cy"]
-        keypoints = scene.pixels.numpy()[seen] + 0.5  # nerfstudio's pixel centres
+        keypoints = scene.pixels.numpy()[seen] + 0.5  # nerfstudio's pixel centers
         np.add.at(total, ids, np.hypot(u - keypoints[:, 0], v - keypoints[:, 1]))
         np.add.at(count, ids, 1)
     assert np.mean(total / count) == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
@@ -65,11 +65,11 @@ def test_the_world_is_upright_and_says_how(scene: Scene, folder: Path) -> None:
     assert "applied_transform" not in about  # versions of nerfstudio differ in what they apply it to
 
 
-def test_the_cloud_has_the_colours_and_the_frames_their_images(scene: Scene, folder: Path) -> None:
+def test_the_cloud_has_the_colors_and_the_frames_their_images(scene: Scene, folder: Path) -> None:
     about = json.loads((folder / "transforms.json").read_text())
     cloud = read_cloud(folder / "sparse_pc.ply")
-    colours = np.stack([cloud[name] for name in ("red", "green", "blue")], axis=1)
-    np.testing.assert_array_equal(colours, scene.colors)
+    colors = np.stack([cloud[name] for name in ("red", "green", "blue")], axis=1)
+    np.testing.assert_array_equal(colors, scene.colors)
     assert [frame["file_path"] for frame in about["frames"]] == [
         f"images/{name}" for name in scene.image_names
     ]

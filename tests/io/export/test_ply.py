@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchslam.geometry import rigid, se3_inverse, so3_exp
-from torchslam.io.export.ply import CAMERA_COLOUR, VERTEX, write_map_cloud, write_ply
+from torchslam.io.export.ply import CAMERA_COLOR, VERTEX, write_map_cloud, write_ply
 from torchslam.map.map import Map
 
 
@@ -22,10 +22,10 @@ def columns(vertices: np.ndarray, *names: str) -> np.ndarray:
 def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator) -> None:
     points_w = torch.randn(5, 3, generator=generator, dtype=torch.float64)
     normals_w = torch.randn(5, 3, generator=generator, dtype=torch.float64)
-    centres_w = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    centers_w = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     colors = torch.randint(0, 256, (5, 3), generator=generator, dtype=torch.uint8)
     observations = torch.tensor([2, 3, 5, 10, 40])
-    write_ply(tmp_path / "map.ply", points_w, colors, centres_w, normals_w, observations)
+    write_ply(tmp_path / "map.ply", points_w, colors, centers_w, normals_w, observations)
     header = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")[0]
     lines = header.decode("ascii").splitlines()
     assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 7"]
@@ -36,12 +36,12 @@ def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator
     ]
     vertices = read(tmp_path / "map.ply")
     positions = columns(vertices, "x", "y", "z")
-    np.testing.assert_allclose(positions, torch.cat([points_w, centres_w]).numpy(), rtol=1e-6)
+    np.testing.assert_allclose(positions, torch.cat([points_w, centers_w]).numpy(), rtol=1e-6)
     np.testing.assert_allclose(columns(vertices, "nx", "ny", "nz")[:5], normals_w.numpy(), rtol=1e-6)
     assert vertices["observations"].tolist() == [2, 3, 5, 10, 40, 0, 0]
     seen = columns(vertices, "red", "green", "blue")
     np.testing.assert_array_equal(seen[:5], colors.numpy())
-    assert seen[5:].tolist() == [list(CAMERA_COLOUR)] * 2
+    assert seen[5:].tolist() == [list(CAMERA_COLOR)] * 2
 
 
 def test_another_program_reads_it(tmp_path: Path, generator: torch.Generator) -> None:
@@ -74,8 +74,8 @@ def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
         (("nx", "ny", "nz"), -slam_map.points["view_directions_w"][alive]),
     ):
         np.testing.assert_allclose(columns(points, *names), expected @ R.mT, atol=1e-5)
-    centres_w = se3_inverse(slam_map.T_cw)[:4, :3, 3]
-    np.testing.assert_allclose(columns(cameras, "x", "y", "z"), centres_w @ R.mT, atol=1e-6)
+    centers_w = se3_inverse(slam_map.T_cw)[:4, :3, 3]
+    np.testing.assert_allclose(columns(cameras, "x", "y", "z"), centers_w @ R.mT, atol=1e-6)
 
 
 def test_the_same_map_in_a_turned_world_stands_as_high(tmp_path: Path, slam_map: Map) -> None:

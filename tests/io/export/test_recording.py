@@ -14,7 +14,7 @@ import pytest
 from tests.io.export.conftest import reprojection_error
 from tests.walks import Walk, arc
 from torchslam.errors import ResultsError
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.images import Images
 from torchslam.io.export.recording import import_rerun, write_recording
 from torchslam.io.export.scene import Scene
@@ -75,8 +75,8 @@ def test_points_fall_on_their_keypoints(flat: Scene, recorded: Rows) -> None:
         pixels = (in_camera / in_camera[:, 2:]) @ K.T
         np.add.at(total, ids, np.hypot(*(pixels[:, :2] - np.array(keypoints)).T))
         np.add.at(count, ids, 1)
-        centred = flat.pixels[flat.frame_index == row].numpy() + 0.5  # the corner of the image is the origin
-        np.testing.assert_allclose(keypoints, centred, atol=1e-3)
+        centered = flat.pixels[flat.frame_index == row].numpy() + 0.5  # the corner of the image is the origin
+        np.testing.assert_allclose(keypoints, centered, atol=1e-3)
     expected = reprojection_error(only_keyframes(flat))
     assert np.mean(total / count) == pytest.approx(expected, abs=1e-3)
 
@@ -91,7 +91,7 @@ def only_keyframes(scene: Scene) -> Scene:
     )
 
 
-def test_keypoints_have_the_colours_of_their_points(flat: Scene, recorded: Rows) -> None:
+def test_keypoints_have_the_colors_of_their_points(flat: Scene, recorded: Rows) -> None:
     frame, colors = recorded["/world/keyframe/keypoints", "Points2D:colors"][-1]
     ids = flat.point_index[flat.frame_index == flat.frame_ids.tolist().index(frame)]
     red = np.array(colors, dtype=np.uint32) >> 24  # red, green, blue, opacity

@@ -31,7 +31,7 @@ from torchslam.types import State, StepResult
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
 FRAMES = 12
-GREY = 90
+GRAY = 90
 
 
 class Pictured(Walk):
@@ -44,7 +44,7 @@ class Pictured(Walk):
     def image(self, index: int) -> torch.Tensor:
         self.reads[index] += 1
         width, height = self.size
-        return torch.full((1, 1, height, width), GREY / 255)
+        return torch.full((1, 1, height, width), GRAY / 255)
 
 
 class Kept:
@@ -78,7 +78,7 @@ def test_screens_see_every_frame_once() -> None:
     run = watched(slam, walk, kept)
     assert walk.reads == [1] * FRAMES
     assert [glimpse.result for glimpse in kept.glimpses] == run.results
-    assert all((glimpse.image == GREY).all() for glimpse in kept.glimpses)
+    assert all((glimpse.image == GRAY).all() for glimpse in kept.glimpses)
     assert (kept.runs, kept.closed) == ([run], 1)
     for glimpse in kept.glimpses:
         count = glimpse.result.inliers
@@ -128,9 +128,9 @@ def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, dist
     posed = [result for result in run.results if result.T_cw is not None]
     translations = rows["/world/camera", "Transform3D:translation"]
     assert [frame for frame, _ in translations] == [result.index for result in posed]
-    centres = np.array([value for _, value in translations]).reshape(-1, 3)
+    centers = np.array([value for _, value in translations]).reshape(-1, 3)
     given = torch.stack([result.T_cw for result in posed if result.T_cw is not None])
-    np.testing.assert_allclose(centres, se3_inverse(given)[:, :3, 3].numpy(), atol=1e-6)
+    np.testing.assert_allclose(centers, se3_inverse(given)[:, :3, 3].numpy(), atol=1e-6)
     ((_, points),) = rows["/world/points", "Points3D:positions"][-1:]
     ids = run.map.valid_points()
     np.testing.assert_allclose(np.array(points), run.map.positions_w[ids].numpy(), atol=1e-5)
@@ -194,9 +194,9 @@ def frames_of(path: Path) -> list[np.ndarray]:
 
 
 def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> None:
-    grey = np.full((120, 1920), GREY, np.uint8)
+    gray = np.full((120, 1920), GRAY, np.uint8)
     result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
-    glimpse = FrameSnapshot(result, grey, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
+    glimpse = FrameSnapshot(result, gray, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
     film = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
     for shown in (glimpse, replace(glimpse, tracked=torch.zeros(0, 2))):
         film.show(shown)
@@ -206,7 +206,7 @@ def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> Non
     marked, unmarked = first[24:37, 494:507], second[24:37, 494:507]
     green = marked[..., 1] - marked[..., 2]
     assert green.max() > 30
-    assert abs(unmarked - GREY).max() < 15
+    assert abs(unmarked - GRAY).max() < 15
     assert (first[60:] > 120).any()  # the words
 
 

@@ -32,7 +32,7 @@ MAX_BYTES = 8 * 2**20
 
 @pytest.fixture
 def kept(tmp_path: Path, run: Run, generator: torch.Generator) -> Results:
-    """As read from a folder; the points have colours."""
+    """As read from a folder; the points have colors."""
     colors = run.map.points["colors"]
     colors[:] = torch.randint(1, 256, colors.shape, generator=generator, dtype=torch.uint8)
     write(run, tmp_path)
@@ -65,22 +65,22 @@ def test_the_page_loads_nothing(kept: Results) -> None:
 
 def test_the_page_holds_the_map_and_the_path(kept: Results) -> None:
     data = data_of(page(kept))
-    (world,) = data["worlds"]
-    S = torch.tensor(world["S_shown_map"], dtype=torch.float64)
+    (submap,) = data["submaps"]
+    S = torch.tensor(submap["S_shown_map"], dtype=torch.float64)
     assert torch.linalg.det(S[:3, :3]) == pytest.approx(1.0)
     ids = kept.map.valid_points()
     points = transform(S, kept.map.positions_w[ids]).numpy()
-    np.testing.assert_allclose(array(world["points"], 3), points, atol=1e-5)
-    np.testing.assert_array_equal(array(world["colors"], 3), kept.map.points["colors"][ids].numpy())
-    poses = array(world["poses"], 3, 4)
+    np.testing.assert_allclose(array(submap["points"], 3), points, atol=1e-5)
+    np.testing.assert_array_equal(array(submap["colors"], 3), kept.map.points["colors"][ids].numpy())
+    poses = array(submap["poses"], 3, 4)
     expected = (S @ kept.trajectory.T_wc).numpy()[:, :3]
     np.testing.assert_allclose(poses, expected, atol=1e-5)
     assert (poses[:, 2, 1] < -0.99).all()  # y of the cameras, down, against z of the page, up
-    assert decoded(world["frame"]).tolist() == [*range(3, 18), *range(22, 30)]
-    assert decoded(world["keyframe"]).tolist() == [0, 5, 10, 15, 20, 25]
+    assert decoded(submap["frame"]).tolist() == [*range(3, 18), *range(22, 30)]
+    assert decoded(submap["keyframe"]).tolist() == [0, 5, 10, 15, 20, 25]
     keyframes = (S @ kept.keyframes.T_wc).numpy()[:, :3]
-    np.testing.assert_allclose(array(world["keyframe_poses"], 3, 4), keyframes, atol=1e-5)
-    box = np.array(world["box"])
+    np.testing.assert_allclose(array(submap["keyframe_poses"], 3, 4), keyframes, atol=1e-5)
+    box = np.array(submap["box"])
     np.testing.assert_allclose(box.mean(axis=0), 0.0, atol=1e-9)
     assert (poses[:, :, 3] > box[0]).all()
     assert (poses[:, :, 3] < box[1]).all()
@@ -101,59 +101,59 @@ def test_the_page_holds_what_happened_to_every_frame(kept: Results) -> None:
     np.testing.assert_allclose(corners[[0, 1, 3], :2] / corners[2, :2], [[-1, -1], [1, -1], [-1, 1]])
 
 
-def test_with_ground_truth_lengths_are_metres_and_errors_known(kept: Results) -> None:
+def test_with_ground_truth_lengths_are_meters_and_errors_known(kept: Results) -> None:
     T_wc = kept.trajectory.T_wc.clone()
     T_wc[:, :3, 3] = 2 * T_wc[:, :3, 3] + 1e6  # far away, as in a map of a country
     T_wc[4, 1, 3] += 0.1
     aligned = replace(kept, groundtruth=Trajectory(kept.trajectory.timestamps, T_wc))
-    (world,) = data_of(page(aligned))["worlds"]
-    assert world["unit"] == "m"
-    S = torch.tensor(world["S_shown_map"], dtype=torch.float64)
+    (submap,) = data_of(page(aligned))["submaps"]
+    assert submap["unit"] == "m"
+    S = torch.tensor(submap["S_shown_map"], dtype=torch.float64)
     assert torch.linalg.det(S[:3, :3]) == pytest.approx(8.0, rel=0.05)
-    errors, poses, truth = decoded(world["errors"]), array(world["poses"], 3, 4), array(world["truth"], 3)
+    errors, poses, truth = decoded(submap["errors"]), array(submap["poses"], 3, 4), array(submap["truth"], 3)
     np.testing.assert_allclose(np.linalg.norm(poses[:, :, 3] - truth, axis=1), errors, atol=2e-5)
     assert errors.argmax() == 4
     assert errors[4] == pytest.approx(0.1, rel=0.15)
 
 
 def test_without_ground_truth_there_are_no_errors(kept: Results) -> None:
-    (world,) = data_of(page(kept))["worlds"]
-    assert np.isnan(decoded(world["errors"])).all()
-    assert world["unit"] == ""
-    assert len(decoded(world["truth"])) == 0
+    (submap,) = data_of(page(kept))["submaps"]
+    assert np.isnan(decoded(submap["errors"])).all()
+    assert submap["unit"] == ""
+    assert len(decoded(submap["truth"])) == 0
 
 
 def test_the_path_is_broken_where_poses_are_missing(kept: Results) -> None:
     keep = torch.ones(len(kept.trajectory), dtype=torch.bool)
     keep[3:9] = False
     path = Trajectory(kept.trajectory.timestamps[keep], kept.trajectory.T_wc[keep])
-    (world,) = data_of(page(replace(kept, trajectory=path)))["worlds"]
-    assert world["breaks"] == [3]
+    (submap,) = data_of(page(replace(kept, trajectory=path)))["submaps"]
+    assert submap["breaks"] == [3]
     steps = path.positions_w.diff(dim=0).norm(dim=-1)
-    assert world["path_length"] == pytest.approx(float(steps.sum() - steps[2]), rel=1e-6)
+    assert submap["path_length"] == pytest.approx(float(steps.sum() - steps[2]), rel=1e-6)
 
 
-def test_a_map_that_has_seen_no_image_has_no_colours(kept: Results) -> None:
+def test_a_map_that_has_seen_no_image_has_no_colors(kept: Results) -> None:
     kept.map.points["colors"][:] = 0
-    (world,) = data_of(page(kept))["worlds"]
-    assert world["colors"]["data"] == ""
+    (submap,) = data_of(page(kept))["submaps"]
+    assert submap["colors"]["data"] == ""
 
 
 def test_large_maps_and_long_runs_are_thinned(kept: Results, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view_data, "MAX_POINTS", 50)
     monkeypatch.setattr(view_data, "MAX_FRAMES", 10)
     data = data_of(page(kept))
-    (world,) = data["worlds"]
-    assert len(array(world["points"], 3)) == len(array(world["colors"], 3)) == 50
-    assert world["points_total"] == kept.map.num_points
+    (submap,) = data["submaps"]
+    assert len(array(submap["points"], 3)) == len(array(submap["colors"], 3)) == 50
+    assert submap["points_total"] == kept.map.num_points
     index = decoded(data["frames"]["index"])
     assert len(index) == 10
     assert index[[0, -1]].tolist() == [0, 29]
-    S = torch.tensor(world["S_shown_map"], dtype=torch.float64)
-    times = (100 + index[decoded(world["frame"])] / 30).tolist()
+    S = torch.tensor(submap["S_shown_map"], dtype=torch.float64)
+    times = (100 + index[decoded(submap["frame"])] / 30).tolist()
     rows = [int((kept.trajectory.timestamps - time).abs().argmin()) for time in times]
     poses = (S @ kept.trajectory.T_wc[rows]).numpy()[:, :3]
-    np.testing.assert_allclose(array(world["poses"], 3, 4), poses, atol=1e-5)
+    np.testing.assert_allclose(array(submap["poses"], 3, 4), poses, atol=1e-5)
 
 
 def test_a_page_has_a_largest_size(kept: Results) -> None:
@@ -171,18 +171,18 @@ def test_a_page_has_a_largest_size(kept: Results) -> None:
 
 def test_every_world_with_poses_is_there_the_main_one_first(tmp_path: Path, two: Run) -> None:
     write(two, tmp_path)
-    worlds = data_of(page(read_results(tmp_path)))["worlds"]
-    assert [world["name"] for world in worlds] == ["0, the main one", "3"]
-    assert decoded(worlds[1]["frame"]).tolist() == [18, 19]
-    assert decoded(worlds[1]["keyframe"]).tolist() == [18]
+    submaps = data_of(page(read_results(tmp_path)))["submaps"]
+    assert [submap["name"] for submap in submaps] == ["0, the main one", "3"]
+    assert decoded(submaps[1]["frame"]).tolist() == [18, 19]
+    assert decoded(submaps[1]["keyframe"]).tolist() == [18]
 
 
 def test_without_a_map_the_page_says_why(tmp_path: Path, run: Run) -> None:
-    why = "no map was initialised: </script> & <b>"
-    write(replace(run, worlds=(), failure=why), tmp_path)
+    why = "no map was initialized: </script> & <b>"
+    write(replace(run, submaps=(), failure=why), tmp_path)
     text = write_view(read_results(tmp_path), tmp_path).read_text()
     data = data_of(text)
-    assert (data["worlds"], data["failure"]) == ([], why)
+    assert (data["submaps"], data["failure"]) == ([], why)
 
 
 # --- in a browser --------------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ def test_a_browser_shows_the_frame_that_is_asked_for(tmp_path: Path, kept: Resul
     assert re.search(r'id="trouble"[^>]* hidden', dom)
 
 
-def test_a_browser_draws_the_points_in_their_colours(tmp_path: Path, kept: Results) -> None:
+def test_a_browser_draws_the_points_in_their_colors(tmp_path: Path, kept: Results) -> None:
     kept.map.points["colors"][:] = torch.tensor([0, 255, 0], dtype=torch.uint8)
     picture = tmp_path / "picture.png"
     browse(write_view(kept, tmp_path), f"--screenshot={picture}")
@@ -228,6 +228,6 @@ def test_a_browser_draws_the_points_in_their_colours(tmp_path: Path, kept: Resul
 
 
 def test_a_browser_says_why_there_is_no_map(tmp_path: Path, run: Run) -> None:
-    write(replace(run, worlds=(), failure="the camera <i>stands</i> still"), tmp_path)
+    write(replace(run, submaps=(), failure="the camera <i>stands</i> still"), tmp_path)
     dom = browse(write_view(read_results(tmp_path), tmp_path), "--dump-dom")
     assert 'role="alert">the camera &lt;i&gt;stands&lt;/i&gt; still<' in dom

@@ -1,6 +1,6 @@
 """Calibration files of other programs: OpenCV, ROS, Kalibr, EuRoC, ORB-SLAM3, COLMAP, nerfstudio.
 
-Pixel (0, 0) is the centre of the top left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3; COLMAP and nerfstudio put its
+Pixel (0, 0) is the center of the top left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3; COLMAP and nerfstudio put its
 corner there, so that their principal points are half a pixel larger.
 """
 
@@ -16,7 +16,7 @@ from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.formats.text_file import numbered_lines, parse_floats, read_text
 from torchslam.data.formats.yaml_text import yaml_numbers, yaml_value
 from torchslam.errors import CalibrationError
-from torchslam.geometry.conventions import HALF_PIXEL
+from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json
 
 MAX_BYTES = 1 << 18
@@ -92,7 +92,7 @@ def checked(
         )
     if any(coefficients[5:]):
         raise CalibrationError(
-            f"{source}: more than k1 k2 p1 p2 k3 is not modelled; calibrate with these alone"
+            f"{source}: more than k1 k2 p1 p2 k3 is not modeled; calibrate with these alone"
         )
     if coefficients:
         coefficients = [*coefficients, 0.0, 0.0, 0.0, 0.0][: max(4, min(5, len(coefficients)))]

@@ -20,7 +20,7 @@ from torchslam.utils import bounded_read as regular_file
 
 EXIF_BLOCK = 0x8769
 FOCAL_LENGTH_35MM = 0xA405
-FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimeters
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from torchslam.data.formats.text_file import parse_floats, read_text
 from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.errors import CalibrationError, TrajectoryError
-from torchslam.geometry.conventions import opengl
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
+from torchslam.geometry.transforms import opengl
 from torchslam.utils import bounded_read as regular_file
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"

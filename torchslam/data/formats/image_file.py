@@ -1,4 +1,4 @@
-"""Image files to tensors. A file that ends early is an error, also where decoders fill the rest with grey."""
+"""Image files to tensors. A file that ends early is an error, also where decoders fill the rest with gray."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from torchslam.utils import bounded_read as regular_file
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
-AS_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
 """An image file above this size is not read."""
 MAX_PIXELS = 1 << 26
 """Pixels of the largest image that is decoded: a small file may promise any number of them."""
 
 
-def read_grey(path: str | Path, where: str, bits: int = 8) -> Tensor:
-    """An image file as (1, 1, H, W) float32 grey in [0, 1].
+def read_gray(path: str | Path, where: str, bits: int = 8) -> Tensor:
+    """An image file as (1, 1, H, W) float32 gray in [0, 1].
 
     bits: how many carry something in files of 16 bits (`bit_depth`)
 
     Raises FrameError at `where` for a file that is missing, truncated, too large or not an image.
     """
-    return grey_to_tensor(read_pixels(path, where), bits)
+    return gray_to_tensor(read_pixels(path, where), bits)
 
 
-def read_colour(path: str | Path, where: str) -> Tensor:
-    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_grey` does."""
+def read_color(path: str | Path, where: str) -> Tensor:
+    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_gray` does."""
     return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
 
 
 def read_pixels(path: str | Path, where: str) -> np.ndarray:
-    """An image file as (H, W) grey, uint8 or uint16. Raises FrameError as `read_grey`."""
-    return _read(path, where, AS_GREY)
+    """An image file as (H, W) gray, uint8 or uint16. Raises FrameError as `read_gray`."""
+    return _read(path, where, AS_GRAY)
 
 
 def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
@@ -60,13 +60,13 @@ def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     return image
 
 
-def decode_pixels(data: bytes, flags: int = AS_GREY) -> np.ndarray | None:
-    """An image file's bytes as (H, W) grey, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
+def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
+    """An image file's bytes as (H, W) gray, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
     whole image."""
     if not data or _promised_pixels(data) > MAX_PIXELS:
         return None
-    if flags == AS_GREY and (grey := png.decode_grey(data)) is not None:
-        return grey
+    if flags == AS_GRAY and (gray := png.decode_gray(data)) is not None:
+        return gray
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
@@ -80,14 +80,14 @@ def bit_depth(images: Iterable[np.ndarray]) -> int:
     return 8 if brightest == 0 else next(bits for bits in (10, 12, 14, 16) if brightest < 1 << bits)
 
 
-def grey_to_tensor(grey: np.ndarray, bits: int = 8) -> Tensor:
+def gray_to_tensor(gray: np.ndarray, bits: int = 8) -> Tensor:
     """(H, W) uint8, or uint16 of which `bits` carry something -> (1, 1, H, W) float32 in [0, 1]."""
-    if grey.dtype == np.uint16:
+    if gray.dtype == np.uint16:
         white = (1 << bits) - 1 if bits > 8 else 65535
-        floats = grey.astype(np.float32)
+        floats = gray.astype(np.float32)
         floats /= white  # in place: of a large image one copy less
         return torch.from_numpy(floats).clamp_(max=1.0)[None, None]
-    return torch.from_numpy(grey).to(torch.float32).div_(255.0)[None, None]
+    return torch.from_numpy(gray).to(torch.float32).div_(255.0)[None, None]
 
 
 def bgr_to_tensor(image: np.ndarray) -> Tensor:

@@ -14,14 +14,14 @@ CHUNK_FRAME = 12
 """Bytes of a chunk around its content: length, name, sum."""
 PLAIN = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
 """Chunks before the pixels that change none of them. Others (of gamma, transparency, animation) are left to OpenCV."""
-GRAY, COLOR = 0, 2  # colour types of a PNG
-TO_GREY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
-"""Red, green, blue to grey as OpenCV has libpng do it: 0.299, 0.587 and the rest of 32768, rounded down. Half of a
+GRAY, COLOR = 0, 2  # color types of a PNG
+TO_GRAY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
+"""Red, green, blue to gray as OpenCV has libpng do it: 0.299, 0.587 and the rest of 32768, rounded down. Half of a
 32768th more than -1/2 makes the rounding of `cv2.transform` that; all sums are whole in float32."""
 
 
-def decode_grey(data: bytes) -> np.ndarray | None:
-    """A plain PNG file (grey of 8 or 16 bits, colour of 8) as (H, W) grey, uint8 or uint16.
+def decode_gray(data: bytes) -> np.ndarray | None:
+    """A plain PNG file (gray of 8 or 16 bits, color of 8) as (H, W) gray, uint8 or uint16.
 
     None for any other file, and for a damaged one: then OpenCV has to say. An image is made of the size that a sound
     header promises, so who calls this has looked at that. Source: PNG specification, sections 5 and 11.
@@ -36,7 +36,7 @@ def decode_grey(data: bytes) -> np.ndarray | None:
         if (bits, color) == (8, GRAY):
             return io.decode_image_png_u8(data, size, "mono")[..., 0]
         if (bits, color) == (8, COLOR):
-            return cv2.transform(io.decode_image_png_u8(data, size, "rgb"), TO_GREY).reshape(size)
+            return cv2.transform(io.decode_image_png_u8(data, size, "rgb"), TO_GRAY).reshape(size)
     except Exception:  # the decoder has no error of its own
         return None
     return None

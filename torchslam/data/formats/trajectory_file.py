@@ -1,4 +1,4 @@
-"""Trajectory files in TUM format: `timestamp tx ty tz qx qy qz qw`, camera to world, metres, seconds."""
+"""Trajectory files in TUM format: `timestamp tx ty tz qx qy qz qw`, camera to world, meters, seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchslam.types import Trajectory
 ORTHOGONAL = 0.05
 """How far R R^T of a pose may be from the identity: some are printed with few digits."""
 FARTHEST = 1e12
-"""Of a position: metres to beyond Neptune."""
+"""Of a position: meters to beyond Neptune."""
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -58,11 +58,11 @@ def checked_poses(T_wc: Tensor, path: Path | str) -> Tensor:
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as a TUM file: nanoseconds, nanometres, nine decimals of the quaternion."""
+    """Write a trajectory as a TUM file: nanoseconds, nanometers, nine decimals of the quaternion."""
     T_wc = trajectory.T_wc.detach().double().cpu()
     quaternions = quaternion_from_matrix(T_wc[:, :3, :3])
     table = torch.cat((T_wc[:, :3, 3], quaternions), dim=-1).tolist()
-    lines = [f"# {COLUMNS} (camera to world, seconds, metres)\n"]
+    lines = [f"# {COLUMNS} (camera to world, seconds, meters)\n"]
     for timestamp, row in zip(trajectory.timestamps.tolist(), table, strict=True):
         # The shortest text that reads back as the same time: seconds since 1970 fill all digits of a double.
         lines.append(f"{round(timestamp, 9)!r} " + " ".join(f"{value:.9f}" for value in row) + "\n")

@@ -81,7 +81,7 @@ class Resized(Transformed):
 
 
 def scale_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same camera for images resized to `size`; pixel (0, 0) is a centre before and after."""
+    """The same camera for images resized to `size`; pixel (0, 0) is a center before and after."""
     x, y = size[0] / camera.width, size[1] / camera.height
     fx, fy, cx, cy = camera.params[..., :4].unbind(-1)
     scaled = torch.stack((fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5), dim=-1)

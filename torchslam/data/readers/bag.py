@@ -21,7 +21,7 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.calibration_files import checked
-from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, grey_to_tensor
+from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.bounded_read import check_regular
@@ -41,9 +41,9 @@ MAX_FILES = 10_000
 SAMPLES = 20
 """Images in which the brightest pixel is looked for, where they have 16 bits."""
 
-# https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them grey.
-GREY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
-COLOURS = {
+# https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
+GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
+COLORS = {
     "rgb8": (3, cv2.COLOR_RGB2GRAY),
     "bgr8": (3, cv2.COLOR_BGR2GRAY),
     "8UC3": (3, cv2.COLOR_BGR2GRAY),
@@ -124,12 +124,12 @@ class BagSequence(Sequence):
 
     def image(self, index: int) -> Tensor:
         try:
-            grey = self._read(self._messages[index])
+            gray = self._read(self._messages[index])
         except SequenceError as error:
             raise FrameError(str(error)) from error
-        if (grey.shape[1], grey.shape[0]) != self.size:
+        if (gray.shape[1], gray.shape[0]) != self.size:
             raise FrameError(f"{self.image_name(index)}: has another size than the first image")
-        return grey_to_tensor(grey, self._bits)
+        return gray_to_tensor(gray, self._bits)
 
     def image_name(self, index: int) -> str:
         return f"{self._path}{self._connection.topic}#{index}"
@@ -138,7 +138,7 @@ class BagSequence(Sequence):
         self._stream, self._position = self._reader.messages([self._connection]), 0
 
     def _read(self, message: int) -> np.ndarray:
-        """(H, W) grey pixels of a message, by its place in the recording."""
+        """(H, W) gray pixels of a message, by its place in the recording."""
         if message < self._position:
             self._rewind()
         where = f"{self._path}{self._connection.topic}, message {message}"
@@ -150,24 +150,24 @@ class BagSequence(Sequence):
                     break
             content: Any = self._reader.deserialize(raw, self._connection.msgtype)
             if self._connection.msgtype == COMPRESSED:
-                grey = decode_pixels(content.data[:MAX_BYTES].tobytes())
-                if grey is None:
+                gray = decode_pixels(content.data[:MAX_BYTES].tobytes())
+                if gray is None:
                     raise SequenceError(f"{where}: `{content.format}` is not an image, or a damaged one")
-                return grey
-            return to_grey(content, where)
+                return gray
+            return to_gray(content, where)
 
 
-def to_grey(message: Any, where: str) -> np.ndarray:
+def to_gray(message: Any, where: str) -> np.ndarray:
     """A sensor_msgs/Image as (H, W), uint8 or uint16. Raises SequenceError at `where` for other encodings."""
     encoding, step = message.encoding, message.step
     height, width = message.height, message.width
-    if encoding in GREY:
-        kind = np.dtype(GREY[encoding])
+    if encoding in GRAY:
+        kind = np.dtype(GRAY[encoding])
         channels, pixels = 1, kind.newbyteorder(">" if message.is_bigendian else "<")
-    elif encoding in COLOURS:
-        channels, pixels = COLOURS[encoding][0], np.dtype(np.uint8)
+    elif encoding in COLORS:
+        channels, pixels = COLORS[encoding][0], np.dtype(np.uint8)
     else:
-        known = ", ".join([*GREY, *COLOURS])
+        known = ", ".join([*GRAY, *COLORS])
         raise SequenceError(f"{where}: encoding `{encoding}` is not read; there are {known}")
     row = width * channels * pixels.itemsize
     if min(height, width) < 1 or step < row or len(message.data) < height * step:
@@ -176,10 +176,10 @@ def to_grey(message: Any, where: str) -> np.ndarray:
         )
     rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, :row]
     image = np.ascontiguousarray(rows).view(pixels)
-    if encoding in GREY:
-        return image.astype(GREY[encoding])
+    if encoding in GRAY:
+        return image.astype(GRAY[encoding])
     image = image.reshape(height, width, channels) if channels > 1 else image
-    return cv2.cvtColor(image, COLOURS[encoding][1])
+    return cv2.cvtColor(image, COLORS[encoding][1])
 
 
 def matches(path: str) -> bool:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import size_text
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.formats.image_file import bit_depth, read_colour, read_grey, read_pixels
+from torchslam.data.formats.image_file import bit_depth, read_color, read_gray, read_pixels
 from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -73,13 +73,13 @@ class ImageSequence(Sequence):
 
     def image(self, index: int) -> Tensor:
         entry = self._entries[index]
-        image = read_grey(entry.path, entry.where, self._bits)
+        image = read_gray(entry.path, entry.where, self._bits)
         self._check_size(entry, (image.shape[-1], image.shape[-2]))
         return image
 
     def color(self, index: int) -> Tensor:
         entry = self._entries[index]
-        image = read_colour(entry.path, entry.where)
+        image = read_color(entry.path, entry.where)
         self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 

@@ -21,7 +21,7 @@ from torchslam.types import Trajectory
 
 LOOKS_FOR = "image_0/ or image_2/ with times.txt (KITTI odometry)"
 CAMERAS = ("image_0", "image_2")
-"""The left cameras, grey and colour."""
+"""The left cameras, gray and color."""
 
 
 def matches(path: str) -> bool:
@@ -30,7 +30,7 @@ def matches(path: str) -> bool:
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """A KITTI odometry sequence, left grey images before left colour ones; `camera` overrides `calib.txt`.
+    """A KITTI odometry sequence, left gray images before left color ones; `camera` overrides `calib.txt`.
 
     Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` beside `sequences/NN`.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
@@ -57,7 +57,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
 
 
 def _read_projection(path: Path, label: str) -> tuple[Calibration, float]:
-    """The rectified camera K [I | t] of a line `P0: ...` and t_x, metres, its offset from camera 0."""
+    """The rectified camera K [I | t] of a line `P0: ...` and t_x, meters, its offset from camera 0."""
     for number, line in numbered_lines(path, CalibrationError):
         if not line.startswith(f"{label}:"):
             continue

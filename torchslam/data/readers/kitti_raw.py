@@ -26,9 +26,9 @@ from torchslam.types import Trajectory
 
 LOOKS_FOR = "image_00/data/ with timestamps.txt (KITTI raw)"
 CAMERAS = ("image_00", "image_02")
-"""The left cameras, grey and colour."""
+"""The left cameras, gray and color."""
 CALIBRATION = "calib_cam_to_cam.txt"
-EARTH_RADIUS = 6378137.0  # metres
+EARTH_RADIUS = 6378137.0  # meters
 TIME = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?")
 
 
@@ -38,7 +38,7 @@ def matches(path: str) -> bool:
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """The left camera of a drive, grey before colour; times are seconds since the day began, UTC.
+    """The left camera of a drive, gray before color; times are seconds since the day began, UTC.
 
     The calibration lies in the drive or in the folder of its day: the rectified one, or for a drive `..._extract` that
     of the images as they are. Ground truth is that of `oxts/`, where calib_velo_to_cam.txt and calib_imu_to_velo.txt
@@ -129,7 +129,7 @@ def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajector
     P = _row(rows, f"P_rect_{number}", 12, calibration)
     T_rect = torch.eye(4, dtype=torch.float64)
     T_rect[:3, :3] = torch.tensor(_row(rows, "R_rect_00", 9, calibration), dtype=torch.float64).view(3, 3)
-    T_rect[0, 3] = P[3] / P[0]  # metres from camera 0 to this one
+    T_rect[0, 3] = P[3] / P[0]  # meters from camera 0 to this one
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
     times = _read_times(drive / "oxts" / "timestamps.txt", TrajectoryError)
     T_wi, kept = _read_packets(packets, times)

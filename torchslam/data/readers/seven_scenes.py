@@ -21,24 +21,24 @@ from torchslam.errors import TrajectoryError
 from torchslam.types import Trajectory
 
 LOOKS_FOR = "frame-*.color.png (7-Scenes)"
-COLOUR = "frame-*.color.png"
+COLOR = "frame-*.color.png"
 ORTHOGONAL = 0.05
 """How far R R^T of a pose may be from the identity; fused poses are printed with few digits."""
 
 
 def matches(path: str) -> bool:
-    """Whether the folder has colour frames of this dataset's names."""
-    return Path(path).is_dir() and next(Path(path).glob(COLOUR), None) is not None
+    """Whether the folder has color frames of this dataset's names."""
+    return Path(path).is_dir() and next(Path(path).glob(COLOR), None) is not None
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """One sequence (`seq-01`), at the Kinect's 30 frames per second, with the poses of its depth camera.
 
-    The dataset gives no calibration of the colour camera; without `camera` its nominal focal length is a guess.
+    The dataset gives no calibration of the color camera; without `camera` its nominal focal length is a guess.
     Raises SequenceError, CalibrationError or TrajectoryError naming the file.
     """
     folder = Path(path)
-    found = match_pattern(str(folder / COLOUR))
+    found = match_pattern(str(folder / COLOR))
     entries = at_rate(found.frames, rate or DEFAULT_RATE)
     times: list[float] = []
     poses: list[Tensor] = []

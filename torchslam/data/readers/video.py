@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, grey_to_tensor
+from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
 from torchslam.data.formats.mp4 import claimed_samples
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -82,7 +82,7 @@ class VideoSequence(Sequence):
         self._rewind()
 
     def image(self, index: int) -> Tensor:
-        return grey_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
+        return gray_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
 
     def color(self, index: int) -> Tensor:
         return bgr_to_tensor(self._frame(index))

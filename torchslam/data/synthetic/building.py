@@ -11,9 +11,9 @@ import numpy as np
 from torchslam.data.synthetic.scene import Painter, Rectangle, X, Y, Z
 
 HALF = 3.9
-"""Metres from the centre to the outer walls."""
+"""Meters from the center to the outer walls."""
 CORE = 1.3
-"""Metres from the centre to the inner walls."""
+"""Meters from the center to the inner walls."""
 HEIGHT = 2.8
 FLOOR = HEIGHT / 2
 """y points down, and is 0 half-way up."""
@@ -23,7 +23,7 @@ DOOR_TOP = -0.7
 PARTITION = 0.1
 """Thickness of the wall with the door."""
 TEXEL = 0.004
-"""Metres: walls and furniture are hardly ever nearer than two pixels to that."""
+"""Meters: walls and furniture are hardly ever nearer than two pixels to that."""
 SIZE_SPREAD = 0.12
 """Furniture is up to that share larger or smaller ..."""
 TURN_SPREAD = 0.15
@@ -45,11 +45,11 @@ FURNITURE = (
     ((-3.1, -1.1, 1.5), (0.4, 0.4, 0.4), 0.5),  # lamps that hang from the ceiling
     ((-1.5, -1.15, 3.1), (0.5, 0.3, 0.3), 0.3),
 )
-"""Centre, size and turn of each piece in the first room."""
+"""Center, size and turn of each piece in the first room."""
 
 
 def rooms(seed: int) -> list[Rectangle]:
-    """Four rooms with textures and furniture of their own, 7.8 x 2.8 x 7.8 metres in all, around the origin."""
+    """Four rooms with textures and furniture of their own, 7.8 x 2.8 x 7.8 meters in all, around the origin."""
     painter = Painter(np.random.default_rng(seed), TEXEL)
     return [rectangle for turns in range(4) for rectangle in _turned(_room(painter), turns)]
 
@@ -82,17 +82,17 @@ def _doorway(painter: Painter) -> list[Rectangle]:
     """The wall in the plane z = 0: a piece on each side of the door, one above it."""
     rectangles = []
     for start, end, bottom in ((-HALF, DOOR[0], FLOOR), (DOOR[1], -CORE, FLOOR), (*DOOR, DOOR_TOP)):
-        centre = ((start + end) / 2, (bottom - FLOOR) / 2, 0.0)
-        rectangles += painter.box(centre, (end - start, bottom + FLOOR, PARTITION), 0.0)
+        center = ((start + end) / 2, (bottom - FLOOR) / 2, 0.0)
+        rectangles += painter.box(center, (end - start, bottom + FLOOR, PARTITION), 0.0)
     return rectangles
 
 
 def _furniture(painter: Painter) -> list[Rectangle]:
     rectangles = []
-    for centre, size, turn in FURNITURE:
+    for center, size, turn in FURNITURE:
         x, y, z = np.array(size) * painter.rng.uniform(1 - SIZE_SPREAD, 1 + SIZE_SPREAD, 3)
         turn += painter.rng.uniform(-TURN_SPREAD, TURN_SPREAD)
-        rectangles += painter.box(centre, (x, y, z), turn)
+        rectangles += painter.box(center, (x, y, z), turn)
     return rectangles
 
 

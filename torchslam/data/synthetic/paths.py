@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam.geometry.lie import rigid, so3_exp
 
 RADIUS = 2.87
-"""Metres: the length of the walk around the core by 2 pi."""
+"""Meters: the length of the walk around the core by 2 pi."""
 OUTWARD = 0.5
 """Radians from the heading to where the camera looks."""
 HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
@@ -35,11 +35,11 @@ WALK = (  # over the storey: x, z and heading in quarter turns to the right from
     (-4.0, -4.1, -7),
 )
 QUARTER_TIME = 1.4
-"""A quarter turn takes as long as a walk of so many metres."""
+"""A quarter turn takes as long as a walk of so many meters."""
 EASING = 0.6
-"""Metres of the walk before and after over which speeds even out."""
+"""Meters of the walk before and after over which speeds even out."""
 ARM = 0.3
-"""Metres: so far in front of the body is the camera held, so that it moves where the body only turns."""
+"""Meters: so far in front of the body is the camera held, so that it moves where the body only turns."""
 
 
 def loop(phase: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def standstill(phase: Tensor) -> Tensor:
 
 
 def rotation(phase: Tensor) -> Tensor:
-    """A camera that turns about its own centre and back."""
+    """A camera that turns about its own center and back."""
     zero = torch.zeros_like(phase)
     return _poses(
         zero, zero, zero, 0.7 * torch.sin(phase), 0.2 * torch.sin(2 * phase), 0.1 * torch.sin(phase)
@@ -70,7 +70,7 @@ def rotation(phase: Tensor) -> Tensor:
 
 
 def sideways(phase: Tensor) -> Tensor:
-    """A slow walk along the wall and back, turned towards it from changing angles."""
+    """A slow walk along the wall and back, turned toward it from changing angles."""
     return _poses(
         1.2 * torch.sin(phase),
         0.2 * torch.sin(2 * phase),
@@ -141,7 +141,7 @@ def phases(frames: int, frames_per_round: int) -> Tensor:
 
 
 def _poses(x: Tensor, y: Tensor, z: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """T_wc from position, metres, and angles, radians: about y, then x, then z of the camera."""
+    """T_wc from position, meters, and angles, radians: about y, then x, then z of the camera."""
     zero = torch.zeros_like(x)
     R_wc = (
         so3_exp(torch.stack((zero, yaw, zero), dim=-1))

@@ -12,7 +12,7 @@ import numpy as np
 from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle
 
 NEAR = 0.05
-"""Metres: what is nearer to the camera is not drawn."""
+"""Meters: what is nearer to the camera is not drawn."""
 PADDING = 2
 SHARPNESS = 0.7
 """Of the choice of level: 1 takes one texel a pixel; less is sharper, at the price of some aliasing."""
@@ -32,13 +32,13 @@ class Renderer:
         du, dv = self._sizes[:, :1] * self._axes_u, self._sizes[:, 1:] * self._axes_v
         self._corners = np.stack((np.zeros_like(du), du, du + dv, dv), axis=1) + self._origins[:, None]
         shapes = np.array([rectangle.texture.shape[::-1] for rectangle in rectangles])
-        self._texels = shapes / self._sizes  # per metre
+        self._texels = shapes / self._sizes  # per meter
         textures = {id(rectangle.texture): rectangle.texture for rectangle in rectangles}  # each once
         self._atlas, offsets = _pack([_pyramid(texture) for texture in textures.values()])
         places = {key: place for place, key in enumerate(textures)}
         offsets = offsets[[places[id(rectangle.texture)] for rectangle in rectangles]]
         # Per rectangle and level: what a texel shrinks to and where the corner of the first one lies in the atlas, half
-        # a texel before its centre.
+        # a texel before its center.
         shrink = np.tile(np.exp2(-np.arange(MIP_LEVELS)), len(rectangles))
         self._tiles = np.stack((shrink, *(offsets.reshape(-1, 2) - 0.5).T)).astype(np.float32)
 
@@ -71,7 +71,7 @@ class Renderer:
         return np.where(hit, image, 0.0).astype(np.float32)
 
     def _linear_forms(self, T_cw: np.ndarray) -> np.ndarray:
-        """(R, 3, 3): per rectangle, (u, v, 1) / z in metres as linear forms of the pixel (x, y, 1)."""
+        """(R, 3, 3): per rectangle, (u, v, 1) / z in meters as linear forms of the pixel (x, y, 1)."""
         R, t = T_cw[:3, :3], T_cw[:3, 3]
         M = np.stack((self._axes_u @ R.T, self._axes_v @ R.T, self._origins @ R.T + t), axis=-1)
         # A rectangle seen exactly edge-on has no inverse and is invisible: forms of zero never win.

@@ -11,14 +11,14 @@ from torchslam.data.synthetic.textures import COVERAGE, surface
 Vector = tuple[float, float, float]
 X, Y, Z = np.eye(3)
 TEXEL = 0.003
-"""Metres: finer than a pixel sees from a metre away."""
+"""Meters: finer than a pixel sees from a meter away."""
 MIP_LEVELS = 6
 """Sizes a texture is kept at; its sides halve without remainder that often."""
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A textured rectangle in the world, metres.
+    """A textured rectangle in the world, meters.
 
     origin: (3,) the corner where the texture starts
     axis_u, axis_v: (3,) unit vectors along the texture's columns and rows
@@ -38,7 +38,7 @@ class Painter:
     """Makes rectangles, each with a texture of its own, lit from above and a little from the front.
 
     rng:   of the textures
-    texel: metres, at most
+    texel: meters, at most
     coverage: the part of a surface that the largest shapes cover
     """
 
@@ -54,13 +54,13 @@ class Painter:
         light = 0.8 + 0.15 * abs(float(normal @ Z)) + 0.2 * float(abs(normal @ Y))
         return Rectangle(origin, axis_u, axis_v, size, (texture * min(light, 1.0)).astype(np.uint8))
 
-    def box(self, centre: Vector, size: Vector, turn: float) -> list[Rectangle]:
+    def box(self, center: Vector, size: Vector, turn: float) -> list[Rectangle]:
         """The six sides of a box, turned about the vertical axis by `turn` radians."""
         rotation = np.array(((np.cos(turn), 0, np.sin(turn)), (0, 1, 0), (-np.sin(turn), 0, np.cos(turn))))
         axes = (rotation @ X, Y, rotation @ Z)
         sides = []
         for a, b, c in ((0, 1, 2), (2, 1, 0), (0, 2, 1)):
-            corner = np.array(centre) - 0.5 * (size[a] * axes[a] + size[b] * axes[b])
+            corner = np.array(center) - 0.5 * (size[a] * axes[a] + size[b] * axes[b])
             for end in (-0.5, 0.5):
                 origin = corner + end * size[c] * axes[c]
                 sides.append(self.rectangle(origin, axes[a], axes[b], (size[a], size[b])))
@@ -68,7 +68,7 @@ class Painter:
 
 
 def room(seed: int) -> list[Rectangle]:
-    """A room of 6.4 x 2.8 x 5.6 metres (x, y down, z) around the origin, furniture in its far half."""
+    """A room of 6.4 x 2.8 x 5.6 meters (x, y down, z) around the origin, furniture in its far half."""
     painter = Painter(np.random.default_rng(seed))
     rectangles = painter.box((0, 0, 0), (6.4, 2.8, 5.6), 0.0)
     furniture = (
@@ -85,12 +85,12 @@ def room(seed: int) -> list[Rectangle]:
         ((-2.6, 0.3, -0.6), (0.6, 2.2, 1.2), 0.1),  # shelves at the sides
         ((2.7, 0.5, 0.1), (0.5, 1.8, 1.0), -0.1),
     )
-    for centre, size, turn in furniture:
-        rectangles += painter.box(centre, size, turn)
+    for center, size, turn in furniture:
+        rectangles += painter.box(center, size, turn)
     return rectangles
 
 
 def wall(seed: int) -> list[Rectangle]:
-    """A single wall of 9 x 6 metres, 2.5 metres in front of the origin."""
+    """A single wall of 9 x 6 meters, 2.5 meters in front of the origin."""
     painter = Painter(np.random.default_rng(seed))
     return [painter.rectangle(np.array((-4.5, -3.0, 2.5)), X, Y, (9.0, 6.0))]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
-from torchslam.data.formats.image_file import grey_to_tensor
+from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
@@ -67,10 +67,10 @@ class RenderOptions:
 
     frames:   how many; a path goes on round after round, with another sway. Without it, the scene's own number
     seed:     of textures and noise
-    noise:    standard deviation, grey levels of 255
+    noise:    standard deviation, gray levels of 255
     blur:     standard deviation of a Gaussian, pixels
     exposure: amplitude of a slow change of brightness, 0 to 1
-    blank:    1 for grey images instead of rendered ones, where only the poses matter
+    blank:    1 for gray images instead of rendered ones, where only the poses matter
     """
 
     frames: int
@@ -89,8 +89,8 @@ class SyntheticSequence(Sequence):
         options = RenderOptions(SCENES[scene].frames) if options is None else options
         T_wc = path(paths.phases(options.frames, frames_per_round))
         timestamps = torch.arange(options.frames, dtype=torch.float64) / FRAME_RATE
-        centre = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-        camera = Camera.pinhole(FOCAL, FOCAL, *centre, size=SIZE)
+        center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+        camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
         super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
         self._options = options
         self._poses_cw = se3_inverse(T_wc).numpy()
@@ -106,7 +106,7 @@ class SyntheticSequence(Sequence):
         # Noise of its own for each frame, whatever the order in which they are asked for.
         rng = np.random.default_rng((options.seed, index))
         image += options.noise * rng.standard_normal(image.shape, dtype=np.float32)
-        return grey_to_tensor(image.round().clip(0, 255).astype(np.uint8))
+        return gray_to_tensor(image.round().clip(0, 255).astype(np.uint8))
 
     def image_name(self, index: int) -> str:
         return f"synthetic:{self.name}#{index}"

@@ -23,9 +23,9 @@ import numpy as np
 from torchslam.data.synthetic.scene import Painter, Rectangle, Vector, X, Y, Z
 
 OUTER = (6.0, 5.0)
-"""Metres from the centre to the outer walls, along x and z."""
+"""Meters from the center to the outer walls, along x and z."""
 CORE = (4.2, 3.2)
-"""Metres from the centre to the inner walls of the corridor."""
+"""Meters from the center to the inner walls of the corridor."""
 HEIGHT = 2.8
 TOP = np.array((0.0, -HEIGHT / 2, 0.0))
 """y points down, and is 0 half-way up."""
@@ -37,11 +37,11 @@ DOOR_TOP = -0.75
 WALL = 0.1
 """Thickness of the wall with the door."""
 TEXEL = 0.004
-"""Metres: hardly anything is ever nearer than two pixels to that."""
+"""Meters: hardly anything is ever nearer than two pixels to that."""
 PLAIN = 0.03
 """Of a wall of the corridor: the largest shapes cover an eighth of what they cover elsewhere."""
 BOARD_EVERY = 3.2
-"""Metres along the corridor between two notice boards, on one wall and on the other."""
+"""Meters along the corridor between two notice boards, on one wall and on the other."""
 BOARD = (0.6, 0.9, 0.03)
 """Width, height and depth of one: up to that share larger or smaller by `SPREAD`."""
 SPREAD = 0.3
@@ -61,11 +61,11 @@ FURNITURE = (
     ((2.0, -1.1, 1.2), (0.5, 0.3, 0.5), 0.3),  # lamps
     ((2.2, -1.1, -1.2), (0.4, 0.4, 0.4), -0.5),
 )
-"""Centre, size and turn of each piece in the room."""
+"""Center, size and turn of each piece in the room."""
 
 
 def storey(seed: int) -> list[Rectangle]:
-    """12 x 2.8 x 10 metres around the origin; textures from a seed."""
+    """12 x 2.8 x 10 meters around the origin; textures from a seed."""
     painter = Painter(np.random.default_rng(seed), TEXEL)
     plain = replace(painter, coverage=PLAIN)
     return _corridor(plain) + _boards(painter) + _room(painter, plain)
@@ -110,9 +110,9 @@ def _board(painter: Painter, at: tuple[float, float], runs_along_x: bool) -> lis
     """at: how far along its wall, and where that is."""
     width, height = np.array(BOARD[:2]) * painter.rng.uniform(1 - SPREAD, 1 + SPREAD, 2)
     y = painter.rng.uniform(-0.5, 0.2)
-    centre: Vector = (at[0], y, at[1]) if runs_along_x else (at[1], y, at[0])
+    center: Vector = (at[0], y, at[1]) if runs_along_x else (at[1], y, at[0])
     size: Vector = (width, height, BOARD[2]) if runs_along_x else (BOARD[2], height, width)
-    return painter.box(centre, size, 0.0)
+    return painter.box(center, size, 0.0)
 
 
 def _room(painter: Painter, plain: Painter) -> list[Rectangle]:
@@ -127,8 +127,8 @@ def _room(painter: Painter, plain: Painter) -> list[Rectangle]:
     middle = CORE[0] - WALL / 2
     floor = HEIGHT / 2
     for start, end, bottom in ((-CORE[1], DOOR[0], floor), (DOOR[1], CORE[1], floor), (*DOOR, DOOR_TOP)):
-        centre = (middle, (bottom - floor) / 2, (start + end) / 2)
-        rectangles += plain.box(centre, (WALL, bottom + floor, end - start), 0.0)
-    for centre, size, turn in FURNITURE:
-        rectangles += painter.box(centre, size, turn)
+        center = (middle, (bottom - floor) / 2, (start + end) / 2)
+        rectangles += plain.box(center, (WALL, bottom + floor, end - start), 0.0)
+    for center, size, turn in FURNITURE:
+        rectangles += painter.box(center, size, turn)
     return rectangles

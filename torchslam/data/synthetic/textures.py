@@ -1,4 +1,4 @@
-"""Procedural grey textures with corners at every scale, from a seed."""
+"""Procedural gray textures with corners at every scale, from a seed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 FINEST = 0.02
-"""Metres: about the smallest shape drawn."""
+"""Meters: about the smallest shape drawn."""
 COVERAGE = 0.25
 """The part of a surface that the largest shapes cover."""
 KINDS = ("polygon", "bar", "ellipse", "letter")
 MIN_CONTRAST = 30
-"""Grey levels between a shape and what is below its centre."""
+"""Gray levels between a shape and what is below its center."""
 FRACTION_BITS = 4
 """Of the coordinates of polygons, so that their corners lie off the pixel grid."""
 
@@ -25,9 +25,9 @@ def surface(
     multiple: int,
     coverage: float = COVERAGE,
 ) -> np.ndarray:
-    """A painted surface: shapes of every size from a third of it down to two centimetres, over smooth noise.
+    """A painted surface: shapes of every size from a third of it down to two centimeters, over smooth noise.
 
-    size: (width, height) metres; texel: metres, at most; multiple: of which rows and columns are to be
+    size: (width, height) meters; texel: meters, at most; multiple: of which rows and columns are to be
     coverage: the part of the surface that the largest shapes cover
     Returns (rows, columns) uint8.
     """
@@ -57,7 +57,7 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     """Draw `count` random shapes of about `extent` texels, each lighter or darker than what is below it."""
     rows, columns = image.shape
     kinds = rng.choice(len(KINDS), count, p=(0.45, 0.25, 0.15, 0.15))
-    centres = rng.uniform((0, 0), (columns, rows), (count, 2))
+    centers = rng.uniform((0, 0), (columns, rows), (count, 2))
     radii = 0.5 * extent * rng.uniform(0.6, 1.4, count)
     contrasts = rng.uniform(35, 95, count) * rng.choice((-1, 1), count)
     turns = rng.uniform(0, 2 * np.pi, count)
@@ -66,40 +66,40 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     corners = rng.integers(3, 7, count)
     jitters = rng.uniform(-0.35, 0.35, (count, 6))
     for i in range(count):
-        x, y = centres[i]
-        grey = _standing_out(int(image[int(y), int(x)]), contrasts[i])
+        x, y = centers[i]
+        gray = _standing_out(int(image[int(y), int(x)]), contrasts[i])
         kind, radius = KINDS[kinds[i]], radii[i]
         if kind == "letter":
-            _draw_letter(image, chr(letters[i]), (x, y), radius, grey)
+            _draw_letter(image, chr(letters[i]), (x, y), radius, gray)
         elif kind == "ellipse":
             axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
-            cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), grey, -1, cv2.LINE_AA)
+            cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), gray, -1, cv2.LINE_AA)
         else:
             sides = 4 if kind == "bar" else corners[i]
             angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
             outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
-            _fill(image, outline, turns[i], (x, y), grey)
+            _fill(image, outline, turns[i], (x, y), gray)
 
 
 def _standing_out(below: int, contrast: float) -> int:
-    """A grey level apart from what is below: lighter or darker, the other way where that would be cut off."""
-    grey = int(np.clip(below + contrast, 0, 255))
-    return grey if abs(grey - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
+    """A gray level apart from what is below: lighter or darker, the other way where that would be cut off."""
+    gray = int(np.clip(below + contrast, 0, 255))
+    return gray if abs(gray - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
 
 
 def _draw_letter(
-    image: np.ndarray, letter: str, centre: tuple[float, float], radius: float, grey: int
+    image: np.ndarray, letter: str, center: tuple[float, float], radius: float, gray: int
 ) -> None:
-    corner = (int(centre[0] - 0.6 * radius), int(centre[1] + 0.7 * radius))
+    corner = (int(center[0] - 0.6 * radius), int(center[1] + 0.7 * radius))
     thickness = max(1, round(radius / 4))
-    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, grey, thickness, cv2.LINE_AA)
+    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, gray, thickness, cv2.LINE_AA)
 
 
 def _fill(
-    image: np.ndarray, outline: np.ndarray, turn: float, centre: tuple[float, float], grey: int
+    image: np.ndarray, outline: np.ndarray, turn: float, center: tuple[float, float], gray: int
 ) -> None:
-    """Fill a polygon, turned about its centre."""
+    """Fill a polygon, turned about its center."""
     cosine, sine = math.cos(turn), math.sin(turn)
-    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + centre
+    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + center
     fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
-    cv2.fillPoly(image, [fixed], grey, cv2.LINE_AA, FRACTION_BITS)
+    cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)

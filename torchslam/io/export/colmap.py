@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchslam.geometry import Camera
-from torchslam.geometry.conventions import corner_camera, corner_pixels, quaternion_wxyz
+from torchslam.geometry.transforms import corner_camera, corner_pixels, quaternion_wxyz
 from torchslam.io.export.scene import Scene
 
 CAMERA_ID = 1

@@ -20,7 +20,7 @@ WITHOUT = "--sequence says where it is now, --no-images does without"
 
 
 class Images:
-    """Colour images by frame, without distortion where that is asked for.
+    """Color images by frame, without distortion where that is asked for.
 
     rows: which frame of the sequence each frame of the run is
     """

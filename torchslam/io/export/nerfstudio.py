@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera
-from torchslam.geometry.conventions import corner_camera, opengl
+from torchslam.geometry.transforms import corner_camera, opengl
 from torchslam.io.export.ply import write_ply
 from torchslam.io.export.scene import Scene
 
@@ -55,4 +55,4 @@ def write_nerfstudio(folder: Path, scene: Scene, R_up: Tensor) -> None:
         "frames": frames,
     }
     (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centres_w=torch.zeros(0, 3))
+    write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centers_w=torch.zeros(0, 3))

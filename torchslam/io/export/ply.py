@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.map.map import Map
 from torchslam.system.run import keyframe_rows
 
@@ -21,11 +21,11 @@ VERTEX = np.dtype(
     ]
 )
 PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
-CAMERA_COLOUR = (213, 73, 63)
+CAMERA_COLOR = (213, 73, 63)
 
 
 def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
-    """Write the points of a map in the colours of the images, and the keyframes of a session in red, z up."""
+    """Write the points of a map in the colors of the images, and the keyframes of a session in red, z up."""
     if slam_map.num_keyframes == 0:
         nothing = torch.zeros(0, 3)
         write_ply(path, nothing, nothing.byte(), nothing)
@@ -46,31 +46,31 @@ def write_ply(
     path: str | Path,
     points_w: Tensor,
     colors: Tensor,
-    centres_w: Tensor,
+    centers_w: Tensor,
     normals_w: Tensor | None = None,
     observations: Tensor | None = None,
 ) -> None:
-    """Write points and camera centres as one cloud.
+    """Write points and camera centers as one cloud.
 
     points_w:         (L, 3); colors: (L, 3) uint8 red, green, blue
-    centres_w:        (K, 3) camera centres, red, with 0 observations
+    centers_w:        (K, 3) camera centers, red, with 0 observations
     normals_w:        (L, 3); the normal of a point looks back to the cameras that saw it. Zero if None
     observations:     (L,) in how many keyframes a point was seen. 0 if None
     """
-    vertices = np.zeros(len(points_w) + len(centres_w), VERTEX)
+    vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
     points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]
     for names, rows, values in (
         (("x", "y", "z"), points, points_w),
         (("red", "green", "blue"), points, colors),
         (("nx", "ny", "nz"), points, normals_w),
-        (("x", "y", "z"), cameras, centres_w),
+        (("x", "y", "z"), cameras, centers_w),
     ):
         if values is not None:
             for name, column in zip(names, values.detach().cpu().numpy().T, strict=True):
                 rows[name] = column
     if observations is not None:
         points["observations"] = observations.detach().cpu().numpy()
-    for name, value in zip(("red", "green", "blue"), CAMERA_COLOUR, strict=True):
+    for name, value in zip(("red", "green", "blue"), CAMERA_COLOR, strict=True):
         cameras[name] = value
     Path(path).write_bytes(_header(len(vertices)) + vertices.tobytes())
 

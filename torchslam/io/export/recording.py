@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.geometry.conventions import corner_camera, corner_pixels
+from torchslam.geometry.transforms import corner_camera, corner_pixels
 from torchslam.io.export.images import Images
 from torchslam.io.export.scene import Scene
 
@@ -21,7 +21,7 @@ APPLICATION = "torchslam"
 JPEG_QUALITY = 90
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
-UNPAINTED = (125, 135, 148)  # points before images have coloured them
+UNPAINTED = (125, 135, 148)  # points before images have colored them
 TRACKED = (87, 190, 65)  # keypoints
 GAP = 5  # usual intervals without a pose that break the line of the path
 
@@ -39,7 +39,7 @@ class Recorder:
     """Writes what a scene is made of to a recording of rerun: all that torchslam logs is named here.
 
     The entities that were given a lens, say `world/camera`, have poses, images and keypoints; pixels have their origin
-    in the centre of the top left one.
+    in the center of the top left one.
     """
 
     def __init__(self, recording: Any) -> None:
@@ -60,7 +60,7 @@ class Recorder:
         self._log(entity, lens, static=True)
 
     def points(self, points_w: Tensor, colors: Tensor | None) -> None:
-        """The points (P, 3) of the map, in the place of those before, with or without colours (P, 3) uint8."""
+        """The points (P, 3) of the map, in the place of those before, with or without colors (P, 3) uint8."""
         content = self._rr.Points3D(
             _numpy(points_w), colors=UNPAINTED if colors is None else colors.cpu().numpy()
         )
@@ -82,7 +82,7 @@ class Recorder:
         self._log(entity, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
     def keypoints(self, entity: str, pixels: Tensor, colors: Tensor | None = None) -> None:
-        """The keypoints (N, 2) that a camera sees; colours (N, 3) uint8."""
+        """The keypoints (N, 2) that a camera sees; colors (N, 3) uint8."""
         content = self._rr.Points2D(
             _numpy(corner_pixels(pixels)),
             colors=TRACKED if colors is None else colors.cpu().numpy(),
@@ -91,7 +91,7 @@ class Recorder:
         self._log(f"{entity}/keypoints", content)
 
     def image(self, entity: str, image: np.ndarray) -> None:
-        """What a camera sees: uint8, grey or blue, green, red."""
+        """What a camera sees: uint8, gray or blue, green, red."""
         _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 

@@ -1,4 +1,4 @@
-"""What exports are made of: posed frames of one run in one world, the points they see, and where."""
+"""What exports are made of: posed frames of one run in one submap, the points they see, and where."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Scene:
         return [f"{index:06d}.png" for index in self.frame_ids.tolist()]
 
     def turned(self, R: Tensor) -> Scene:
-        """The same scene in a world that is turned by R (3, 3): points p become R p."""
+        """The same scene in a submap that is turned by R (3, 3): points p become R p."""
         T_cw = self.T_cw.clone()
         T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
         return replace(self, T_cw=T_cw, points_w=self.points_w @ R.mT)
@@ -63,20 +63,20 @@ class Scene:
         return total.index_add(0, self.point_index, self.errors()) / count
 
 
-def scene_of(world: Submap, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
-    """The frames of one session in a world that was read from a file, or its keyframes alone.
+def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
+    """The frames of one session in a submap that was read from a file, or its keyframes alone.
 
     Observations of points that lie outside of the camera's model, and points that fewer than two of the frames see,
     are left out. Raises ResultsError where there are no frames.
     """
-    if world.map.num_keyframes == 0:
-        raise ResultsError(f"world {world.number} is empty")
-    graph = world.history.graph(world.map, camera, world.number)
+    if submap.map.num_keyframes == 0:
+        raise ResultsError(f"submap {submap.number} is empty")
+    graph = submap.posed_frames.graph(submap.map, camera, submap.number)
     wanted = (graph.sessions == session) & (graph.is_keyframe | (not keyframes_alone))
     rows = torch.nonzero(wanted)[:, 0]
     if len(rows) == 0:
         raise ResultsError(
-            f"world {world.number} holds no frames of this run: it was only localised, or all of it is elsewhere"
+            f"submap {submap.number} holds no frames of this run: it was only localized, or all of it is elsewhere"
         )
     rows = rows[torch.argsort(graph.timestamps[rows], stable=True)]
     slot = torch.full((len(graph.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
@@ -94,7 +94,7 @@ def scene_of(world: Submap, camera: Camera, session: int, keyframes_alone: bool)
         is_keyframe=graph.is_keyframe[rows],
         T_cw=graph.T_cw[rows].double(),
         points_w=graph.points_w[points].double(),
-        colors=world.map.points["colors"][graph.point_ids[points]],
+        colors=submap.map.points["colors"][graph.point_ids[points]],
         frame_index=slot[graph.frame_index[seen]],
         point_index=point_index,
         pixels=graph.pixels[seen].double(),

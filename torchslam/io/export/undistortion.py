@@ -13,7 +13,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.scene import Scene
 
-MAX_GROWTH = 2.0  # of width and height: towards 90 degrees from the axis a plane has no end
+MAX_GROWTH = 2.0  # of width and height: toward 90 degrees from the axis a plane has no end
 
 
 def pinhole_within(camera: Camera) -> Camera:

@@ -15,7 +15,7 @@ _SIZE = 0.06  # of the largest ellipse in the picture, when magnified
 
 def draw_ellipses(
     axes: Axes,
-    centres: np.ndarray,
+    centers: np.ndarray,
     covariances: np.ndarray,
     what: str,
     color: str,
@@ -23,7 +23,7 @@ def draw_ellipses(
     linewidth: float = 0.9,
     zorder: float = 5,
 ) -> None:
-    """Draw covariances (L, 2, 2) around centres (L, 2), say in the legend what they are; none where all are zero.
+    """Draw covariances (L, 2, 2) around centers (L, 2), say in the legend what they are; none where all are zero.
 
     magnified_in: the width of the picture, in which to magnify by the power of ten that keeps ellipses small; 0: not
     """
@@ -44,7 +44,7 @@ def draw_ellipses(
         diameters[:, 0],
         np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1])),
         units="xy",
-        offsets=centres[known],
+        offsets=centers[known],
         offset_transform=axes.transData,
         facecolors="none",
         edgecolors=color,

@@ -24,18 +24,18 @@ def plot_features(
     keypoints: (N, 2) pixels
     matched:   (N,) bool, those that are map points
     previous:  (N, 2) pixels of the same map points in an earlier frame, NaN where it did not see them
-    lengths:   (N,) in how many keyframes the point was seen, for the colour
+    lengths:   (N,) in how many keyframes the point was seen, for the color
     """
     from matplotlib.ticker import MaxNLocator
 
-    grey = style.to_numpy(image)
-    height, width = grey.shape
+    gray = style.to_numpy(image)
+    height, width = gray.shape
     is_matched = matched.cpu().numpy()
     x, y = style.to_numpy(keypoints).T
     with style.house_style():
         figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
         axes = figure.add_subplot()
-        axes.imshow(0.25 + 0.75 * grey, cmap="gray", vmin=0.0, vmax=1.0)
+        axes.imshow(0.25 + 0.75 * gray, cmap="gray", vmin=0.0, vmax=1.0)
         axes.plot(
             x[~is_matched],
             y[~is_matched],

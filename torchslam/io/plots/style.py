@@ -103,7 +103,7 @@ def upright_axes(T_wc: np.ndarray) -> tuple[np.ndarray, tuple[str, str, str]]:
 def robust_box(path: np.ndarray, points: np.ndarray, margin: float = 0.06) -> np.ndarray:
     """Limits (D, 2) that hold the whole path (N, D) and the bulk of the points (L, D), but no far outliers.
 
-    Points count between their 3rd and 97th percentile, and only as far from the path's centre as 4 times
+    Points count between their 3rd and 97th percentile, and only as far from the path's center as 4 times
     the median point is, or 1.5 times the path extends.
     """
     if not len(path) and not len(points):
@@ -111,14 +111,14 @@ def robust_box(path: np.ndarray, points: np.ndarray, margin: float = 0.06) -> np
     anchor = path if len(path) else np.median(points, axis=0, keepdims=True)
     low, high = anchor.min(axis=0), anchor.max(axis=0)
     if len(points):
-        centre = (low + high) / 2
+        center = (low + high) / 2
         reach = max(
-            4.0 * float(np.median(np.linalg.norm(points - centre, axis=1))),
+            4.0 * float(np.median(np.linalg.norm(points - center, axis=1))),
             1.5 * float(np.linalg.norm(high - low)),
         )
         point_low, point_high = np.percentile(points, [3.0, 97.0], axis=0)
-        low = np.minimum(low, np.maximum(point_low, centre - reach))
-        high = np.maximum(high, np.minimum(point_high, centre + reach))
+        low = np.minimum(low, np.maximum(point_low, center - reach))
+        high = np.maximum(high, np.minimum(point_high, center + reach))
     pad = margin * max(float((high - low).max()), 1e-6)
     return np.stack([low - pad, high + pad], axis=1)
 

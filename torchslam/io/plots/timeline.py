@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _SHADES = {
     State.LOST: (style.LOST, "lost"),
     State.UNCERTAIN: (style.UNCERTAIN, "uncertain"),
-    State.INITIALIZING: (style.INITIALIZING, "initialising"),
+    State.INITIALIZING: (style.INITIALIZING, "initializing"),
 }
 
 
@@ -30,10 +30,10 @@ def plot_errors(
     results: Sequence[StepResult] = (),
     title: str = "",
 ) -> Figure:
-    """The error of every posed frame over time, coloured by its size; spans without a pose shaded.
+    """The error of every posed frame over time, colored by its size; spans without a pose shaded.
 
     timestamps: (N,) seconds of the posed frames that have ground truth
-    errors_m:   (N,) metres between the aligned and the true camera centre
+    errors_m:   (N,) meters between the aligned and the true camera center
     errors_rad: (N,) radians between the aligned and the true orientation
     results:    of all frames, for the shading
     """
@@ -47,7 +47,7 @@ def plot_errors(
         panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for axes, (label, errors) in zip(panels, rows, strict=True):
             _shade(axes, results, origin)
-            _coloured_line(axes, seconds - origin, errors)
+            _colored_line(axes, seconds - origin, errors)
             rmse = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
             axes.axhline(rmse, color=style.MUTED, lw=0.9, ls=(0, (4, 3)), label="RMSE")
             axes.annotate(
@@ -116,8 +116,8 @@ def _origin(seconds: np.ndarray, results: Sequence[StepResult]) -> float:
 
 
 def _shade(axes: Axes, results: Sequence[StepResult], origin: float) -> None:
-    """Shade the spans of frames that have no pose or an uncertain one, each kind labelled once."""
-    labelled: set[State] = set()
+    """Shade the spans of frames that have no pose or an uncertain one, each kind labeled once."""
+    labeled: set[State] = set()
     start = 0
     for end in range(1, len(results) + 1):
         state = results[start].state
@@ -131,28 +131,28 @@ def _shade(axes: Axes, results: Sequence[StepResult], origin: float) -> None:
                 last - origin,
                 color=color,
                 lw=0,
-                label="_" * (state in labelled) + label,
+                label="_" * (state in labeled) + label,
             )
-            labelled.add(state)
+            labeled.add(state)
         start = end
 
 
-def _coloured_line(axes: Axes, seconds: np.ndarray, errors: np.ndarray) -> None:
-    """A line coloured by its height, broken where frames are missing."""
+def _colored_line(axes: Axes, seconds: np.ndarray, errors: np.ndarray) -> None:
+    """A line colored by its height, broken where frames are missing."""
     from matplotlib.collections import LineCollection
 
     knots = np.stack([seconds, errors], axis=1)
     segments = np.stack([knots[:-1], knots[1:]], axis=1) if len(knots) > 1 else np.zeros((0, 2, 2))
     steps = np.diff(seconds)
     near = steps <= 5.0 * np.median(steps) if len(steps) else np.zeros(0, dtype=bool)
-    lines = LineCollection(list(segments[near]), cmap=_error_colours(), lw=1.6, capstyle="round")
+    lines = LineCollection(list(segments[near]), cmap=_error_colors(), lw=1.6, capstyle="round")
     lines.set_array(segments[near, :, 1].mean(axis=1))
     lines.set_clim(0.0, float(np.percentile(errors, 98)) if len(errors) else 1.0)
     axes.add_collection(lines)
     axes.set_xlim(min(0.0, seconds.min(initial=0.0)), seconds.max(initial=1e-3))
 
 
-def _error_colours() -> Colormap:
+def _error_colors() -> Colormap:
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("errors", ["#3d8f7c", "#e0b352", "#c8553d"])

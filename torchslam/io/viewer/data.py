@@ -1,4 +1,4 @@
-"""What view.html shows: the worlds of a run with z up, around their middle, as far as a page can hold them."""
+"""What view.html shows: the submaps of a run with z up, around their middle, as far as a page can hold them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from torchslam.data.association import nearest
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.pictures import aligned
 from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.results import Results
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
 
-MAX_POINTS = 150_000  # of all worlds together: 20 bytes each in the page
+MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
 FRUSTUM = 0.035  # its depth, in radii of the scene
@@ -35,17 +35,17 @@ def page_data(results: Results) -> dict[str, Any]:
     """Everything that the page needs, ready for JSON; the numbers as `encoded`. Same results, same data.
 
     frames: one row for each that is shown: index, seconds since the first, state, ...
-    worlds: those with frames of the run, the main one first, each as `_world` has it
+    submaps: those with frames of the run, the main one first, each as `_submap` has it
     """
     figures = results.metrics
     frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
     times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
     reasons = list(dict.fromkeys(frame.reason for frame in frames))
     number_of = {reason: number for number, reason in enumerate(reasons)}
-    paths = {figures["world"]: results.trajectory} | results.others
-    shown = [world for world in results.worlds if len(paths.get(world.number, ()))]
-    shown.sort(key=lambda world: world.number != figures["world"])
-    budget = MAX_POINTS / max(sum(world.map.num_points for world in shown), 1)
+    paths = {figures["submap"]: results.trajectory} | results.others
+    shown = [submap for submap in results.submaps if len(paths.get(submap.number, ()))]
+    shown.sort(key=lambda submap: submap.number != figures["submap"])
+    budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
     accuracy = f" · ATE {figures['ate_m']:.3g} m" if "ate_m" in figures else ""
     return {
         "title": Path(figures.get("source") or "torchslam").name,
@@ -61,9 +61,9 @@ def page_data(results: Results) -> dict[str, Any]:
             "inliers": encoded([frame.inliers for frame in frames], "int32"),
             "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
         },
-        "worlds": [
-            _world(world, paths[world.number], results, times, int(budget * world.map.num_points))
-            for world in shown
+        "submaps": [
+            _submap(submap, paths[submap.number], results, times, int(budget * submap.map.num_points))
+            for submap in shown
         ],
     }
 
@@ -82,24 +82,24 @@ def decoded(packed: dict[str, str]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(packed["data"]), kind)
 
 
-def _world(
-    world: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
+def _submap(
+    submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
-    """A world as it is shown: upright, around the middle of its box; aligned and in metres with ground truth.
+    """A submap as it is shown: upright, around the middle of its box; aligned and in meters with ground truth.
 
     S_shown_map: (4, 4) similarity from the map to what is shown
     frame, keyframe: (F,), (K,) rows of `frames`; poses, keyframe_poses: (F, 3, 4), (K, 3, 4) camera to world
-    errors:      (F,) metres, NaN where unknown; breaks: rows before which the path is broken
-    truth:       (M, 3); points, colors: (P, 3), no colours where no image was seen; points_total: before thinning
+    errors:      (F,) meters, NaN where unknown; breaks: rows before which the path is broken
+    truth:       (M, 3); points, colors: (P, 3), no colors where no image was seen; points_total: before thinning
     box:         (2, 3) lowest and highest corner around what matters; radius: half its diagonal
     """
     evaluation = _evaluation(path, results)
     S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
-    keyframes = keyframe_trajectory(world.map, results.session)
+    keyframes = keyframe_trajectory(submap.map, results.session)
     up = torch.eye(4, dtype=torch.float64)
-    up[:3, :3] = upright_rotation(aligned(Trajectory(path.timestamps, se3_inverse(world.map.T_cw)), S).T_wc)
+    up[:3, :3] = upright_rotation(aligned(Trajectory(path.timestamps, se3_inverse(submap.map.T_cw)), S).T_wc)
     S = up @ S
-    points_w, colors = _points(world)
+    points_w, colors = _points(submap)
     box = torch.from_numpy(
         robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy()).T.copy()
     )
@@ -119,7 +119,7 @@ def _world(
     steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
     steps[[row - 1 for row in breaks]] = 0.0
     return {
-        "name": f"{world.number}" + (", the main one" if world.number == results.metrics["world"] else ""),
+        "name": f"{submap.number}" + (", the main one" if submap.number == results.metrics["submap"] else ""),
         "unit": "" if evaluation is None else "m",
         "S_shown_map": S.tolist(),
         "frame": encoded(frame, "int32"),
@@ -140,7 +140,7 @@ def _world(
 
 
 def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
-    """The errors of the poses in a world; None where there is nothing to compare them with."""
+    """The errors of the poses in a submap; None where there is nothing to compare them with."""
     if results.groundtruth is None:
         return None
     try:
@@ -150,21 +150,21 @@ def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
 
 
 def _during(results: Results, path: Trajectory) -> Trajectory:
-    """The ground truth from the first to the last pose of a world."""
+    """The ground truth from the first to the last pose of a submap."""
     truth = results.groundtruth
     assert truth is not None  # else there is no evaluation
     during = (truth.timestamps >= path.timestamps[0]) & (truth.timestamps <= path.timestamps[-1])
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
-def _points(world: Submap) -> tuple[Tensor, Tensor]:
-    """(P, 3) positions and (P, 3) colours of the living points."""
-    if world.map.num_points == 0:
+def _points(submap: Submap) -> tuple[Tensor, Tensor]:
+    """(P, 3) positions and (P, 3) colors of the living points."""
+    if submap.map.num_points == 0:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
-    ids = world.map.valid_points()
-    positions_w = world.map.positions_w[ids].double()
+    ids = submap.map.valid_points()
+    positions_w = submap.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)
-    return positions_w[finite], world.map.points["colors"][ids][finite]
+    return positions_w[finite], submap.map.points["colors"][ids][finite]
 
 
 def _shown_rows(timestamps: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:

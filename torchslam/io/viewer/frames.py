@@ -29,7 +29,7 @@ VIDEO = "tracked.mp4"
 MAX_WIDTH = 960  # pixels of the film: it is to stay small
 BAR = 26  # pixels, for the words under the image
 USUAL_RATE = 30.0  # frames per second of a film of what nobody knows the rate of
-COLOURS = {  # blue, green, red
+COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
     State.TRACKING: (65, 190, 87),
     State.UNCERTAIN: (225, 130, 190),
@@ -43,7 +43,7 @@ FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 class FrameSnapshot:
     """One frame and what became of it.
 
-    image:     (H, W) uint8 grey
+    image:     (H, W) uint8 gray
     keypoints: (N, 2) all that were found; tracked: (m, 2) those whose map points hold the pose, where it is believed
     """
 
@@ -116,7 +116,7 @@ class _Memory(Transformed):
 
 def tracked_pixels(slam: SLAM, index: int) -> Tensor:
     """(m, 2) where a frame of this session sees map points; none while its pose is not believed."""
-    frames, seen = slam.history.frames, slam.history.observations
+    frames, seen = slam.posed_frames.frames, slam.posed_frames.observations
     if len(frames) == 0 or len(seen) == 0:
         return torch.zeros(0, 2, dtype=torch.float64)
     is_it = (frames["frame_index"] == index) & (frames["session"] == slam.session.number)
@@ -169,7 +169,7 @@ class LiveView:
             recorder.words("state", ": ".join(filter(None, (result.state.value, result.reason))))
         if result.is_keyframe:
             slam = self._slam
-            self._map(slam.map, slam.history.trajectory(slam.map, slam.session.number), painted=False)
+            self._map(slam.map, slam.posed_frames.trajectory(slam.map, slam.session.number), painted=False)
 
     def end(self, run: Run) -> None:
         if len(run.trajectory):
@@ -189,7 +189,7 @@ class LiveView:
 
 
 class Film:
-    """tracked.mp4: every frame with its keypoints, those that hold the pose in the colour of the state."""
+    """tracked.mp4: every frame with its keypoints, those that hold the pose in the color of the state."""
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
         """size: (width, height) of the images. Raises ResultsError where no film can be written."""
@@ -207,18 +207,16 @@ class Film:
         image = cv2.cvtColor(
             cv2.resize(glimpse.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
         )
-        for pixels, colour, radius in (
+        for pixels, color, radius in (
             (glimpse.keypoints, UNMATCHED, 1),
-            (glimpse.tracked, COLOURS[result.state], 3),
+            (glimpse.tracked, COLORS[result.state], 3),
         ):
             for x, y in (pixels * self._scale).round().int().tolist():
-                cv2.circle(image, (x, y), radius, colour, 1, cv2.LINE_AA)
+                cv2.circle(image, (x, y), radius, color, 1, cv2.LINE_AA)
         image = cv2.copyMakeBorder(image, 0, BAR, 0, 0, cv2.BORDER_CONSTANT, value=(24, 21, 19))
         words = f"{result.index}  {result.state.value}  {result.inliers or ''}  {result.reason}"
         place = (8, image.shape[0] - 8)
-        cv2.putText(
-            image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, COLOURS[result.state], 1, cv2.LINE_AA
-        )
+        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, COLORS[result.state], 1, cv2.LINE_AA)
         self._writer.write(image)
 
     def end(self, run: Run) -> None:

@@ -1,4 +1,4 @@
-/* What there is to draw of a world, from the arrays of the page. */
+/* What there is to draw of a submap, from the arrays of the page. */
 
 const RAMP = [[42, 157, 143], [138, 190, 120], [233, 196, 106], [231, 140, 90], [209, 73, 91]]; // no error to the most
 const STATES = ["initializing", "tracking", "uncertain", "lost"];
@@ -20,8 +20,8 @@ function decodeAll(value) {
   return Object.fromEntries(Object.entries(value).map(([name, inner]) => [name, decodeAll(inner)]));
 }
 
-/** The colour (r, g, b) of an error between 0 and `most`. */
-function rampColour(error, most) {
+/** The color (r, g, b) of an error between 0 and `most`. */
+function rampColor(error, most) {
   const at = Math.max(0, Math.min(1, error / most)) * (RAMP.length - 1);
   const low = Math.min(Math.floor(at), RAMP.length - 2);
   return RAMP[low].map((value, i) => Math.round(value + (at - low) * (RAMP[low + 1][i] - value)));
@@ -45,12 +45,12 @@ function pathLines(positions, isGap) {
   return { ends: new Float32Array(ends), rows };
 }
 
-/** The eight edges of the pyramid from a camera's centre to its image. pose: 3 rows of 4, camera to world. */
+/** The eight edges of the pyramid from a camera's center to its image. pose: 3 rows of 4, camera to world. */
 function frustumLines(pose, corners, depth) {
   const place = ([x, y, z]) => [0, 4, 8].map((row) => pose[row] * x + pose[row + 1] * y + pose[row + 2] * z + pose[row + 3]);
   const image = corners.map((corner) => place(corner.map((value) => value * depth)));
-  const centre = place([0, 0, 0]);
-  return image.flatMap((corner, i) => [...centre, ...corner, ...corner, ...image[(i + 1) % 4]]);
+  const center = place([0, 0, 0]);
+  return image.flatMap((corner, i) => [...center, ...corner, ...corner, ...image[(i + 1) % 4]]);
 }
 
 /** Positions (3 a row) of poses (12 a row). */
@@ -71,10 +71,10 @@ function gridLines([low, high]) {
   return { ends: new Float32Array(ends), step };
 }
 
-/** A colour (r, g, b, opacity) for each of n lines. */
-function colours(count, colour, opacity = 255) {
+/** A color (r, g, b, opacity) for each of n lines. */
+function colors(count, color, opacity = 255) {
   const bytes = new Uint8Array(4 * count);
-  for (let i = 0; i < count; i++) bytes.set([...(typeof colour === "function" ? colour(i) : colour), opacity], 4 * i);
+  for (let i = 0; i < count; i++) bytes.set([...(typeof color === "function" ? color(i) : color), opacity], 4 * i);
   return bytes;
 }
 

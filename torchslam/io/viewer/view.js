@@ -1,4 +1,4 @@
-/* The page: worlds, layers, the frames in time. */
+/* The page: submaps, layers, the frames in time. */
 
 const $ = (id) => document.getElementById(id);
 const data = decodeAll(JSON.parse($("data").textContent));
@@ -8,34 +8,34 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 const painter = createPainter($("scene"));
 const eye = createEye($("scene"), redraw, () => ($("follow").checked = false));
 const layers = {};
-const shown = { world: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
+const shown = { submap: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
 
 const number = (value) => value.toLocaleString("en");
 const tone = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const rgb = (name) => [1, 3, 5].map((i) => parseInt(tone(name).slice(i, i + 2), 16));
 const isOn = (layer) => document.querySelector(`[data-layer=${layer}]`).checked;
 
-// --- worlds and layers ---------------------------------------------------------------------------------------------
+// --- submaps and layers ---------------------------------------------------------------------------------------------
 
-/** Row of the pose of a frame in the world that is shown, -1 where it has none. */
+/** Row of the pose of a frame in the submap that is shown, -1 where it has none. */
 function rowOf(frame) {
-  const row = countUpTo(shown.world.frame, frame) - 1;
-  return row >= 0 && shown.world.frame[row] === frame ? row : -1;
+  const row = countUpTo(shown.submap.frame, frame) - 1;
+  return row >= 0 && shown.submap.frame[row] === frame ? row : -1;
 }
 
-function showWorld(world) {
-  shown.world = world;
-  if (world) {
-    world.positions ??= positionsOf(world.poses);
-    world.most ??= mostOf(world.errors);
-    const hasErrors = Number.isFinite(world.most);
-    $("colour-choice").hidden = !hasErrors;
-    $("colour").value = hasErrors ? "error" : "state";
-    document.querySelector("[data-for=truth]").hidden = world.truth.length === 0;
-    const all = world.points.length / 3;
-    $("count-points").textContent = number(all) + (all < world.points_total ? ` of ${number(world.points_total)}` : "");
-    $("count-path").textContent = length(world.path_length, world.unit);
-    $("count-keyframes").textContent = number(world.keyframe.length);
+function showSubmap(submap) {
+  shown.submap = submap;
+  if (submap) {
+    submap.positions ??= positionsOf(submap.poses);
+    submap.most ??= mostOf(submap.errors);
+    const hasErrors = Number.isFinite(submap.most);
+    $("color-choice").hidden = !hasErrors;
+    $("color").value = hasErrors ? "error" : "state";
+    document.querySelector("[data-for=truth]").hidden = submap.truth.length === 0;
+    const all = submap.points.length / 3;
+    $("count-points").textContent = number(all) + (all < submap.points_total ? ` of ${number(submap.points_total)}` : "");
+    $("count-path").textContent = length(submap.path_length, submap.unit);
+    $("count-keyframes").textContent = number(submap.keyframe.length);
     build();
     resetView();
   }
@@ -43,38 +43,38 @@ function showWorld(world) {
   showFrame(shown.frame);
 }
 
-/** Make all layers of the world that is shown, in the colours of the theme. */
+/** Make all layers of the submap that is shown, in the colors of the theme. */
 function build() {
-  const world = shown.world;
-  if (!world || !painter) return;
+  const submap = shown.submap;
+  if (!submap || !painter) return;
   Object.values(layers).forEach(painter.remove);
-  const points = world.colors.length ? world.colors : new Uint8Array(world.points.length).map((_, i) => rgb("unpainted")[i % 3]);
-  layers.points = painter.points(world.points, points);
-  shown.finest = world.points.length > 3e5 ? 1.3 : 2.6; // pixels: few points would hardly be seen
-  const path = pathLines(world.positions, (row) => world.breaks.includes(row));
-  shown.pathFrames = path.rows.map((row) => world.frame[row]);
-  layers.path = painter.lines(path.ends, colours(path.rows.length, (i) => pathColour(path.rows[i])));
-  const truth = pathLines(world.truth, () => false);
-  layers.truth = painter.lines(truth.ends, colours(truth.rows.length, rgb("truth"), 190));
+  const points = submap.colors.length ? submap.colors : new Uint8Array(submap.points.length).map((_, i) => rgb("unpainted")[i % 3]);
+  layers.points = painter.points(submap.points, points);
+  shown.finest = submap.points.length > 3e5 ? 1.3 : 2.6; // pixels: few points would hardly be seen
+  const path = pathLines(submap.positions, (row) => submap.breaks.includes(row));
+  shown.pathFrames = path.rows.map((row) => submap.frame[row]);
+  layers.path = painter.lines(path.ends, colors(path.rows.length, (i) => pathColor(path.rows[i])));
+  const truth = pathLines(submap.truth, () => false);
+  layers.truth = painter.lines(truth.ends, colors(truth.rows.length, rgb("truth"), 190));
   const edges = [];
-  for (let at = 0; at < world.keyframe_poses.length; at += 12)
-    edges.push(...frustumLines(world.keyframe_poses.subarray(at, at + 12), data.corners, world.frustum));
-  layers.keyframes = painter.lines(new Float32Array(edges), colours(edges.length / 6, rgb("keyframe"), 150));
-  const grid = gridLines(world.box);
-  layers.grid = painter.lines(grid.ends, colours(grid.ends.length / 6, rgb("grid"), 140));
-  $("count-grid").textContent = length(grid.step, world.unit);
-  const byError = $("colour").value === "error";
+  for (let at = 0; at < submap.keyframe_poses.length; at += 12)
+    edges.push(...frustumLines(submap.keyframe_poses.subarray(at, at + 12), data.corners, submap.frustum));
+  layers.keyframes = painter.lines(new Float32Array(edges), colors(edges.length / 6, rgb("keyframe"), 150));
+  const grid = gridLines(submap.box);
+  layers.grid = painter.lines(grid.ends, colors(grid.ends.length / 6, rgb("grid"), 140));
+  $("count-grid").textContent = length(grid.step, submap.unit);
+  const byError = $("color").value === "error";
   $("ramp").hidden = !byError;
   $("states").hidden = byError;
   $("ramp").firstElementChild.style.background = `linear-gradient(90deg, ${RAMP.map((c) => `rgb(${c})`)})`;
-  $("ramp-high").textContent = `≥ ${length(world.most, world.unit)}`;
+  $("ramp-high").textContent = `≥ ${length(submap.most, submap.unit)}`;
 }
 
-function pathColour(row) {
-  const world = shown.world;
-  if ($("colour").value === "error")
-    return Number.isFinite(world.errors[row]) ? rampColour(world.errors[row], world.most) : rgb("unpainted");
-  const state = STATES[frames.state[world.frame[row]]];
+function pathColor(row) {
+  const submap = shown.submap;
+  if ($("color").value === "error")
+    return Number.isFinite(submap.errors[row]) ? rampColor(submap.errors[row], submap.most) : rgb("unpainted");
+  const state = STATES[frames.state[submap.frame[row]]];
   return rgb(state === "tracking" || state === "uncertain" ? state : "later");
 }
 
@@ -83,10 +83,10 @@ function currentFrustum() {
   layers.camera = null;
   const row = rowOf(shown.frame);
   if (row < 0) return;
-  const world = shown.world;
-  const edges = frustumLines(world.poses.subarray(12 * row, 12 * row + 12), data.corners, 1.8 * world.frustum);
-  layers.camera = painter.lines(new Float32Array(edges), colours(8, rgb("camera")));
-  if ($("follow").checked) eye.look({ target: [...world.positions.subarray(3 * row, 3 * row + 3)] });
+  const submap = shown.submap;
+  const edges = frustumLines(submap.poses.subarray(12 * row, 12 * row + 12), data.corners, 1.8 * submap.frustum);
+  layers.camera = painter.lines(new Float32Array(edges), colors(8, rgb("camera")));
+  if ($("follow").checked) eye.look({ target: [...submap.positions.subarray(3 * row, 3 * row + 3)] });
 }
 
 // --- drawing -------------------------------------------------------------------------------------------------------
@@ -107,8 +107,8 @@ function draw() {
   const size = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(scale * side));
   if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   painter.begin(rgb("ground").map((value) => value / 255));
-  const world = shown.world;
-  if (!world) return;
+  const submap = shown.submap;
+  if (!submap) return;
   const view = eye.projection();
   const past = { faded: 0.22, cut: countUpTo(shown.pathFrames, shown.frame) };
   const ink = rgb("ink").map((value) => value / 255);
@@ -116,23 +116,23 @@ function draw() {
   if (isOn("points"))
     painter.draw(layers.points, {
       ...view,
-      size: shown.pointSize * 0.006 * world.radius * canvas.height,
+      size: shown.pointSize * 0.006 * submap.radius * canvas.height,
       limits: [shown.finest * scale * shown.pointSize, 7 * scale * shown.pointSize],
       lift: [...ink, 0.2],
     });
   if (isOn("truth")) painter.draw(layers.truth, { ...view, width: 1.4 * scale });
   if (isOn("keyframes"))
-    painter.draw(layers.keyframes, { ...view, width: scale, faded: 0.25, cut: 8 * countUpTo(world.keyframe, shown.frame) });
+    painter.draw(layers.keyframes, { ...view, width: scale, faded: 0.25, cut: 8 * countUpTo(submap.keyframe, shown.frame) });
   if (isOn("path")) painter.draw(layers.path, { ...view, width: 2.6 * scale, ...past });
   painter.draw(layers.camera, { ...view, width: 2 * scale, above: true });
 }
 
 function resetView(pitch = 0.55) {
-  const [low, high] = shown.world.box;
+  const [low, high] = shown.submap.box;
   const isWide = high[0] - low[0] > high[1] - low[1];
   const { clientWidth: width, clientHeight: height } = $("scene");
   const free = $("time").offsetTop || height; // what the strip of frames leaves
-  const distance = (0.85 * shown.world.radius * height) / Math.tan(FIELD_OF_VIEW / 2) / Math.min(free, width);
+  const distance = (0.85 * shown.submap.radius * height) / Math.tan(FIELD_OF_VIEW / 2) / Math.min(free, width);
   eye.look({ yaw: isWide ? -1.2 : -0.4, pitch, distance, target: low.map((value, i) => (value + high[i]) / 2) });
   eye.shift(0, (height - free) / 2);
 }
@@ -150,10 +150,10 @@ function showFrame(frame) {
   $("frame").value = shown.frame;
   if (last < 0) return;
   const words = [`frame ${frames.index[shown.frame]}`, `${frames.seconds[shown.frame].toFixed(2)} s`, STATES[frames.state[shown.frame]]];
-  if (shown.world && painter) {
+  if (shown.submap && painter) {
     const row = rowOf(shown.frame);
     if (row < 0) words.push("no pose here");
-    else if (Number.isFinite(shown.world.errors[row])) words.push(`error ${length(shown.world.errors[row], shown.world.unit)}`);
+    else if (Number.isFinite(shown.submap.errors[row])) words.push(`error ${length(shown.submap.errors[row], shown.submap.unit)}`);
     currentFrustum();
   }
   if (frames.inliers[shown.frame]) words.push(`${number(frames.inliers[shown.frame])} points seen`);
@@ -179,9 +179,9 @@ function drawStrip() {
     pen.fillStyle = tone(bands[STATES[frames.state[frame]]] ?? "hair");
     pen.fillRect(x(frame - 0.5), 0, x(next - 0.5) - x(frame - 0.5), height);
   }
-  const world = shown.world;
-  const hasErrors = world && Number.isFinite(world.most);
-  const values = hasErrors ? world.errors : frames.inliers;
+  const submap = shown.submap;
+  const hasErrors = submap && Number.isFinite(submap.most);
+  const values = hasErrors ? submap.errors : frames.inliers;
   const most = hasErrors ? values.reduce((a, b) => (b > a ? b : a), 0) : Math.max(...frames.inliers, 1);
   pen.strokeStyle = tone("ink");
   pen.lineWidth = 1.2;
@@ -189,14 +189,14 @@ function drawStrip() {
   pen.beginPath();
   let before = NaN;
   values.forEach((value, i) => {
-    const frame = hasErrors ? world.frame[i] : i;
+    const frame = hasErrors ? submap.frame[i] : i;
     if (!Number.isFinite(value)) return;
     pen[frame - before === 1 ? "lineTo" : "moveTo"](x(frame), height - 2 - ((height - 5) * value) / most);
     before = frame;
   });
   pen.stroke();
   document.querySelectorAll("#curve [data-state]").forEach((word) => (word.hidden = !frames.state.includes(STATES.indexOf(word.dataset.state))));
-  $("curve-words").textContent = last < 0 ? "" : hasErrors ? `error, up to ${length(most, world.unit)}` : `points seen, up to ${number(most)}`;
+  $("curve-words").textContent = last < 0 ? "" : hasErrors ? `error, up to ${length(most, submap.unit)}` : `points seen, up to ${number(most)}`;
 }
 
 function play(playing) {
@@ -245,8 +245,8 @@ const KEYS = {
   "[": () => resizePoints(0.8),
   "]": () => resizePoints(1.25),
   f: () => $("follow").click(),
-  r: () => shown.world && resetView(),
-  t: () => shown.world && resetView(STEEPEST),
+  r: () => shown.submap && resetView(),
+  t: () => shown.submap && resetView(STEEPEST),
   "?": () => $("help").showModal(),
 };
 
@@ -262,8 +262,8 @@ function listen() {
   $("top").addEventListener("click", KEYS.t);
   $("help-open").addEventListener("click", KEYS["?"]);
   $("follow").addEventListener("change", () => showFrame(shown.frame));
-  $("world").addEventListener("change", (event) => showWorld(data.worlds[event.target.value]));
-  $("colour").addEventListener("change", () => (build(), showFrame(shown.frame)));
+  $("submap").addEventListener("change", (event) => showSubmap(data.submaps[event.target.value]));
+  $("color").addEventListener("change", () => (build(), showFrame(shown.frame)));
   document.querySelectorAll("[data-layer]").forEach((box) => box.addEventListener("change", redraw));
   addEventListener("resize", () => (drawStrip(), redraw()));
   dark.addEventListener("change", () => (build(), drawStrip(), showFrame(shown.frame)));
@@ -281,18 +281,18 @@ function begin() {
   $("title").textContent = data.title;
   $("facts").textContent = data.facts;
   $("frame").max = Math.max(last, 0);
-  data.worlds.forEach((world, i) => $("world").add(new Option(world.name, i)));
-  $("world-choice").hidden = data.worlds.length < 2;
+  data.submaps.forEach((submap, i) => $("submap").add(new Option(submap.name, i)));
+  $("submap-choice").hidden = data.submaps.length < 2;
   $("legend").open = innerWidth > 600;
-  $("legend").hidden = data.worlds.length === 0;
-  $("trouble").hidden = painter !== null && data.worlds.length > 0;
+  $("legend").hidden = data.submaps.length === 0;
+  $("trouble").hidden = painter !== null && data.submaps.length > 0;
   $("trouble").textContent = painter ? data.failure || "There is no map." : "This browser has no WebGL 2, which draws the map.";
   listen();
-  const asked = new URLSearchParams(location.hash.slice(1)); // view.html#world=0&frame=120
+  const asked = new URLSearchParams(location.hash.slice(1)); // view.html#submap=0&frame=120
   if (asked.has("frame")) shown.frame = Number(asked.get("frame")) || 0;
-  const chosen = data.worlds[Number(asked.get("world")) || 0] ?? data.worlds[0] ?? null;
-  $("world").value = data.worlds.indexOf(chosen);
-  showWorld(chosen);
+  const chosen = data.submaps[Number(asked.get("submap")) || 0] ?? data.submaps[0] ?? null;
+  $("submap").value = data.submaps.indexOf(chosen);
+  showSubmap(chosen);
   document.documentElement.dataset.ready = $("readout").textContent;
 }
 
