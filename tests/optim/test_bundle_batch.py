@@ -12,10 +12,9 @@ from torch.func import vmap
 
 from torchslam.geometry import se3_exp
 from torchslam.optim import BundleProblem, CameraPrior, PosePrior, bundle_adjust
-from torchslam.optim.bundle import minimization
-from torchslam.optim.bundle.dense import GridBundle
-from torchslam.optim.bundle.problem import sanitized
-from torchslam.optim.bundle.sparse_layout import what_moves
+from torchslam.optim.bundle import _minimization as minimization
+from torchslam.optim.bundle._dense import GridBundle
+from torchslam.optim.bundle._problem import sanitized, what_moves
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 EQUAL = {"rtol": 1e-8, "atol": 1e-10}

@@ -180,7 +180,7 @@ def run_graph(graph, start=0):
 
 def test_a_run_graph_keeps_its_row_numbers(tmp_path):
     path = tmp_path / "graph.safetensors"
-    graph = run_graph(replace(simulated()[1], world=torch.full((10,), 3)), start=5)
+    graph = run_graph(replace(simulated()[1], submap=torch.full((10,), 3)), start=5)
     graph.save(path)
     loaded = RunGraph.load(path)
     assert type(loaded) is RunGraph
@@ -188,7 +188,7 @@ def test_a_run_graph_keeps_its_row_numbers(tmp_path):
         assert torch.equal(getattr(loaded, name), getattr(graph, name)), name
     plain = ObservationGraph.load(path)
     assert type(plain) is ObservationGraph
-    assert torch.equal(plain.world, graph.world)
+    assert torch.equal(plain.submap, graph.submap)
     plain.save(path)
     with pytest.raises(TorchslamError, match="is not an observation graph"):
         RunGraph.load(path)
@@ -198,15 +198,15 @@ def test_a_file_from_before_there_were_worlds_has_one(tmp_path):
     _, graph = simulated()
     graph.save(tmp_path / "new")
     with safe_open(tmp_path / "new", framework="pt") as file:
-        metadata, names = file.metadata(), set(file.keys()) - {"world"}
+        metadata, names = file.metadata(), set(file.keys()) - {"submap"}
         save_file({name: file.get_tensor(name) for name in names}, tmp_path / "old", metadata)
-    assert torch.equal(ObservationGraph.load(tmp_path / "old").world, torch.zeros(10, dtype=torch.int64))
+    assert torch.equal(ObservationGraph.load(tmp_path / "old").submap, torch.zeros(10, dtype=torch.int64))
 
 
 def two_worlds():
     """Truths and graphs of two worlds that share a camera, and both as one graph in an order of its own."""
     (truth_1, one), (truth_2, two) = simulated(seed=0), simulated(frames=7, points=30, seed=1)
-    one, two = replace(one, world=torch.full((10,), 4)), replace(two, world=torch.full((7,), 1))
+    one, two = replace(one, submap=torch.full((10,), 4)), replace(two, submap=torch.full((7,), 1))
     return (truth_1, truth_2), (one, two), join([one, two])
 
 
@@ -216,7 +216,7 @@ def close(found, expected):
 
 def test_worlds_are_solved_each_on_its_own():
     _, (one, two), both = two_worlds()
-    assert both.worlds == [1, 4]
+    assert both.submaps == [1, 4]
     solution, first, second = solve(both), solve(one), solve(two)
     # Frames in between are refined in one batch: on some processors that moves their last digits.
     close(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
@@ -226,9 +226,9 @@ def test_worlds_are_solved_each_on_its_own():
     assert torch.equal(solution.success, torch.cat([first.success, second.success]))
     assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
     assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
-    assert torch.equal(solution.world, both.world)
-    for world, alone in ((4, first), (1, second)):
-        found = solution.trajectory_in(world).T_wc
+    assert torch.equal(solution.submap, both.submap)
+    for submap, alone in ((4, first), (1, second)):
+        found = solution.trajectory_in(submap).T_wc
         torch.testing.assert_close(found, alone.trajectory.T_wc, atol=1e-12, rtol=0)
     assert torch.equal(solution.trajectory.T_wc, solution.trajectory_in(4).T_wc)  # ten frames against seven
     assert torch.equal(solution.T_cw[0], both.T_cw[0])
@@ -246,7 +246,7 @@ def test_rows_of_worlds_may_be_mixed():
         both,
         timestamps=both.timestamps[order],
         T_cw=both.T_cw[order],
-        world=both.world[order],
+        submap=both.submap[order],
         is_keyframe=both.is_keyframe[order],
         frame_index=place[both.frame_index[rows]],
         **{name: getattr(both, name)[rows] for name in ("point_index", "pixels", "weights")},
@@ -279,7 +279,7 @@ def test_worlds_that_cannot_be_solved_are_refused():
     with pytest.raises(ValueError, match="free camera"):
         solve(both, free_camera=True)
     with pytest.raises(ValueError, match="no keyframe"):
-        solve(replace(both, is_keyframe=both.is_keyframe & (both.world == 1)))
+        solve(replace(both, is_keyframe=both.is_keyframe & (both.submap == 1)))
     shared = both.point_index.clone()
     shared[both.frame_index == 10] = 0
     with pytest.raises(ValueError, match="seen in two worlds"):
@@ -289,7 +289,7 @@ def test_worlds_that_cannot_be_solved_are_refused():
 def test_joined_run_graphs_keep_their_names():
     _, graph = simulated()
     both = join(
-        [run_graph(graph), replace(run_graph(graph, start=100), world=torch.ones(10, dtype=torch.int64))]
+        [run_graph(graph), replace(run_graph(graph, start=100), submap=torch.ones(10, dtype=torch.int64))]
     )
     assert type(both) is RunGraph
     assert both.frame_ids.tolist() == [*range(10), *range(100, 110)]

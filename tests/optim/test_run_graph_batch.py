@@ -15,7 +15,7 @@ from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve
 from torchslam.optim.run_graph_batch import solve_each
 
 SIZES = ((10, 50, 0), (8, 40, 1), (7, 60, 2))
-COLUMNS = ("T_cw", "points_w", "success", "moved_points", "converged", "world", "timestamps")
+COLUMNS = ("T_cw", "points_w", "success", "moved_points", "converged", "submap", "timestamps")
 
 
 def several(noise: float = 0.5) -> list[ObservationGraph]:
@@ -84,11 +84,11 @@ def test_each_says_of_its_own_worlds_whether_they_are_at_a_minimum() -> None:
     (*_, apart), (graph, *_) = two_worlds(), several()
     ends = solve(apart)
     there = replace(apart, T_cw=ends.T_cw, points_w=ends.points_w)
-    second = (apart.world == 1)[:, None, None]
+    second = (apart.submap == 1)[:, None, None]
     half = replace(there, T_cw=torch.where(second, apart.T_cw, there.T_cw))
     found = solve_each([graph, half, there], iterations=2)
     assert [bool(each.converged.any()) for each in found] == [False, True, True]
-    assert torch.equal(found[1].converged, apart.world == 4)
+    assert torch.equal(found[1].converged, apart.submap == 4)
     assert found[2].converged.all()
     for each, alone in zip(found, (graph, half, there), strict=True):
         assert torch.equal(each.converged, solve(alone, iterations=2).converged)

@@ -160,7 +160,7 @@ class _Data(NamedTuple):
 
 @dataclass(frozen=True)
 class _Problem:
-    """The least-squares problems for `levenberg.minimize`, and what follows from their minima."""
+    """The least-squares problems for `levenberg_marquardt.minimize`, and what follows from their minima."""
 
     residual: Residual
     product: Product

@@ -46,7 +46,7 @@ class ObservationGraph:
     weights:     (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances
     camera:      one for all frames
     is_keyframe: (F,) bool; keyframes and points are solved together, the other frames against the points
-    world:       (F,) int64 in which world a frame is; worlds share nothing but the camera. All in world 0 if left out
+    submap:       (F,) int64 in which world a frame is; worlds share nothing but the camera. All in world 0 if left out
     """
 
     timestamps: Tensor
@@ -58,13 +58,13 @@ class ObservationGraph:
     weights: Tensor
     camera: Camera
     is_keyframe: Tensor
-    world: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    submap: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
 
     _SCHEMA: ClassVar[Schema] = {
         "timestamps": ("F", (), float),
         "T_cw": ("F", (4, 4), float),
         "is_keyframe": ("F", (), bool),
-        "world": ("F", (), int),
+        "submap": ("F", (), int),
         "points_w": ("P", (3,), float),
         "frame_index": ("O", (), int),
         "point_index": ("O", (), int),
@@ -73,18 +73,20 @@ class ObservationGraph:
     }
 
     def __post_init__(self) -> None:
-        if len(self.world) == 0:
-            object.__setattr__(self, "world", torch.zeros_like(self.is_keyframe, dtype=torch.int64))
+        if len(self.submap) == 0:
+            object.__setattr__(self, "submap", torch.zeros_like(self.is_keyframe, dtype=torch.int64))
 
     @property
-    def worlds(self) -> list[int]:
+    def submaps(self) -> list[int]:
         """The worlds that there are, ascending."""
-        return [int(world) for world in torch.unique(self.world)]  # `tolist` fails in transforms of torch 2.5
+        return [
+            int(submap) for submap in torch.unique(self.submap)
+        ]  # `tolist` fails in transforms of torch 2.5
 
-    def part(self, world: int) -> tuple[Tensor, Tensor, Tensor]:
+    def part(self, submap: int) -> tuple[Tensor, Tensor, Tensor]:
         """Rows of the frames, the observations and the points of one world; points without observations have none."""
-        frames = (self.world == world).nonzero().squeeze(-1)
-        rows = (self.world[self.frame_index] == world).nonzero().squeeze(-1)
+        frames = (self.submap == submap).nonzero().squeeze(-1)
+        rows = (self.submap[self.frame_index] == submap).nonzero().squeeze(-1)
         return frames, rows, torch.unique(self.point_index[rows])
 
     def save(self, path: str | Path) -> None:
@@ -106,7 +108,7 @@ class ObservationGraph:
             check_regular(path, _MAX_BYTES, "a graph that is read")
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
-                names = [name for name in cls.columns() if name in known or name != "world"]
+                names = [name for name in cls.columns() if name in known or name != "submap"]
                 tensors = {name: file.get_tensor(name) for name in (*names, "camera")}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
@@ -169,9 +171,9 @@ class GraphSolution:
     moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.
     converged: (F,) bool, the search for a frame's pose, and before for its world's keyframes and points, ended at a
                minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
-    world:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
+    submap:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
     keyframes: the bundle adjustments of keyframes and points, with their covariances, one per world in the order of
-               `ObservationGraph.worlds`; rows are those of the world's keyframes and of the points its frames see
+               `ObservationGraph.submaps`; rows are those of the world's keyframes and of the points its frames see
     """
 
     timestamps: Tensor
@@ -181,18 +183,18 @@ class GraphSolution:
     success: Tensor
     moved_points: Tensor
     converged: Tensor
-    world: Tensor
+    submap: Tensor
     keyframes: tuple[BundleSolution, ...]
 
     @property
     def trajectory(self) -> Trajectory:
         """Camera to world, ordered by time, differentiable; of the world with most frames."""
-        worlds, frames = torch.unique(self.world, return_counts=True)
+        worlds, frames = torch.unique(self.submap, return_counts=True)
         return self.trajectory_in(int(worlds[frames.argmax()]))
 
-    def trajectory_in(self, world: int) -> Trajectory:
+    def trajectory_in(self, submap: int) -> Trajectory:
         """Camera to world, ordered by time, differentiable; of one world."""
-        rows = (self.world == world).nonzero().squeeze(-1)
+        rows = (self.submap == submap).nonzero().squeeze(-1)
         order = rows[torch.argsort(self.timestamps[rows], stable=True)]
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
@@ -215,7 +217,7 @@ def solve(
     quadratic part at 95 % of a Gaussian. Raises ValueError if a world has no keyframe, if a point is seen in two
     worlds, and for `free_camera` with several worlds, of which each would find a camera of its own.
     """
-    worlds = graph.worlds
+    worlds = graph.submaps
     if free_camera is not False and len(worlds) > 1:
         raise ValueError("a free camera needs a graph of one world")
     solved = graph.points_w.new_zeros(len(graph.points_w), dtype=torch.int64)
@@ -223,8 +225,8 @@ def solve(
     success, moved = torch.zeros_like(graph.is_keyframe), torch.zeros_like(solved, dtype=torch.bool)
     bundles: list[BundleSolution] = []
     options = (kernel, scale, backward, iterations, tolerance)
-    for world in worlds:
-        keyframes, points, problem = keyframes_of(graph, world)
+    for submap in worlds:
+        keyframes, points, problem = keyframes_of(graph, submap)
         solved[points] += 1
         bundle = bundle_adjust(
             problem, kernel, scale, free_camera, backward, iterations, tolerance, progress=progress
@@ -244,19 +246,19 @@ def solve(
     camera = bundles[0].camera
     T_cw, success, settled = between(graph, T_cw, points_w, camera, moved, success, *options)
     found = T_cw, points_w, camera, success, moved, settled & converged_of(graph, bundles)
-    return GraphSolution(graph.timestamps, *found, graph.world, tuple(bundles))
+    return GraphSolution(graph.timestamps, *found, graph.submap, tuple(bundles))
 
 
-def keyframes_of(graph: ObservationGraph, world: int) -> tuple[Tensor, Tensor, BundleProblem]:
+def keyframes_of(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
     """The keyframes (k,) of one world, its points (p,), and their bundle adjustment.
 
     Raises ValueError where there is no keyframe.
     """
-    frames, rows, points = graph.part(world)
+    frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
     if len(keyframes) == 0:
         raise ValueError("a world of the graph has no keyframe")
-    slots = torch.full_like(graph.world, -1)
+    slots = torch.full_like(graph.submap, -1)
     slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
     problem = BundleProblem(
@@ -273,9 +275,9 @@ def keyframes_of(graph: ObservationGraph, world: int) -> tuple[Tensor, Tensor, B
 
 
 def converged_of(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
-    """(F,) whether the bundle adjustment of each frame's world, in the order of `graph.worlds`, has converged."""
+    """(F,) whether the bundle adjustment of each frame's world, in the order of `graph.submaps`, has converged."""
     converged = torch.cat([bundle.convergence.converged for bundle in bundles])
-    return converged[torch.unique(graph.world, return_inverse=True)[1]]
+    return converged[torch.unique(graph.submap, return_inverse=True)[1]]
 
 
 def between(

@@ -85,16 +85,16 @@ def _solve_alike(
     """Graphs whose cameras have one model, together."""
     options = kernel, scale, backward, iterations, tolerance
     worlds = [
-        _World(number, *keyframes_of(graph, world))
+        _World(number, *keyframes_of(graph, submap))
         for number, graph in enumerate(graphs)
-        for world in graph.worlds
+        for submap in graph.submaps
     ]
     bundles = _bundles(worlds, *options)
-    # Rows of all graphs, one after the other, as `join` has them; `world` tells the graphs apart.
+    # Rows of all graphs, one after the other, as `join` has them; `submap` tells the graphs apart.
     joined = join([_plain(graph, number) for number, graph in enumerate(graphs)])
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
-    frames = torch.cat([world.keyframes + frame_starts[world.graph] for world in worlds])
-    points = torch.cat([world.points + point_starts[world.graph] for world in worlds])
+    frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in worlds])
+    points = torch.cat([submap.points + point_starts[submap.graph] for submap in worlds])
     if len(torch.unique(points)) < len(points):
         raise ValueError("a point is seen in two worlds")
     success, moved = torch.zeros_like(joined.is_keyframe), joined.points_w.new_zeros(len(joined.points_w))
@@ -106,16 +106,16 @@ def _solve_alike(
     moved = moved.bool().index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
     success = success.index_copy(0, frames, succeeded & finite)
     params = torch.stack([graph.camera.params for graph in graphs])
-    camera = graphs[0].camera.with_params(params[joined.world])
+    camera = graphs[0].camera.with_params(params[joined.submap])
     T_cw, success, settled = between(joined, T_cw, points_w, camera, moved, success, *options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
-        own = tuple(bundle for bundle, world in zip(bundles, worlds, strict=True) if world.graph == number)
+        own = tuple(bundle for bundle, submap in zip(bundles, worlds, strict=True) if submap.graph == number)
         converged = settled[rows] & converged_of(graph, own)
         found = T_cw[rows], points_w[places], graph.camera, success[rows], moved[places], converged
-        solutions.append(GraphSolution(graph.timestamps, *found, graph.world, own))
+        solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
     return tuple(solutions)
 
 
@@ -176,7 +176,7 @@ def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:
     """The columns that every graph has, all of one world, whose number is the graph's."""
     columns = {name: getattr(graph, name) for name in ObservationGraph.columns()}
     whole = ObservationGraph(camera=graph.camera, **columns)
-    return replace(whole, world=torch.full_like(graph.world, number))
+    return replace(whole, submap=torch.full_like(graph.submap, number))
 
 
 def _starts(tables: Sequence[Tensor]) -> list[int]:

@@ -1,6 +1,6 @@
 """The adjustment around a keyframe in a process of its own, while this one tracks the next frames: the same bytes.
 
-What is adjusted and when its outcome counts is `mapping.adjusting`'s to say; here it is only computed elsewhere.
+`mapping.local_bundle` selects the window and applies the result; this process only solves it.
 """
 
 from __future__ import annotations
@@ -13,10 +13,8 @@ import numpy as np
 import torch
 
 from torchslam.geometry import Camera
-from torchslam.mapping.async_bundle import Answer
-from torchslam.mapping.local_bundle import Adjusted, solve_around
-from torchslam.optim import BundleProblem
-from torchslam.optim.bundle.schur import Marginals
+from torchslam.mapping.local_bundle import BundleResult, PendingResult, solve_local
+from torchslam.optim import BundleProblem, Marginals
 from torchslam.parallel.worker import WithWorker, pack_task, requests, send_result, try_call, unwrap
 
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
@@ -24,7 +22,7 @@ SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "
 
 
 class BundleWorker(WithWorker):
-    """Solves with another process, see `mapping.adjusting.Solver`; here until it has started, or where it was ended.
+    """Solves with another process, see `mapping.local_bundle.Solver`; here until it has started, or where it was ended.
 
     There is a process while this is entered.
     """
@@ -35,12 +33,12 @@ class BundleWorker(WithWorker):
         self._has_task = False
         self._number = 0  # of the last problem that was sent
 
-    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
         number = self._send(problem, iterations, covariances)
 
-        def answer() -> Adjusted:
+        def answer() -> BundleResult:
             found = None if number is None else self._receive(number)
-            return solve_around(problem, iterations, covariances) if found is None else found
+            return solve_local(problem, iterations, covariances) if found is None else found
 
         return answer
 
@@ -55,7 +53,7 @@ class BundleWorker(WithWorker):
         message = pickle.dumps((self._number, arrays, iterations, covariances))
         return self._number if self._worker.send(message) else None
 
-    def _receive(self, number: int) -> Adjusted | None:
+    def _receive(self, number: int) -> BundleResult | None:
         """The answer of a number; those before it were not wanted in the end. None where there is nobody to answer."""
         while (answer := self._worker.receive()) is not None:
             answered, found = answer
@@ -64,13 +62,13 @@ class BundleWorker(WithWorker):
         return None
 
 
-def _adjusted(arrays: list[np.ndarray]) -> Adjusted:
+def _adjusted(arrays: list[np.ndarray]) -> BundleResult:
     """What `_arrays` packed."""
     T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
-    return Adjusted(T_cw, points_w, Marginals(*covariances) if covariances else None)
+    return BundleResult(T_cw, points_w, Marginals(*covariances) if covariances else None)
 
 
-def _arrays(adjusted: Adjusted) -> list[np.ndarray]:
+def _arrays(adjusted: BundleResult) -> list[np.ndarray]:
     """For the way between processes: tensors are slow to pickle."""
     return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
 
@@ -80,7 +78,7 @@ def _work(connection: Connection, camera: Camera) -> None:
 
     def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
         columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
-        return _arrays(solve_around(BundleProblem(camera=camera, **columns), iterations, covariances))
+        return _arrays(solve_local(BundleProblem(camera=camera, **columns), iterations, covariances))
 
     for number, *problem in requests(connection):
         send_result(connection, (number, try_call("adjusts", solve, *problem)))

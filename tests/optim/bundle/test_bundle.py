@@ -5,7 +5,7 @@ import torch
 
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, umeyama
 from torchslam.optim import bundle_adjust
-from torchslam.optim.bundle import schur
+from torchslam.optim.bundle import _schur as schur
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 

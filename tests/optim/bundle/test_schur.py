@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from torchslam.optim.bundle import schur
-from torchslam.optim.bundle.schur import NormalEquations, Tangent, build_structure
+from torchslam.optim.bundle import _schur as schur
+from torchslam.optim.bundle._schur import NormalEquations, Tangent, build_structure
 
 
 def random_system(generator, num_frames=5, num_points=12, num_camera=2):

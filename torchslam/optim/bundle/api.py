@@ -12,9 +12,9 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle.minimization import BundleMinimization, Found
-from torchslam.optim.bundle.problem import BundleProblem, sanitized
-from torchslam.optim.bundle.schur import Marginals
+from torchslam.optim.bundle._minimization import BundleMinimization, Found
+from torchslam.optim.bundle._problem import BundleProblem, sanitized
+from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.core.implicit import Backward, check_backward, minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence, Progress
 

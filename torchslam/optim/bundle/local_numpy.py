@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
-from torchslam.geometry.whitening import whitening
-from torchslam.optim.bundle.problem import BundleProblem, as_mask, checked_rows
+from torchslam.geometry.gating import whitening
+from torchslam.optim.bundle._problem import BundleProblem, as_mask, checked_rows
 from torchslam.optim.core.linear import inverse_root_3x3
 from torchslam.optim.core.numpy_backend import (
     MIN_DEPTH,
@@ -222,7 +222,7 @@ class _Model:
 
     def _equations(self, use_curvature: bool) -> _Equations:
         """Gauss-Newton normal equations, optionally with the kernel's curvature, as in
-        `residuals.gauss_newton_expansion` and `assembly.assemble`."""
+        `residuals.gauss_newton_expansion` and `bundle._sparse.assemble`."""
         window, (R_cw, rays_w, image, inverse, errors, squared, weight) = self.window, self.linearization
         in_image = (R_cw[:2] - image[:, None] * R_cw[2]) * inverse  # (2, 3, O)
         J = window.along[0][:, None] * in_image[0] + window.along[1][:, None] * in_image[1]
@@ -268,7 +268,7 @@ class _Step(NamedTuple):
 
 @dataclass(frozen=True)
 class _Equations:
-    """Normal equations of frames that move along the axes of the world, as in `assembly`, and of points.
+    """Normal equations of frames that move along the axes of the world, as in `bundle._sparse`, and of points.
 
     frames: (F', 6, 6), frames_gradient: (F', 6); points: (6, P) as `_LOWER`, points_gradient: (3, P)
     blocks: (6, 3, O') of observations by free frames, frame against point; point: (O',) of each

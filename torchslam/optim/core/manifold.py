@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchslam.optim.core import tangent
 from torchslam.optim.core.batching import Tensors
-from torchslam.optim.pose_graph import model as pose_graph_model
 
 Manifold = Literal["euclidean", "se3", "sim3"]
 """What an unknown moves on.
@@ -34,7 +33,7 @@ class _Moves(NamedTuple):
 
 _MATRICES = {
     "se3": _Moves(6, tangent.retract, tangent.push, tangent.pull_back),
-    "sim3": _Moves(7, pose_graph_model.retract, pose_graph_model.push, pose_graph_model.pull_back),
+    "sim3": _Moves(7, tangent.retract_sim3, tangent.push_sim3, tangent.pull_back_sim3),
 }
 
 

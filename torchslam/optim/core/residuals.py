@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.gating import is_definite, whitening
 from torchslam.geometry.robust import Kernel, robustify
-from torchslam.geometry.whitening import is_definite, whitening
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
-"""The left-perturbation tangent of SE(3) as the solvers use it: xi = (v, omega), translation first."""
+"""Left perturbations of SE(3), xi = (v, omega), translation first, and of Sim(3), with the log scale last."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchslam.geometry.lie import skew
+from torchslam.geometry.lie import sim3_exp, skew
 
 
 def retract(T: Tensor, xi: Tensor) -> Tensor:
@@ -45,6 +47,12 @@ def turned(R: Tensor, values: Tensor) -> Tensor:
     return (R[..., None, :, :] @ values.unflatten(-2, (2, 3))).flatten(-3, -2)
 
 
+def cross_entries(u: Sequence[Tensor], columns: Sequence[Tensor]) -> list[Tensor]:
+    """The three entries of u x columns, of the three of either, each of any shape that broadcasts."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return [(u[i] * columns[j]).addcmul(u[j], columns[i], value=-1) for i, j in pairs]
+
+
 def move(points_c: Tensor, xi: Tensor) -> Tensor:
     """The velocity of points in the camera frame when the pose moves along xi: v + omega x p.
 
@@ -57,3 +65,25 @@ def point_jacobian(points_c: Tensor) -> Tensor:
     """d p / d xi at zero: [I, -p^]. (..., 3) -> (..., 3, 6)."""
     eye = torch.eye(3, dtype=points_c.dtype, device=points_c.device)
     return torch.cat((eye.expand(*points_c.shape, 3), -skew(points_c)), dim=-1)
+
+
+def retract_sim3(S: Tensor, xi: Tensor) -> Tensor:
+    """exp(xi) @ S, the scale kept where xi has no seventh number. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
+    return sim3_exp(torch.nn.functional.pad(xi, (0, 7 - xi.shape[-1]))) @ S
+
+
+def pull_back_sim3(S: Tensor, grad_S: Tensor) -> Tensor:
+    """The gradient with respect to xi (..., 7), at zero, of a loss with gradient `grad_S` at exp(xi) @ S."""
+    columns, grads = S[..., :3, :], grad_S[..., :3, :]
+    rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
+    return torch.cat((grads[..., 3], rotation, (columns * grads).sum((-2, -1))[..., None]), dim=-1)
+
+
+def push_sim3(S: Tensor, xi: Tensor) -> Tensor:
+    """The change of S, to first order, when it moves along xi. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
+    columns = S[..., :3, :]
+    turned = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
+    if xi.shape[-1] == 7:
+        turned = turned + xi[..., 6:, None] * columns
+    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    return torch.nn.functional.pad(changed, (0, 0, 0, 1))

@@ -13,8 +13,7 @@ from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim.core.implicit import Backward, check_backward, minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence
-from torchslam.optim.pose_graph.minimization import PoseGraphMinimization
-from torchslam.optim.pose_graph.model import Inputs
+from torchslam.optim.pose_graph._problem import Inputs, PoseGraphMinimization
 
 # 95 % of the norms of seven standard normal numbers lie below.
 _SCALE = 3.75

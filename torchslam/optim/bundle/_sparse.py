@@ -1,4 +1,10 @@
-"""The least-squares problem behind `bundle_adjust`: its local models, its adjoint."""
+"""One bundle adjustment of any size: the order of its observations, its local models, and its adjoint.
+
+Frames move along the axes of the world: seen from there, a point that lies at the ray r from the camera moves to first
+order as dp = v + omega x r + dX, so that the Hessian C of an observation in its point is also that against v, and
+r x C against omega. To second order the rotation adds omega x (omega x r) / 2 + omega x dX.
+Rows run along the observations: every operation streams through contiguous memory.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +17,23 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_adjoint, se3_inverse, transform
+from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle.assembly import assemble, product
-from torchslam.optim.bundle.priors import PriorTerms, prior_terms, still_open
-from torchslam.optim.bundle.problem import Inputs
-from torchslam.optim.bundle.schur import (
+from torchslam.optim.bundle._problem import (
+    Estimate,
+    Inputs,
+    PriorTerms,
+    gauge_motions,
+    prior_terms,
+    still_open,
+)
+from torchslam.optim.bundle._schur import (
     Marginals,
     NormalEquations,
+    Structure,
     Tangent,
+    build_structure,
 )
-from torchslam.optim.bundle.sparse_layout import Layout
 from torchslam.optim.core.batching import Tensors
 from torchslam.optim.core.residuals import (
     Expansion,
@@ -33,15 +45,102 @@ from torchslam.optim.core.residuals import (
     rounding_cost,
     variance_factor,
 )
-from torchslam.optim.core.tangent import retract, turned
+from torchslam.optim.core.tangent import cross_entries, retract, turned
 
 
-class Estimate(NamedTuple):
-    """(F, 4, 4) poses, (P, 3) points in the layout's order, (C, K) camera parameters."""
+@dataclass(frozen=True)
+class Layout:
+    """The order in which one bundle adjustment is processed, and what of it moves.
 
-    T_cw: Tensor
-    points_w: Tensor
-    params: Tensor
+    observations: (O',) rows of the problem's observations that count, ordered as `Structure` asks
+    frame_index:  (O',) rows of T_cw; point_index: (O',) positions in point_order
+    point_order:  (P,) rows of points_w, ordered as `Structure` asks; point_rank: (P,) its inverse
+    free_frames:  (F',) rows of T_cw that move; free_points: (P,) bool, in point_order
+    """
+
+    observations: Tensor
+    frame_index: Tensor
+    point_index: Tensor
+    point_order: Tensor
+    point_rank: Tensor
+    free_frames: Tensor
+    free_points: Tensor
+    structure: Structure
+
+
+def build_layout(
+    frame_index: Tensor, point_index: Tensor, counted: Tensor, free_frames: Tensor, free_points: Tensor
+) -> Layout:
+    """Order the observations (O,) that count of free and fixed frames (F,) and points (P,), as `Moving` has them."""
+    num_points = len(free_points)
+    count = int(free_frames.sum())
+    slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
+    rows = counted.nonzero().squeeze(-1)
+    rows = rows[torch.argsort(slots[frame_index[rows]], stable=True)]
+    first = torch.full((num_points,), count, device=rows.device)
+    first = first.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amin")
+    point_order = torch.argsort(first, stable=True)
+    point_rank = torch.argsort(point_order)
+    points = point_rank[point_index[rows]]
+    structure = build_structure(slots[frame_index[rows]], points, count, num_points)
+    return Layout(
+        rows,
+        frame_index[rows],
+        points,
+        point_order,
+        point_rank,
+        free_frames.nonzero().squeeze(-1),
+        free_points[point_order],
+        structure,
+    )
+
+
+def assemble(
+    structure: Structure, expansion: Expansion, rays_w: Tensor, free_points: Tensor, exact: bool
+) -> NormalEquations:
+    """Normal equations of observations ordered as `structure` asks, for frames that move along the world's axes.
+
+    expansion: gradient (3 + K, O) and Hessian (3 + K, 3 + K, O) in the points in the world and the camera
+    rays_w:    (3, O) from the observing camera to the point, in the axes of the world
+    exact:     include the second-order terms of the rotation, for the exact Hessian
+    """
+    gradient, hessian = expansion
+    slope, linked = gradient[:3], structure.num_linked
+    # The columns of all blocks: against points, the gradient, against the camera.
+    moved = torch.cat((hessian[:3, :3], slope[:, None], hessian[:3, 3:]), dim=1)
+    points = structure.sum_by_point(moved.flatten(0, 1).mT).unflatten(-1, (3, -1))
+    slope, rays_w, moved = slope[:, :linked], rays_w[:, :linked], moved[..., :linked]
+    turned = torch.stack(cross_entries(rays_w, moved))
+    twice = torch.stack(cross_entries(rays_w, turned[:, :3].transpose(0, 1)))
+    against_points = turned[:, :3]
+    if exact:
+        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
+        against_points = against_points - torch.stack(cross_entries(slope, eye))
+        outer = slope[:, None] * rays_w
+        twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
+    blocks = torch.cat((moved[:, :3], against_points)).permute(2, 1, 0).reshape(-1, 6)
+    coupling = blocks.new_zeros(structure.storage_rows, 6).index_add_(0, structure.coupling, blocks)
+    moved, turned, twice = (structure.sum_by_frame(values) for values in (moved, turned, twice))
+    upper = torch.cat((moved[..., :3], turned[..., :3].mT), dim=-1)
+    lower = torch.cat((turned[..., :3], twice), dim=-1)
+    rest = torch.cat((moved[..., 3:], turned[..., 3:]), dim=1)
+    return NormalEquations(
+        structure,
+        Tangent(rest[..., 0], points[..., 3], gradient[3:].sum(-1)),
+        torch.cat((upper, lower), dim=1),
+        points[..., :3],
+        hessian[3:, 3:].sum(-1),
+        rest[..., 1:],
+        points[..., 4:],
+        coupling,
+        free_points,
+    )
+
+
+def product(A: Tensor, B: Tensor) -> Tensor:
+    """A B of matrices (m, 3, O) and (3, n, O). -> (m, n, O)."""
+    first = A[:, 0, None] * B[0]
+    return first.addcmul(A[:, 1, None], B[1]).addcmul(A[:, 2, None], B[2])
 
 
 @dataclass(frozen=True)
@@ -70,7 +169,7 @@ class Seen(NamedTuple):
 
 
 class Bundle:
-    """A bundle adjustment for `levenberg.minimize` (a batch of one), and what follows from its minimum."""
+    """A bundle adjustment for `levenberg_marquardt.minimize` (a batch of one), and what follows from its minimum."""
 
     def __init__(
         self,
@@ -159,9 +258,8 @@ class Bundle:
             return None
         T_free = T_cw[layout.free_frames]
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
-        scaling = torch.nn.functional.pad(transform(T_free, origin[None]).squeeze(-2), (0, 3))[..., None]
-        motions = scaling if len(anchors) else torch.cat((scaling, -se3_adjoint(T_free)), dim=-1)
-        motions = turned(T_free[:, :3, :3].mT, motions)
+        motions = gauge_motions(T_free, origin)
+        motions = motions[..., :1] if len(anchors) else motions
         motions = torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
@@ -218,8 +316,8 @@ class Bundle:
 
     def _seen(self, estimate: Estimate) -> Seen:
         R_cw = estimate.T_cw[:, :3, :3]
-        centres_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
-        frames = torch.cat((R_cw.flatten(1), centres_w[..., 0]), dim=-1)
+        centers_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
+        frames = torch.cat((R_cw.flatten(1), centers_w[..., 0]), dim=-1)
         rows = frames.index_select(0, self.layout.frame_index).mT.contiguous()
         R_cw = rows[:9].unflatten(0, (3, 3))
         rays_w = estimate.points_w.index_select(0, self.layout.point_index).mT - rows[9:]

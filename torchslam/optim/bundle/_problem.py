@@ -1,4 +1,4 @@
-"""What a bundle adjustment is asked, and the same as finite tensors that all lead with a batch."""
+"""The definition of a bundle adjustment, the same as finite tensors that all lead with a batch, and its priors."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
-from torchslam.optim.core.priors import CameraPrior, PosePrior
+from torchslam.optim.core.priors import CameraPrior, PosePrior, prior_expansion, prior_hessian
 from torchslam.optim.core.residuals import only, usable
+from torchslam.optim.core.tangent import turned
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,45 @@ class Given(NamedTuple):
     def part(self, rows: slice) -> Given:
         """Some elements of the batch."""
         return Given(*(tensor[rows] for tensor in self))
+
+
+class Estimate(NamedTuple):
+    """(F, 4, 4) poses, (P, 3) points in the layout's order, (C, K) camera parameters."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    params: Tensor
+
+
+_MIN_POINTS_PER_FRAME = 3
+_MIN_FRAMES_PER_POINT = 2
+
+
+class Moving(NamedTuple):
+    """(B, O) bool, the observations that count; (B, F), (B, P) bool, the frames and points that move."""
+
+    counted: Tensor
+    frames: Tensor
+    points: Tensor
+
+
+def what_moves(given: Given) -> Moving:
+    """Of what may move, points seen less than twice and frames that see less than three points and have no prior stay,
+    and are not observed."""
+    frame_index, point_index, counted = given.frame_index, given.point_index, given.counted
+    seen = _counts(point_index, counted, given.free_points) >= _MIN_FRAMES_PER_POINT
+    counted = counted & (seen | ~given.free_points).gather(1, point_index)
+    seeing = _counts(frame_index, counted, given.free_frames) >= _MIN_POINTS_PER_FRAME
+    if given.inputs.pose_prior is not None:
+        seeing = seeing | (given.prior_information != 0).flatten(2).any(-1)
+    counted = counted & (seeing | ~given.free_frames).gather(1, frame_index)
+    return Moving(counted, given.free_frames & seeing, given.free_points & seen)
+
+
+def _counts(index: Tensor, counted: Tensor, of: Tensor) -> Tensor:
+    """How many counted rows of index (B, O) there are of each of `of`. -> (B, N)."""
+    rows = flat_rows(index, of.shape[1])[counted.flatten()]
+    return torch.bincount(rows, minlength=of.numel()).view(of.shape)
 
 
 def flat_rows(index: Tensor, size: int) -> Tensor:
@@ -259,3 +300,72 @@ def as_mask(rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
     mask = torch.zeros(count, dtype=torch.bool, device=like.device)
     mask[rows.long()] = True
     return mask.expand(batch, count)
+
+
+class PriorTerms(NamedTuple):
+    """Cost (...), and gradients and Hessians over frames, (..., F, 6), (..., F, 6, 6), and the cameras' n free
+    directions each, (..., C n), (..., C n, C n)."""
+
+    cost: Tensor
+    frames_gradient: Tensor
+    frames: Tensor
+    camera_gradient: Tensor
+    camera: Tensor
+
+    def in_world(self, R_cw: Tensor) -> PriorTerms:
+        """The same for frames (..., F, 3, 3) that move along the axes of the world."""
+        frames = turned(R_cw.mT, turned(R_cw.mT, self.frames).mT)
+        gradient = turned(R_cw.mT, self.frames_gradient[..., None])[..., 0]
+        return self._replace(frames_gradient=gradient, frames=frames)
+
+
+def prior_terms(
+    inputs: Inputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
+) -> PriorTerms | None:
+    """The terms at poses (..., F, 4, 4) and parameters (..., C, K); None where there are no priors.
+
+    moving: (..., F) bool, of which frames the prior counts; directions: (K, n), none where the camera is fixed
+    exact:  the exact Hessian, not that of Gauss and Newton
+    """
+    poses, camera = inputs.pose_prior, inputs.camera_prior
+    if poses is None and camera is None:
+        return None
+    cost = T_cw.new_zeros(T_cw.shape[:-3])
+    g_frames, H_frames = T_cw.new_zeros(*T_cw.shape[:-2], 6), T_cw.new_zeros(*T_cw.shape[:-2], 6, 6)
+    if poses is not None:
+        poses = PosePrior(poses.T_cw, torch.where(moving[..., None, None], poses.information, 0.0))
+        costs, g_frames, H_frames = prior_expansion(poses, T_cw)
+        cost = cost + costs.sum(-1)
+        if exact:
+            flat = PosePrior(poses.T_cw.reshape(-1, 4, 4), poses.information.reshape(-1, 6, 6))
+            H_frames = prior_hessian(flat, T_cw.reshape(-1, 4, 4)).view_as(H_frames)
+    free = 0 if directions is None else directions.shape[-1]
+    g_camera = params.new_zeros(*params.shape[:-1], free)
+    H_camera = params.new_zeros(*g_camera.shape, free)
+    if camera is not None and directions is not None:
+        off = params - camera.params
+        pulled = (camera.information @ off[..., None]).squeeze(-1)
+        cost = cost + 0.5 * (off * pulled).sum((-2, -1))
+        g_camera, H_camera = pulled @ directions, directions.mT @ camera.information @ directions
+    return PriorTerms(cost, g_frames, H_frames, g_camera.flatten(-2), block_diagonal(H_camera))
+
+
+def block_diagonal(blocks: Tensor) -> Tensor:
+    """(..., N, D, D) -> (..., N D, N D)."""
+    rows = torch.diag_embed(blocks.movedim(-3, -1), dim1=-4, dim2=-2)
+    return rows.flatten(-2).flatten(-3, -2)
+
+
+def gauge_motions(T_cw: Tensor, origin_w: Tensor) -> Tensor:
+    """How frames (..., F, 4, 4) move along the axes of the world, (..., F, 6, 7): with the scale about a point
+    (..., 3) or (..., 1, 3), and with each of the six rigid motions of the world."""
+    scaling = torch.nn.functional.pad(transform(T_cw, origin_w[..., None, :]).squeeze(-2), (0, 3))[..., None]
+    return turned(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
+
+
+def still_open(motions: Tensor, H_frames: Tensor) -> Tensor:
+    """Of orthonormal motions (..., F, 6, g) of all frames those that priors (..., F, 6, 6) do not hinder; else zero."""
+    held = torch.einsum("...fag,...fab,...fbh->...gh", motions, H_frames, motions)
+    stiffness, mixtures = torch.linalg.eigh(held)
+    is_open = stiffness <= torch.finfo(held.dtype).eps ** 0.5 * stiffness[..., -1:]
+    return motions @ (mixtures * is_open[..., None, :])[..., None, :, :]

@@ -1,32 +1,117 @@
-"""What `refine_pose` minimises: its inputs, their local models, and the minimum with what its derivatives need."""
+"""Refinement of camera poses against known points: batched, robust, differentiable.
+
+In the local quadratic models, which take most of the time, rows of Jacobians run along the observations, (B, D, N): one
+matrix product per problem makes Hessian and gradient, and every operation before it streams through contiguous memory.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
-from torchslam.geometry.precision import check_dtypes
+from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.implicit import Ndims
-from torchslam.optim.core.levenberg_marquardt import minimize
+from torchslam.optim.core.implicit import Backward, Ndims, check_backward, minimum
+from torchslam.optim.core.levenberg_marquardt import Convergence, minimize
 from torchslam.optim.core.linear import factorize
 from torchslam.optim.core.priors import PosePrior, prior_expansion, prior_hessian
 from torchslam.optim.core.residuals import (
     Observations,
+    Weighed,
     exact_expansion,
     linearize,
     only,
     usable,
     variance_factor,
+    weigh,
 )
 from torchslam.optim.core.tangent import move, point_jacobian, pull_back, push, retract
-from torchslam.optim.pose.expansion import PoseModel, PoseObservations
+
+
+class PoseModel(NamedTuple):
+    """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6) in xi.
+
+    hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
+    bend:    (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
+             Newton's, several times as effective; zero elsewhere
+    """
+
+    T_cw: Tensor
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+    bend: Tensor
+
+
+class PoseObservations:
+    """Observations (B, N) of known points, laid out for expansions at many poses."""
+
+    def __init__(self, points_w: Tensor, observations: Observations) -> None:
+        """points_w: (B, N, 3)"""
+        self.observations = observations
+        camera = observations.camera
+        self.points_w = points_w.mT.contiguous()
+        self.pinhole = camera.model == "pinhole" and not observations.has_matrices
+        self.metric = camera.params.new_ones(1, 1)  # what turns products of rows into those of pixels
+        if self.pinhole:
+            focal, centre = camera.params[..., :2, None], camera.params[..., 2:4, None]
+            self.normalized = ((observations.pixels.mT - centre) / focal).contiguous()
+            self.metric = focal.square()  # (2, 1) or (B, 2, 1)
+
+    def expand(self, T_cw: Tensor, near: Tensor) -> PoseModel:
+        """The model at T_cw (B, 4, 4); `near` (B,) says where to add the bend."""
+        points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
+        rows, (cost, weight, bend) = self._pinhole(points_c) if self.pinhole else self._general(points_c)
+        moments = (rows * (weight[:, None] * self.metric)[:, None]).flatten(2) @ rows.flatten(2).mT
+        hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
+        if near.any():
+            pulls = (rows[:, :6] * (self.metric[..., None, :, :] * rows[:, 6:])).sum(2)
+            added = (pulls * (bend * near[:, None])[:, None]) @ pulls.mT
+        else:
+            added = torch.zeros_like(hessian)
+        return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added)
+
+    def _pinhole(self, points_c: Tensor) -> tuple[Tensor, Weighed]:
+        """Rows (B, 7, 2, N) of d residual / d xi and of the residual, in units of the focal length."""
+        depth = points_c[:, 2:]
+        valid = depth > torch.finfo(depth.dtype).eps
+        inverse = torch.where(valid, depth, 1.0).reciprocal()
+        xy = points_c[:, :2] * inverse
+        residual = xy - self.normalized
+        squared_px = (self.metric * residual.square()).sum(1)
+
+        inverse = inverse[:, 0]
+        u, v = xy.unbind(1)
+        zero, product = torch.zeros_like(u), u * v
+        # d(u, v) / d(translation), then / d(rotation): each line is a column of the Jacobian.
+        columns = (
+            *(inverse, zero),
+            *(zero, inverse),
+            *(-inverse * u, -inverse * v),
+            *(-product, -1 - v * v),
+            *(1 + u * u, product),
+            *(-v, u),
+            *residual.unbind(1),
+        )
+        rows = torch.stack(columns, dim=1).unflatten(1, (7, 2))
+        return rows, weigh(self.observations, squared_px, valid[:, 0])
+
+    def _general(self, points_c: Tensor) -> tuple[Tensor, Weighed]:
+        """As `_pinhole`, for any camera; rows are in pixels."""
+        points_c = points_c.mT
+        lin = linearize(self.observations, points_c)
+        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
+        rows = torch.cat((lin.J, J_rotation, lin.residual[..., None]), dim=-1)
+        return rows.permute(0, 3, 2, 1), Weighed(lin.cost, lin.weight, lin.bend)
+
 
 _MIN_POINTS = 3
 
@@ -222,3 +307,78 @@ class PoseMinimization:
 
     def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
         return (pull_back(found[0], gradient[0]),)
+
+
+@dataclass(frozen=True)
+class RefinedPose:
+    """Poses at the minimum of their robust reprojection error.
+
+    T_cw:        (B, 4, 4) world to camera; the start, without gradient, where `success` is False
+    cost:        (B,) half the sum of robustified squared whitened residuals, detached
+    success:     (B,) bool, the start is finite, and the usable points (at least three) or the prior determine the pose
+    convergence: iterations and convergence per element
+    """
+
+    T_cw: Tensor
+    cost: Tensor
+    success: Tensor
+    convergence: Convergence
+    _inputs: PoseInputs = field(repr=False)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """(B, 6, 6) of the left perturbation (translation, rotation), detached; zero where `success` is False.
+
+        Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
+        """
+        with torch.no_grad():
+            covariance = PoseProblem(self._inputs).covariance(self.T_cw)
+            return torch.where(self.success[:, None, None], covariance, 0.0)
+
+
+@full_precision
+def refine_pose(
+    T_cw: Tensor,
+    points_w: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    kernel: Kernel = "cauchy",
+    scale: Tensor | float = 1.0,
+    prior: PosePrior | None = None,
+    backward: Backward = "implicit",
+    iterations: int = 20,
+    tolerance: float = 1e-10,
+) -> RefinedPose:
+    """Minimise robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
+
+    T_cw:      (B, 4, 4) start
+    points_w:  (B, N, 3), pixels: (B, N, 2); points or pixels of a batch of one broadcast
+    weights:   (B, N) inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
+               positive definite; one if None
+    mask:      (B, N) bool, all if None; rows that are not finite are left out in any case
+    scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
+    prior:     a Gaussian on the poses, in the same units
+    backward:  how gradients reach points, pixels, weights, camera.params, scale and prior, see `implicit.Backward`
+    tolerance: stop where a step promises to lower the cost by less than this share of it
+
+    An element that fails (too few points, pose not determined) has `success` False and a zero gradient. The implicit
+    gradient is zero as well where the exact Hessian is not positive definite, that is, not at a strict minimum.
+    Raises ValueError for shapes that do not fit and for unknown names.
+    """
+    check_backward(backward)
+    inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
+    minimization = PoseMinimization(inputs, iterations, tolerance)
+    tensors = (T_cw, *inputs.tensors())
+    if backward == "unroll":
+        found = minimization.minimize(tensors)
+    else:
+        attached = backward == "implicit"
+        found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
+    refined, success, cost, steps, converged, initial_cost = found
+    if backward == "truncated":
+        problem = PoseProblem(inputs)
+        last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))
+        refined = torch.where(success[:, None, None], last, refined)
+    return RefinedPose(refined, cost, success, Convergence(steps, converged, initial_cost, cost), inputs)

@@ -1,4 +1,4 @@
-"""The least-squares problem behind `pose_graph_optimize`: its local models, its adjoint.
+"""The least-squares problem behind `pose_graph_optimize`: its order, its local models, its adjoint.
 
 An edge's error is e = log(E) with E = X S_ji^-1, X = S_j S_i^-1. Nodes moved by exp(xi) from the left move E to
 exp(xi_j) exp(-Ad(X) xi_i) E: to first order by eta = xi_j - Ad(X) xi_i, from the left too, so that the derivative of e
@@ -8,6 +8,7 @@ normal equations therefore follows from its gradient and Hessian in eta alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,15 +17,109 @@ from torch import Tensor
 
 from torchslam.geometry.lie import (
     sim3_adjoint,
-    sim3_exp,
     sim3_inverse,
     sim3_left_jacobian_inverse,
     sim3_log,
     skew,
 )
 from torchslam.geometry.robust import Kernel, Robustified, robustify
-from torchslam.optim.pose_graph.layout import Layout
-from torchslam.optim.pose_graph.sparse_cholesky import SparseFactor, factorize_sparse
+from torchslam.optim.core.batching import Tensors
+from torchslam.optim.core.implicit import Ndims
+from torchslam.optim.core.levenberg_marquardt import minimize
+from torchslam.optim.core.tangent import pull_back_sim3, push_sim3, retract_sim3
+from torchslam.optim.pose_graph._sparse_cholesky import (
+    BlockStructure,
+    SparseFactor,
+    build_block_structure,
+    factorize_sparse,
+)
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Rows that are summed by group, in a fixed order."""
+
+    order: Tensor
+    counts: Tensor
+
+    @staticmethod
+    def of(index: Tensor, count: int) -> Groups:
+        return Groups(torch.argsort(index, stable=True), torch.bincount(index, minlength=count))
+
+    def sum(self, values: Tensor) -> Tensor:
+        """(B, N, ...) -> (B, groups, ...)."""
+        shape = (len(self.counts), values.shape[0], *values.shape[2:])
+        flat = values.transpose(0, 1).index_select(0, self.order).flatten(1)
+        total = torch.segment_reduce(flat, "sum", lengths=self.counts, unsafe=True)
+        return total.view(shape).transpose(0, 1)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The discrete part of a pose graph: what counts, what moves, and in which order it is processed.
+
+    i, j:     (E,) int64 nodes of the edges
+    counted:  (B, E) bool; moving: (B, K) bool, nodes that counted edges join with a fixed one
+    linking:  (L,) edges that, in some element, join two moving nodes; turned: (L,) bool, whether the block of the pair
+              of nodes is the transpose of the edge's; by_pair: the edges of each pair; by_node: the edges' ends, first
+              all i, then all j, of each node
+    """
+
+    i: Tensor
+    j: Tensor
+    counted: Tensor
+    moving: Tensor
+    linking: Tensor
+    turned: Tensor
+    by_pair: Groups
+    by_node: Groups
+    structure: BlockStructure
+
+
+def build_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> Layout:
+    """Decide what moves, and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
+    i, j = edges.unbind(-1)
+    num_nodes = fixed.shape[1]
+    moving = _reached(edges, counted, fixed) & ~fixed
+    linking = (counted & moving[:, i] & moving[:, j]).any(0).nonzero().squeeze(-1)
+    low, high = edges[linking].amin(-1), edges[linking].amax(-1)
+    keys, positions = torch.unique(low * num_nodes + high, return_inverse=True)
+    pairs = torch.stack((keys // num_nodes, keys % num_nodes), dim=-1)
+    return Layout(
+        i,
+        j,
+        counted,
+        moving,
+        linking,
+        j[linking] == high,
+        Groups.of(positions, len(pairs)),
+        Groups.of(torch.cat((i, j)), num_nodes),
+        build_block_structure(num_nodes, dims, pairs),
+    )
+
+
+def _reached(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
+    """Which nodes (B, K) counted edges join, over others or not, with a fixed one.
+
+    Every node points to one of its component with a number not above its own; edges hook these onto one another, and
+    pointers are shortened, until nothing changes: about log K rounds.
+    """
+    num_nodes = fixed.shape[1]
+    label = torch.arange(num_nodes, device=fixed.device).expand_as(fixed)
+    ends = edges.T.flatten()
+    while True:
+        at_ends = label[:, ends]
+        low = torch.minimum(*at_ends.chunk(2, dim=1))
+        low = torch.where(counted, low, num_nodes).repeat(1, 2)
+        hooked = label.scatter_reduce(1, at_ends, low, "amin")
+        hooked = hooked.scatter_reduce(1, ends.expand_as(low), low, "amin")
+        shortened = hooked.gather(1, hooked)
+        if torch.equal(shortened, label):
+            break
+        label = shortened
+    has_fixed = torch.zeros_like(label).scatter_reduce(1, label, fixed.long(), "amax")
+    return has_fixed.gather(1, label) > 0
+
 
 # A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
@@ -77,7 +172,7 @@ class PoseGraphModel:
 
 
 class PoseGraphProblem:
-    """A pose graph for `levenberg.minimize`, and what follows from its minimum."""
+    """A pose graph for `levenberg_marquardt.minimize`, and what follows from its minimum."""
 
     def __init__(self, layout: Layout, inputs: Inputs, kernel: Kernel) -> None:
         self.layout, self.inputs, self.kernel = layout, inputs, kernel
@@ -98,7 +193,7 @@ class PoseGraphProblem:
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         decrease = 0.5 * (xi * model.gradient).sum((-2, -1))
-        moved = torch.where(self.layout.moving[..., None, None], retract(model.S_cw, -xi), model.S_cw)
+        moved = torch.where(self.layout.moving[..., None, None], retract_sim3(model.S_cw, -xi), model.S_cw)
         return moved, torch.where(factor.definite, decrease, torch.inf)
 
     def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
@@ -186,28 +281,6 @@ def linearize(
     return Linearization(error, J, carry, pull, squared, robust, sigma)
 
 
-def retract(S: Tensor, xi: Tensor) -> Tensor:
-    """exp(xi) @ S, the scale kept where xi has no seventh number. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
-    return sim3_exp(torch.nn.functional.pad(xi, (0, 7 - xi.shape[-1]))) @ S
-
-
-def pull_back(S: Tensor, grad_S: Tensor) -> Tensor:
-    """The gradient with respect to xi (..., 7), at zero, of a loss with gradient `grad_S` at exp(xi) @ S."""
-    columns, grads = S[..., :3, :], grad_S[..., :3, :]
-    rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
-    return torch.cat((grads[..., 3], rotation, (columns * grads).sum((-2, -1))[..., None]), dim=-1)
-
-
-def push(S: Tensor, xi: Tensor) -> Tensor:
-    """The change of S, to first order, when it moves along xi. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
-    columns = S[..., :3, :]
-    turned = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
-    if xi.shape[-1] == 7:
-        turned = turned + xi[..., 6:, None] * columns
-    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
-    return torch.nn.functional.pad(changed, (0, 0, 0, 1))
-
-
 def _bracket(force: Tensor) -> Tensor:
     """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors. (..., D) -> (..., D, D)."""
     v, omega = skew(force[..., :3]), skew(force[..., 3:6])
@@ -216,3 +289,72 @@ def _bracket(force: Tensor) -> Tensor:
         M = torch.nn.functional.pad(M, (0, 1, 0, 1))
         M[..., 6, :3], M[..., :3, 6] = force[..., :3], -force[..., :3]
     return 0.5 * M
+
+
+class PoseGraphMinimization:
+    """A pose graph; its inputs are those of `Inputs`, edges that count (B, E), fixed nodes (B, K), and
+    the edges (E, 2).
+
+    Found are the nodes (B, K, 4, 4), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
+    """
+
+    num_unknowns = 1
+    num_vectors = 1
+    ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1, 2))
+
+    def __init__(self, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
+        self.dims, self.kernel = dims, kernel
+        self.iterations, self.tolerance = iterations, tolerance
+        self._last: tuple[tuple[Tensor, Tensor], Layout] | None = None
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        problem = self._problem(inputs)
+        model, convergence = minimize(problem, inputs[0], self.iterations, self.tolerance)
+        with torch.no_grad():
+            success = problem.solvable & problem.factorized(model).definite
+        how = convergence.iterations, convergence.converged, convergence.initial_cost
+        return model.S_cw, success, problem.layout.moving, convergence.cost, *how
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        S_cw, success, moving, *_ = found
+        problem, use = self._problem(inputs), (moving & success[:, None])[..., None]
+        with torch.no_grad():
+            factor = problem.factorized(problem.exact_model(S_cw))
+
+        def solve(right: Tensors) -> Tensors:
+            return (torch.where(use, factor.solve(torch.where(use, right[0], 0.0)), 0.0),)
+
+        return solve
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        given, (xi,), (i, j) = Inputs(*inputs[:4]), direction, inputs[6].unbind(-1)
+        S_cw = torch.where(found[2][..., None, None], found[0], given.S_cw)
+        lin = linearize(S_cw, i, j, inputs[4], given, self.kernel)
+        xi_i, xi_j = xi.index_select(1, i)[..., None], xi.index_select(1, j)[..., None]
+        velocity = (lin.J @ (xi_j - lin.carry @ xi_i)).squeeze(-1)
+        return (lin.kernel.weight * (lin.pull * velocity).sum(-1)).sum()
+
+    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+        return retract_sim3(found[0], direction[0]), *found[1:]
+
+    def push(self, found: Tensors, direction: Tensors) -> Tensors:
+        return (push_sim3(found[0], direction[0]),)
+
+    def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
+        return (pull_back_sim3(found[0], gradient[0])[..., : self.dims],)
+
+    def last_step(self, S_cw: Tensor, inputs: Tensors, success: Tensor) -> Tensor:
+        """The nodes after one more step from the minimum, with the gradient of that step."""
+        problem = self._problem(inputs)
+        last = problem.evaluate(S_cw, ~success)
+        return problem.step(last, torch.zeros_like(last.cost))[0]
+
+    def _problem(self, inputs: Tensors) -> PoseGraphProblem:
+        return PoseGraphProblem(self._layout(*inputs[4:]), Inputs(*inputs[:4]), self.kernel)
+
+    def _layout(self, counted: Tensor, fixed: Tensor, edges: Tensor) -> Layout:
+        """The layout for what counts and is fixed; the last one is kept, which mostly is the next one."""
+        key = counted, fixed
+        if self._last is None or not all(map(torch.equal, self._last[0], key)):
+            self._last = key, build_layout(edges, counted, fixed, self.dims)
+        return self._last[1]

@@ -10,13 +10,10 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle.dense import GridBundle
-from torchslam.optim.bundle.dense_layout import GridLayout, build_grid_layout, fits_grids, grid_data
-from torchslam.optim.bundle.priors import prior_terms
-from torchslam.optim.bundle.problem import Given, flat_rows
-from torchslam.optim.bundle.schur import Marginals
-from torchslam.optim.bundle.sparse import Bundle, Estimate
-from torchslam.optim.bundle.sparse_layout import Layout, Moving, build_layout, what_moves
+from torchslam.optim.bundle._dense import GridBundle, GridLayout, build_grid_layout, fits_grids, grid_data
+from torchslam.optim.bundle._problem import Estimate, Given, Moving, flat_rows, prior_terms, what_moves
+from torchslam.optim.bundle._schur import Marginals
+from torchslam.optim.bundle._sparse import Bundle, Layout, build_layout
 from torchslam.optim.core.batching import Tensors
 from torchslam.optim.core.implicit import Ndims
 from torchslam.optim.core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize

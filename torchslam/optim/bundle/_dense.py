@@ -1,0 +1,588 @@
+"""Many small bundle adjustments at once, every frame of one against every point of it.
+
+What the sparse equations of `_schur` gather and scatter is dense here, with the points along the last dimension: every
+operation streams through contiguous memory, sums over frames and points are batched matrix products, and the Schur
+complement is one product per problem. For windows of a few frames that see most of the same points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_inverse
+from torchslam.geometry.robust import Kernel
+from torchslam.optim.bundle._problem import (
+    Estimate,
+    Given,
+    Inputs,
+    Moving,
+    PriorTerms,
+    block_diagonal,
+    flat_rows,
+    gauge_motions,
+    prior_terms,
+    still_open,
+)
+from torchslam.optim.bundle._schur import Marginals
+from torchslam.optim.core.batching import Tensors, chosen, taken
+from torchslam.optim.core.linear import DefiniteFactor, factorize, inverse_root_3x3
+from torchslam.optim.core.residuals import (
+    Expansion,
+    Linearization,
+    Observations,
+    exact_expansion,
+    gauss_newton_expansion,
+    linearize,
+    rounding_cost,
+    variance_factor,
+)
+from torchslam.optim.core.tangent import cross_entries, retract, turned
+
+# An observation of the sparse equations costs as much as so many cells of a grid.
+_SPARSEST = 8
+
+
+class GridLayout(NamedTuple):
+    """The discrete part of the problems; every tensor leads with the batch.
+
+    order:   (B, F) rows of T_cw, those that move first; rank: (B, F) its inverse
+    cells:   (B, O) place of each observation among the F * P cells of its grid, the one after them if it does not count
+    free:    (B, F') which of the first F' move, F' being the most of any problem
+    anchors: (B, F) which of the ordered frames stay and see something
+    free_points: (B, P); held_points: (B,) whether a point that is seen stays
+    """
+
+    order: Tensor
+    rank: Tensor
+    cells: Tensor
+    free: Tensor
+    anchors: Tensor
+    free_points: Tensor
+    held_points: Tensor
+
+
+class GridData(NamedTuple):
+    """All that the problems are made of, in the layout's order.
+
+    inputs:    as `Inputs`, but pixels (B, F, 2, P) and weights (B, F, P), zero where nothing was seen
+    camera_of: (B, F) the camera of each frame
+    """
+
+    layout: GridLayout
+    inputs: Inputs
+    camera_of: Tensor
+
+
+def fits_grids(given: Given, moving: Moving) -> bool:
+    """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
+    num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
+    cells = moving.frames.numel() * num_points
+    if given.weights.ndim > 2:
+        return False  # whitening makes the grids' way of a pinhole camera a longer one
+    if not 0 < cells <= _SPARSEST * int(moving.counted.sum()):
+        return False
+    places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
+    return int(torch.bincount(places[moving.counted.flatten()], minlength=1).max()) <= 1
+
+
+def build_grid_layout(given: Given, moving: Moving) -> GridLayout:
+    """The grids of problems that `fits_grids`."""
+    num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
+    order = torch.argsort((~moving.frames).int(), dim=1, stable=True)
+    rank = torch.argsort(order, dim=1)
+    counts = moving.frames.sum(1)
+    slots = torch.arange(int(counts.max()), device=counts.device)
+    frames = rank.gather(1, given.frame_index)
+    seeing = torch.zeros_like(rank).scatter_add(1, frames, moving.counted.long()) > 0
+    held = moving.counted & ~moving.points.gather(1, given.point_index)
+    return GridLayout(
+        order,
+        rank,
+        torch.where(moving.counted, frames * num_points + given.point_index, num_frames * num_points),
+        slots < counts[:, None],
+        seeing & ~moving.frames.gather(1, order),
+        moving.points,
+        held.any(1),
+    )
+
+
+def grid_data(layout: GridLayout, given: Given) -> GridData:
+    """The grids, filled."""
+    inputs = given.inputs._replace(
+        T_cw=take(given.T_cw, layout.order),
+        pixels=_spread(layout, given.pixels.mT),
+        weights=_spread(layout, given.weights[:, None])[:, :, 0],
+    )
+    if inputs.pose_prior is not None:
+        inputs = inputs._replace(
+            prior_T_cw=take(given.prior_T_cw, layout.order),
+            prior_information=take(given.prior_information, layout.order),
+        )
+    return GridData(layout, inputs, given.camera_index.gather(1, layout.order))
+
+
+def take(tensor: Tensor, rows: Tensor) -> Tensor:
+    """Rows (B, N) of (B, F, ...)."""
+    index = rows.view(*rows.shape, *(1,) * (tensor.ndim - 2))
+    return tensor.gather(1, index.expand(*rows.shape, *tensor.shape[2:]))
+
+
+def _spread(layout: GridLayout, values: Tensor) -> Tensor:
+    """Values (B, D, O) of observations in their cells, (B, F, D, P)."""
+    (batch, num_frames), num_points = layout.order.shape, layout.free_points.shape[1]
+    grid = values.new_zeros(batch, values.shape[1], num_frames * num_points + 1)
+    grid = grid.scatter(2, layout.cells[:, None].expand_as(values), values)[..., :-1]
+    return grid.unflatten(-1, (num_frames, num_points)).transpose(1, 2).contiguous()
+
+
+# eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k.
+_AXES = torch.eye(3, dtype=torch.float64)
+_CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3))
+
+
+class GridExpansion(NamedTuple):
+    """`residuals.Expansion` of every frame and point: gradient (B, F, D, P), hessian (B, F, D, D, P), D = 3 + K."""
+
+    gradient: Tensor
+    hessian: Tensor
+
+
+class GridEquations(NamedTuple):
+    """Gradient and Hessian over F free frames, which move along the axes of the world as in `_sparse`, and the
+    cameras, D = 6 F + K, and points.
+
+    gradient: (B, D), points_gradient: (B, 3, P), reduced: (B, D, D), points: (B, 3, 3, P), coupling: (B, D, 3, P)
+    """
+
+    gradient: Tensor
+    points_gradient: Tensor
+    reduced: Tensor
+    points: Tensor
+    coupling: Tensor
+
+
+def assemble_grid(
+    expansion: GridExpansion, rays_w: Tensor, R_cw: Tensor, free: Tensor, exact: bool
+) -> GridEquations:
+    """Normal equations over the first frames, of which those that are free (B, F') move, all points, and the cameras.
+
+    expansion: in the points in the camera frames
+    rays_w:    (B, F, 3, P) from the cameras to the points, in the axes of the world; R_cw: (B, F, 3, 3)
+    exact:     include the second-order terms of the rotation
+    """
+    dims, leading, R_wc = expansion.gradient.shape[2], free.shape[1], R_cw.mT
+    upper = expansion.hessian[:, :, :3]
+    curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, F, 3, 3, P): R^T C R
+    slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
+    points, points_gradient, points_camera = curve.sum(1), slope.sum(1), across.sum(1)
+
+    slope, curve, across, rays_w = (part[:, :leading] for part in (slope, curve, across, rays_w))
+    coupling = torch.stack(
+        (*curve.unbind(2), *cross_entries(rays_w[..., None, :].unbind(2), curve.unbind(2))), dim=2
+    )
+    sums = _sum_by_frame(slope, across, coupling, rays_w, exact)
+    if exact:
+        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[None, None, ..., None]
+        bend = torch.stack(cross_entries(slope[:, :, :, None].unbind(2), eye.unbind(2)), dim=2)
+        coupling = coupling - torch.nn.functional.pad(bend, (0, 0, 0, 0, 3, 0))
+    gradient, frames, frames_camera = sums
+    if not free.all():  # what only fills up stays where it is
+        gradient = torch.where(free[..., None], gradient, 0.0)
+        eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
+        frames = torch.where(free[..., None, None], frames, eye)
+        frames_camera = torch.where(free[..., None, None], frames_camera, 0.0)
+        coupling = torch.where(free[..., None, None, None], coupling, 0.0)
+    coupling, reduced = coupling.flatten(1, 2), block_diagonal(frames)
+    if dims > 3:
+        frames_camera = frames_camera.flatten(1, 2)
+        camera = expansion.hessian[:, :, 3:, 3:].sum((1, -1))
+        coupling = torch.cat((coupling, points_camera.transpose(1, 2)), dim=1)
+        reduced = torch.cat(
+            (
+                torch.cat((reduced, frames_camera), dim=-1),
+                torch.cat((frames_camera.mT, camera), dim=-1),
+            ),
+            dim=1,
+        )
+    gradient = torch.cat((gradient.flatten(1), expansion.gradient[:, :, 3:].sum((1, -1))), dim=-1)
+    return GridEquations(gradient, points_gradient, reduced, points, coupling)
+
+
+def _times(R: Tensor, columns: Tensor) -> Tensor:
+    """R (B, F, 3, 3) times columns (B, F, 3, n, P)."""
+    return (R @ columns.flatten(3)).view_as(columns)
+
+
+def _sum_by_frame(
+    slope: Tensor, across: Tensor, coupling: Tensor, rays_w: Tensor, exact: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """G^T q (B, F, 6), G^T C G (B, F, 6, 6) and G^T C_camera (B, F, 6, K) summed over the points, G = [I, -r^].
+
+    They are sums of q, C_camera and G^T C (B, F, 6, 3, P) times 1 and r.
+    """
+    num_camera, cross = across.shape[3], _CROSS.to(rays_w.dtype).to(rays_w.device)
+    affine = torch.cat((torch.ones_like(rays_w[:, :, :1]), rays_w), dim=2).mT
+    pushed = slope @ affine  # (B, F, 3, 4)
+    outer = pushed[..., 1:]
+    torque = torch.einsum("bmj,xfjm->xfb", cross, outer)
+    moments = (coupling.flatten(2, 3) @ affine).unflatten(2, (6, 3))  # (B, F, 6, 3, 4)
+    frames = torch.cat((moments[..., 0], torch.einsum("clk,xfakl->xfac", cross, moments[..., 1:])), dim=-1)
+    if exact:
+        eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
+        trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        bend = 0.5 * (outer + outer.mT) - trace * eye
+        frames = frames + torch.nn.functional.pad(bend, (3, 0, 3, 0))
+    sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, F, 3, K, 4)
+    turned = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
+    return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], turned), dim=-2)
+
+
+class FactorizedGrid(NamedTuple):
+    """Equations ready to be solved for any right side: the inverse roots (B, 3, 3, P) of the points' blocks, zero for
+    points that do not move, the coupling times them (B, D, 3 P), and what is left for frames and cameras."""
+
+    root: Tensor
+    whitened: Tensor
+    reduced: DefiniteFactor
+
+    def solve(self, right: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """H^-1 right, (B, D) and (B, 3, P); all zero where the reduced system is not definite."""
+        halves = (self.root * points[:, None]).sum(2)
+        rest = right - (self.whitened @ halves.flatten(1)[..., None]).squeeze(-1)
+        solution = self.reduced.solve(rest[..., None])
+        halves = halves - (self.whitened.mT @ solution).view_as(halves)
+        moved = (self.root * halves[:, :, None]).sum(1)
+        return solution.squeeze(-1), torch.where(self.reduced.definite[:, None, None], moved, 0.0)
+
+    def marginals(self) -> tuple[Tensor, Tensor]:
+        """The inverse over frames and cameras (B, D, D), and the blocks (B, P, 3, 3) of the points."""
+        size = self.whitened.shape[1]
+        eye = torch.eye(size, dtype=self.root.dtype, device=self.root.device)
+        inverse = self.reduced.solve(eye.expand(len(self.root), size, size))
+        A = self.whitened.unflatten(-1, (3, -1)).permute(0, 3, 2, 1)  # (B, P, 3, D)
+        root = self.root.permute(0, 3, 1, 2)
+        inner = torch.eye(3, dtype=A.dtype, device=A.device) + (A @ inverse[:, None]) @ A.mT
+        return inverse, root.mT @ inner @ root
+
+
+def factorized_grid(
+    equations: GridEquations,
+    free: Tensor,
+    free_points: Tensor,
+    num_camera: int,
+    damping: Tensor | None = None,
+    gauge: Tensor | None = None,
+) -> FactorizedGrid:
+    """Eliminate the points and factorise what is left, as `NormalEquations.factorized` does.
+
+    free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,)
+    gauge: (B, 6 F, g)
+    """
+    root = _inverse_root(equations.points, free_points, damping)
+    c0, c1, c2 = equations.coupling.unbind(2)
+    q = root[:, None].unbind(2)
+    whitened = torch.stack(
+        (
+            q[0][:, :, 0] * c0,
+            q[1][:, :, 0] * c0 + q[1][:, :, 1] * c1,
+            q[2][:, :, 0] * c0 + q[2][:, :, 1] * c1 + q[2][:, :, 2] * c2,
+        ),
+        dim=2,
+    ).flatten(2)
+    reduced, frames = equations.reduced, equations.reduced.shape[-1] - num_camera
+    if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
+        growth = damping[:, None] * reduced.diagonal(dim1=-2, dim2=-1)
+        growth[:, :frames] += torch.finfo(growth.dtype).tiny ** 0.5
+        reduced = reduced + torch.diag_embed(growth)
+    reduced = torch.baddbmm(reduced, whitened, whitened.mT, alpha=-1)
+    if gauge is not None:
+        c = gauge * _mean_of(reduced, free, num_camera).sqrt()[:, None, None]
+        c = torch.nn.functional.pad(c, (0, 0, 0, num_camera))
+        reduced = torch.baddbmm(reduced, c, c.mT)
+    return FactorizedGrid(root, whitened, factorize(reduced, strict=damping is None))
+
+
+def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
+    """(B,) mean of the diagonal, without the rows that only fill up: each problem has the one that it has alone."""
+    diagonal = reduced.diagonal(dim1=-2, dim2=-1)
+    if free.all():
+        return diagonal.mean(-1)
+    rows = torch.nn.functional.pad(free.repeat_interleave(6, dim=1), (0, num_camera), value=True)
+    return torch.where(rows, diagonal, 0.0).sum(-1) / rows.sum(-1).clamp_min(1)
+
+
+def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:
+    """`inverse_root_3x3` of blocks (B, 3, 3, P), with diagonals grown by the share `damping`, where they are free."""
+    diagonal = blocks.diagonal(dim1=1, dim2=2).mT
+    if damping is not None:
+        diagonal = diagonal * (1 + damping[:, None, None])
+    d0, d1, d2 = diagonal.unbind(1)
+    lower = d0, blocks[:, 1, 0], d1, blocks[:, 2, 0], blocks[:, 2, 1], d2
+    smallest = torch.finfo(blocks.dtype).eps ** 0.8 if damping is None else 0.0
+    q00, q10, q11, q20, q21, q22 = inverse_root_3x3(lower, free, smallest)
+    zero = torch.zeros_like(q00)
+    return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=1).unflatten(1, (3, 3))
+
+
+class GridEstimate(NamedTuple):
+    """Poses (B, F, 4, 4) in the layout's order, points (B, 3, P), camera parameters (B, C, K)."""
+
+    T_cw: Tensor
+    points_w: Tensor
+    params: Tensor
+
+
+class GridModel(NamedTuple):
+    """The local models of the costs (B,) at an estimate."""
+
+    estimate: GridEstimate
+    cost: Tensor
+    equations: GridEquations
+
+
+@dataclass(frozen=True)
+class GridBundle:
+    """Bundle adjustments for `levenberg_marquardt.minimize`, and what follows from their minima.
+
+    directions: (K, n) in which the cameras' parameters move, None where they do not
+    """
+
+    data: GridData
+    camera: Camera
+    kernel: Kernel
+    directions: Tensor | None
+
+    @property
+    def solvable(self) -> Tensor:
+        layout, has_prior = self.data.layout, self.data.inputs.pose_prior is not None
+        observed = (layout.cells < layout.order.shape[1] * layout.free_points.shape[1]).any(1)
+        return observed | layout.free.any(1) if has_prior else observed
+
+    @property
+    def start(self) -> GridEstimate:
+        inputs = self.data.inputs
+        return GridEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
+
+    def rounding(self) -> Tensor:
+        return rounding_cost(self.data.inputs.weights, self.data.inputs.params)
+
+    def part(self, rows: Tensor) -> GridBundle:
+        """The problems of some elements of the batch."""
+        return replace(self, data=taken(self.data, rows))
+
+    def evaluate(self, estimate: GridEstimate, near: Tensor) -> GridModel:
+        points_c = self._points_c(estimate)
+        lin = self._linearize(estimate, points_c)
+        equations, prior_cost = self._equations(estimate, _expanded(lin, near))
+        return GridModel(estimate, lin.cost.sum((1, 2)) + prior_cost, equations)
+
+    def step(self, model: GridModel, damping: Tensor) -> tuple[GridEstimate, Tensor]:
+        equations, (T_cw, points_w, params) = model.equations, model.estimate
+        factorized = self._factorized(model.estimate, equations, damping)
+        step, points = factorized.solve(equations.gradient, equations.points_gradient)
+        decrease = (step * equations.gradient).sum(1) + (points * equations.points_gradient).sum((1, 2))
+        decrease = torch.where(factorized.reduced.definite, 0.5 * decrease, torch.inf)
+        frames, camera = self._split(step)
+        leading = frames.shape[1]
+        moved = retract(T_cw[:, :leading], -turned(T_cw[:, :leading, :3, :3], frames[..., None])[..., 0])
+        T_cw = torch.cat((moved, T_cw[:, leading:]), dim=1)
+        if self.directions is not None:
+            params = params - camera.unflatten(1, (params.shape[1], -1)) @ self.directions.mT
+        return GridEstimate(T_cw, points_w - points, params), decrease
+
+    def select(self, accept: Tensor, new: GridModel, old: GridModel) -> GridModel:
+        return new if accept.all() else chosen(accept, new, old)
+
+    def definite(self, model: GridModel) -> Tensor:
+        """(B,) whether all that moves is determined, up to the gauge."""
+        return self._factorized(model.estimate, model.equations).reduced.definite
+
+    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+        """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
+        layout, ordered = self.data.layout, self.ordered(estimate)
+        points_c = self._points_c(ordered)
+        expansion = exact_expansion(self._observations(ordered), points_c.mT, self.directions is not None)
+        if self.directions is not None:
+            expansion = expansion.along(self._columns)
+        equations, _ = self._equations(ordered, _as_grid(expansion), exact=True)
+        factorized = self._factorized(ordered, equations)
+        leading = layout.free.shape[1]
+        padding, R_cw = layout.order.shape[1] - leading, ordered.T_cw[:, :leading, :3, :3]
+
+        def solve(right: Tensors) -> Tensors:
+            frames, points, camera = right
+            frames = torch.where(layout.free[..., None], take(frames, layout.order)[:, :leading], 0.0)
+            frames = turned(R_cw.mT, frames[..., None])[..., 0]
+            solved, points = factorized.solve(torch.cat((frames.flatten(1), camera), dim=1), points.mT)
+            frames, camera = self._split(solved)
+            frames = torch.nn.functional.pad(turned(R_cw, frames[..., None])[..., 0], (0, 0, 0, padding))
+            return take(frames, layout.rank), points.mT, camera
+
+        return solve
+
+    def marginals(self, estimate: Estimate) -> Marginals:
+        """Covariances (B, F, 6, 6), (B, P, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
+        layout, ordered = self.data.layout, self.ordered(estimate)
+        points_c = self._points_c(ordered)
+        lin = self._linearize(ordered, points_c)
+        observations = self._observations(ordered)
+        flat = replace(
+            observations, pixels=observations.pixels.flatten(1, 2), weights=observations.weights.flatten(1)
+        )
+        columns = 0 if self.directions is None else self._columns.shape[-1] - 3
+        num_parameters = 6 * layout.free.sum(1) + 3 * layout.free_points.sum(1) + columns
+        factor = variance_factor(flat, Linearization(*(part.flatten(1, 2) for part in lin)), num_parameters)
+        expansion = _expanded(lin, torch.zeros_like(factor))
+        equations, _ = self._equations(ordered, expansion, share=factor[:, None, None])
+        inverse, points = self._factorized(ordered, equations).marginals()
+        inverse, points = factor[:, None, None] * inverse, factor[:, None, None, None] * points
+        leading = layout.free.shape[1]
+        size, R_cw = 6 * leading, ordered.T_cw[:, :leading, :3, :3]
+        frames = inverse[:, :size, :size].unflatten(1, (-1, 6)).unflatten(3, (-1, 6)).diagonal(dim1=1, dim2=3)
+        frames = turned(R_cw, turned(R_cw, frames.movedim(-1, 1)).mT)
+        frames = torch.where(layout.free[..., None, None], frames, 0.0)
+        padding = layout.order.shape[1] - leading
+        frames = take(torch.nn.functional.pad(frames, (0, 0, 0, 0, 0, padding)), layout.rank)
+        return Marginals(frames, points, inverse[:, size:, size:])
+
+    def ordered(self, estimate: Estimate) -> GridEstimate:
+        """An estimate as the grids have it."""
+        T_cw = take(estimate.T_cw, self.data.layout.order)
+        return GridEstimate(T_cw, estimate.points_w.mT, estimate.params)
+
+    def in_order(self, estimate: GridEstimate) -> Estimate:
+        """An estimate as the problems have it."""
+        T_cw = take(estimate.T_cw, self.data.layout.rank)
+        return Estimate(T_cw, estimate.points_w.mT, estimate.params)
+
+    def _points_c(self, estimate: GridEstimate) -> Tensor:
+        """(B, F, 3, P)"""
+        T_cw = estimate.T_cw
+        return T_cw[..., :3, :3] @ estimate.points_w[:, None] + T_cw[..., :3, 3:]
+
+    def _observations(self, estimate: GridEstimate) -> Observations:
+        inputs = self.data.inputs
+        params = estimate.params
+        if params.shape[1] > 1:
+            params = take(params, self.data.camera_of)
+        camera, scale = self.camera.with_params(params), inputs.scale[:, None, None]
+        return Observations(inputs.pixels.mT, inputs.weights, camera, self.kernel, scale)
+
+    @property
+    def _columns(self) -> Tensor:
+        """From points and directions to points and parameters, (3 + K, 3 + n) or (B, F, 1, 3 + K, 3 + C n)."""
+        assert self.directions is not None
+        num_cameras = self.data.inputs.params.shape[1]
+        columns = camera_columns(self.directions, num_cameras)
+        return columns[0] if num_cameras == 1 else columns[self.data.camera_of][:, :, None]
+
+    def _linearize(self, estimate: GridEstimate, points_c: Tensor) -> Linearization:
+        """Of every frame and point, (B, F, P, ...)."""
+        lin = linearize(self._observations(estimate), points_c.mT, self.directions is not None)
+        return lin if self.directions is None else lin._replace(J=lin.J @ self._columns)
+
+    def _equations(
+        self,
+        estimate: GridEstimate,
+        expansion: GridExpansion,
+        exact: bool = False,
+        share: Tensor | float = 1.0,
+    ) -> tuple[GridEquations, Tensor | float]:
+        """The equations with a share of the priors, and the priors' cost (B,)."""
+        R_cw, t_cw = estimate.T_cw[..., :3, :3], estimate.T_cw[..., :3, 3:]
+        rays_w = estimate.points_w[:, None] + R_cw.mT @ t_cw
+        equations = assemble_grid(expansion, rays_w, R_cw, self.data.layout.free, exact)
+        terms = self._priors(estimate, exact)
+        if terms is None:
+            return equations, 0.0
+        gradient = torch.cat((terms.frames_gradient.flatten(1), terms.camera_gradient), dim=1)
+        frames, camera = block_diagonal(terms.frames), terms.camera
+        size, more = frames.shape[-1], camera.shape[-1]
+        hessian = torch.nn.functional.pad(frames, (0, more, 0, more))
+        hessian = hessian + torch.nn.functional.pad(camera, (size, 0, size, 0))
+        return (
+            equations._replace(
+                gradient=equations.gradient + gradient, reduced=equations.reduced + share * hessian
+            ),
+            terms.cost,
+        )
+
+    def _priors(self, estimate: GridEstimate, exact: bool = False) -> PriorTerms | None:
+        inputs, free = self.data.inputs, self.data.layout.free
+        if inputs.pose_prior is not None:
+            leading = free.shape[1]
+            inputs = inputs._replace(
+                prior_T_cw=inputs.prior_T_cw[:, :leading],
+                prior_information=inputs.prior_information[:, :leading],
+            )
+        T_cw = estimate.T_cw[:, : free.shape[1]]
+        terms = prior_terms(inputs, T_cw, estimate.params, free, self.directions, exact)
+        return None if terms is None else terms.in_world(T_cw[..., :3, :3])
+
+    def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """The parts of (B, D) that are of the free frames (B, F', 6) and of the cameras."""
+        leading = self.data.layout.free.shape[1]
+        return vector[:, : 6 * leading].unflatten(1, (leading, 6)), vector[:, 6 * leading :]
+
+    def _factorized(
+        self, estimate: GridEstimate, equations: GridEquations, damping: Tensor | None = None
+    ) -> FactorizedGrid:
+        layout = self.data.layout
+        more = equations.reduced.shape[-1] - 6 * layout.free.shape[1]
+        return factorized_grid(
+            equations, layout.free, layout.free_points, more, damping, self._gauge(estimate)
+        )
+
+    def _gauge(self, estimate: GridEstimate) -> Tensor | None:
+        """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None
+        where nowhere."""
+        layout = self.data.layout
+        free, anchors = layout.free, layout.anchors.sum(1)
+        is_open = (anchors < 2) & ~layout.held_points & free.any(1)
+        if not is_open.any():
+            return None
+        T_free = estimate.T_cw[:, : free.shape[1]]
+        first = torch.where(anchors > 0, layout.anchors.int().argmax(1), 0)[:, None]
+        similarity = gauge_motions(T_free, se3_inverse(take(estimate.T_cw, first))[..., :3, 3])
+        scaling = similarity[..., 0]
+        scaling = torch.where((free & is_open[:, None])[..., None], scaling, 0.0)
+        length = scaling.square().sum((1, 2), keepdim=True)
+        motions = (scaling * torch.where(length > 0, length, 1.0).rsqrt())[..., None]
+        adrift = is_open & (anchors == 0) & (free.sum(1) > 1)
+        if adrift.any():
+            moves = torch.where(free[..., None, None], similarity[..., 1:], 0.0)
+            whole = torch.cat((motions, moves), dim=-1).flatten(1, 2)
+            eye = torch.eye(*whole.shape[1:], dtype=whole.dtype, device=whole.device)
+            whole = torch.linalg.qr(torch.where(adrift[:, None, None], whole, eye)).Q
+            rest = torch.where(adrift[:, None, None], whole[..., 1:], 0.0).unflatten(1, (free.shape[1], 6))
+            motions = torch.cat((motions, rest), dim=-1)
+        with torch.no_grad():
+            priors = self._priors(estimate)
+            motions = motions if priors is None else still_open(motions, priors.frames)
+        return motions.flatten(1, 2)
+
+
+def _expanded(lin: Linearization, near: Tensor) -> GridExpansion:
+    """Without the bend of the projection; near: (B,)."""
+    J = lin.J.movedim((-2, -1), (0, 1))
+    gradient, hessian = gauss_newton_expansion(lin, J, near[:, None, None])
+    return GridExpansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())
+
+
+def _as_grid(expansion: Expansion) -> GridExpansion:
+    """(B, F, P, D) and (B, F, P, D, D) with the points last."""
+    return GridExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
+
+
+def camera_columns(directions: Tensor, num_cameras: int) -> Tensor:
+    """(C, 3 + K, 3 + C n) from a point and the steps of all cameras along n directions (K, n) to the point and the
+    parameters of one of them."""
+    eye = torch.eye(3, dtype=directions.dtype, device=directions.device)
+    own = torch.eye(num_cameras, dtype=directions.dtype, device=directions.device)
+    return torch.stack([torch.block_diag(eye, torch.kron(row[None], directions)) for row in own])
