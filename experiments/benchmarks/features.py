@@ -1,6 +1,6 @@
 """How good and how fast the features and their matching are, beside OpenCV, in one run and on one thread.
 
-    python -m experiments.benchmarks.features [--data FOLDER] [--output FILE] [--pairs 8] [--no-compile]
+    python -m experiments.benchmarks.features [--data FOLDER] [--output FILE] [--pairs 8]
 
 FOLDER holds the sequences. Both extractors give 1000 keypoints, and the same matcher matches them; OpenCV's keypoints
 are those of `OpenCVORB`, that is with the half pixel put right that cv2.ORB is off on its higher levels. Times are CPU
@@ -43,7 +43,7 @@ def read(data: Path, sequence: str) -> list[Path]:
     return sorted((data / sequence / "rgb").iterdir())
 
 
-def grey(path: Path) -> NDArray:
+def gray(path: Path) -> NDArray:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise SystemExit(f"{path}: cannot be read")
@@ -79,7 +79,7 @@ def epipolar(
     fx, fy, cx, cy = (float(v) for v in (data / sequence / "calibration.txt").read_text().split()[:4])
     counts, shares = [], []
     for start in np.linspace(0, len(paths) - 1 - max(GAPS), pairs).astype(int):
-        images = [grey(paths[start]), grey(paths[start + gap])]
+        images = [gray(paths[start]), gray(paths[start + gap])]
         height, width = images[0].shape
         camera = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
         pixels_1, pixels_2 = match_pixels(*(extract(to_tensor(image)) for image in images), **options)
@@ -91,12 +91,12 @@ def epipolar(
 
 
 def changes(height: int, width: int) -> dict[str, tuple[NDArray, float, float, float]]:
-    """Known changes of an image: a homography, noise in grey values, gain and offset."""
-    centre = np.array([[1, 0, width / 2], [0, 1, height / 2], [0, 0, 1.0]])
+    """Known changes of an image: a homography, noise in gray values, gain and offset."""
+    center = np.array([[1, 0, width / 2], [0, 1, height / 2], [0, 0, 1.0]])
 
     def turned(degrees: float, scale: float) -> NDArray:
         c, s = scale * np.cos(np.radians(degrees)), scale * np.sin(np.radians(degrees))
-        return centre @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(centre)
+        return center @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(center)
 
     tilt = np.eye(3)
     tilt[2, :2] = 2.5e-4, -2e-4
@@ -110,7 +110,7 @@ def changes(height: int, width: int) -> dict[str, tuple[NDArray, float, float, f
         "noise 8": (np.eye(3), 8, 1, 0),
         "darker": (turned(3, 1), 2, 0.6, 0),
         "brighter": (turned(3, 1), 2, 1.2, 15),
-        "tilted": (centre @ tilt @ np.linalg.inv(centre), 2, 1, 0),
+        "tilted": (center @ tilt @ np.linalg.inv(center), 2, 1, 0),
     }
 
 
@@ -158,15 +158,12 @@ def random_descriptors(count: int, seed: int) -> Features:
     return Features(keypoints, ones, ones, ones, described, ones.bool())
 
 
-def speed_tables(image: NDArray, compiled: bool) -> list[str]:
+def speed_tables(image: NDArray) -> list[str]:
     peer, tensor = cv2.ORB.create(1000), to_tensor(image)
-    modules = {"torchslam": ORB(1000)} | (
-        {"torchslam, compiled": ORB(1000, compile=True)} if compiled else {}
+    pair = in_turns(
+        {"torchslam": partial(ORB(1000), tensor), "cv2": lambda: peer.detectAndCompute(image, None)}
     )
-    times: dict[str, tuple[float, float]] = {}
-    for name, module in modules.items():
-        pair = in_turns({name: partial(module, tensor), "cv2": lambda: peer.detectAndCompute(image, None)})
-        times |= {name: (pair[name], pair["cv2"])}
+    times = {"torchslam": (pair["torchslam"], pair["cv2"])}
     lines = ["| ORB, 1000 keypoints, 640x480 | ms | cv2.ORB | ratio |", "|---|---|---|---|"]
     lines += [f"| {name} | {a:.1f} | {b:.1f} | {a / b:.1f} |" for name, (a, b) in times.items()]
     lines += ["", "| Hamming, mutual | ms | cv2.BFMatcher | ratio |", "|---|---|---|---|"]
@@ -202,7 +199,7 @@ def quality_tables(data: Path, pairs: int) -> list[str]:
     extractors: dict[str, nn.Module] = {"ours": ORB(1000), "cv2": OpenCVORB(1000)}
     lines = []
     for title, options in (
-        ("mutual nearest neighbours", {"ratio": None, "max_distance": None}),
+        ("mutual nearest neighbors", {"ratio": None, "max_distance": None}),
         ("mutual and ratio 0.8", {"ratio": 0.8, "max_distance": None}),
     ):
         lines += [
@@ -221,7 +218,7 @@ def quality_tables(data: Path, pairs: int) -> list[str]:
         lines.append("")
     lines += ["| known change | repeatability | precision | right matches | error, px |", "|---" * 5 + "|"]
     images = [
-        grey(path)
+        gray(path)
         for name in SEQUENCES
         for path in (lambda p: p[:: max(1, len(p) // 3)][:3])(read(data, name))
     ]
@@ -243,13 +240,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
     parser.add_argument("--output", type=Path, default=HERE / "features.md")
     parser.add_argument("--pairs", type=int, default=8, help="of images, per sequence and distance")
-    parser.add_argument("--no-compile", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     with torch.no_grad():
-        image = cv2.resize(grey(read(arguments.data, "redkitchen")[0]), (640, 480))
-        lines = ["One thread, CPU time, medians.", "", *speed_tables(image, not arguments.no_compile), ""]
+        image = cv2.resize(gray(read(arguments.data, "redkitchen")[0]), (640, 480))
+        lines = ["One thread, CPU time, medians.", "", *speed_tables(image), ""]
         lines += [
             "Quality, torchslam / OpenCV: matches that one essential matrix explains to 1 px, and their share.",
             "",

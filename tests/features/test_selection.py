@@ -4,14 +4,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.features.pyramid import plan_atlas
+from torchslam.features.pyramid import plan_pyramid
 from torchslam.features.selection import (
     _falling,
     best_of_cells,
-    contend,
     plan_grid,
+    prefilter_candidates,
     ranks_within,
-    spread,
+    select_evenly,
 )
 
 CPU = torch.device("cpu")
@@ -30,44 +30,44 @@ def test_best_of_cells_are_the_highest() -> None:
 
 
 def test_atlas_levels_do_not_overlap() -> None:
-    atlas = plan_atlas(123, 201, 1.2, 8)
-    taken = torch.zeros(atlas.rows, atlas.stride, dtype=torch.int64)
-    for (h, w), (top, left) in zip(atlas.sizes, atlas.corners, strict=True):
+    pyramid = plan_pyramid(123, 201, 1.2, 8)
+    taken = torch.zeros(pyramid.rows, pyramid.stride, dtype=torch.int64)
+    for (h, w), (top, left) in zip(pyramid.sizes, pyramid.corners, strict=True):
         taken[top : top + h, left : left + w] += 1
     assert taken.max() == 1
-    assert taken.sum() == sum(h * w for h, w in atlas.sizes)
+    assert taken.sum() == sum(h * w for h, w in pyramid.sizes)
 
 
 def test_grid_shares_the_budget_and_leaves_the_border() -> None:
-    atlas = plan_atlas(240, 320, 1.2, 8)
-    grid = plan_grid(atlas, 500, 8, 19, 7, CPU)
+    pyramid = plan_pyramid(240, 320, 1.2, 8)
+    grid = plan_grid(pyramid, 500, 8, 19, 7, CPU)
     assert int(grid.budgets.sum()) == 500
     assert (grid.budgets[:-1] >= grid.budgets[1:]).all()
-    inside = grid.table.view(atlas.rows, atlas.stride) >= 0
+    inside = grid.table.view(pyramid.rows, pyramid.stride) >= 0
     assert inside[19 : 240 - 19, 19 : 320 - 19].all()
     assert not inside[:240, :19].any()
     assert set(grid.floor.tolist()) == {7, 255}
 
 
 def test_levels_without_room_get_no_budget() -> None:
-    grid = plan_grid(plan_atlas(60, 60, 1.2, 8), 100, 8, 19, 7, CPU)
+    grid = plan_grid(plan_pyramid(60, 60, 1.2, 8), 100, 8, 19, 7, CPU)
     assert grid.budgets.tolist()[-1] == 0
     assert int(grid.budgets.sum()) == 100
-    assert int(plan_grid(plan_atlas(20, 20, 1.2, 8), 100, 8, 19, 7, CPU).budgets.sum()) == 0
+    assert int(plan_grid(plan_pyramid(20, 20, 1.2, 8), 100, 8, 19, 7, CPU).budgets.sum()) == 0
 
 
 def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
-    atlas = plan_atlas(100, 100, 1.2, 1)
-    grid = plan_grid(atlas, 4, 1, 19, 7, CPU)
+    pyramid = plan_pyramid(100, 100, 1.2, 1)
+    grid = plan_grid(pyramid, 4, 1, 19, 7, CPU)
     assert len(grid.levels) == 4
     scores = torch.tensor([9.0, 8.0, 7.0, 6.0, 1.0, 2.0, 3.0])
     cells = torch.tensor([0, 0, 0, 0, 1, 2, 3])
     everything = torch.ones(7, dtype=torch.bool)
     image = torch.zeros(7, dtype=torch.int64)
-    rows, places = spread(scores, everything, cells, image, grid, 1, 4)
+    rows, places = select_evenly(scores, everything, cells, image, grid, 1, 4)
     assert rows[places.argsort()].tolist() == [0, 6, 5, 4]
     # Weak corners are taken only as the best of their cell.
-    rows, _ = spread(scores, ~everything, cells, image, grid, 1, 7)
+    rows, _ = select_evenly(scores, ~everything, cells, image, grid, 1, 7)
     assert sorted(rows.tolist()) == [0, 4, 5, 6]
 
 
@@ -80,13 +80,13 @@ def test_falling_order_is_that_of_a_stable_sort(values: list[float]) -> None:
 
 
 def test_spread_gives_unused_budget_to_other_levels() -> None:
-    atlas = plan_atlas(100, 100, 1.2, 2)
-    grid = plan_grid(atlas, 10, 2, 19, 7, CPU)
+    pyramid = plan_pyramid(100, 100, 1.2, 2)
+    grid = plan_grid(pyramid, 10, 2, 19, 7, CPU)
     level_1 = int((grid.levels == 1).nonzero()[0])
     cells = torch.full((9,), level_1)
     scores = torch.arange(9.0)
     image = torch.zeros(9, dtype=torch.int64)
-    rows, _ = spread(scores, scores >= 0, cells, image, grid, 1, 10)
+    rows, _ = select_evenly(scores, scores >= 0, cells, image, grid, 1, 10)
     assert len(rows) == 9
 
 
@@ -95,7 +95,7 @@ def test_whoever_contends_not_is_not_chosen(
     seed: int, count: int, corners: int, batch: int, most: int
 ) -> None:
     draw = torch.Generator().manual_seed(seed)
-    grid = plan_grid(plan_atlas(120, 160, 1.2, 4), count, 8, 19, 7, CPU)
+    grid = plan_grid(plan_pyramid(120, 160, 1.2, 4), count, 8, 19, 7, CPU)
     num_cells = grid.levels.shape[0]
     cells, images = (torch.randint(0, n, (corners,), generator=draw) for n in (num_cells, batch))
     fast = torch.randint(8, 8 + most, (corners,), generator=draw).to(torch.uint8)
@@ -104,17 +104,19 @@ def test_whoever_contends_not_is_not_chosen(
     best = best_of_cells(images * num_cells + cells, fast, batch * num_cells)
 
     offered = strong | best
-    fewer = best | (strong & contend(fast, offered, cells, images, grid, batch, count))
+    fewer = best | (strong & prefilter_candidates(fast, offered, cells, images, grid, batch, count))
     results = []
     for rows in (offered.nonzero().squeeze(1), fewer.nonzero().squeeze(1)):
-        chosen, places = spread(*(x[rows] for x in (strengths, strong, cells, images)), grid, batch, count)
+        chosen, places = select_evenly(
+            *(x[rows] for x in (strengths, strong, cells, images)), grid, batch, count
+        )
         results.append((rows[chosen].tolist(), places.tolist()))
     assert results[0] == results[1]
 
 
 def test_few_contend_where_many_are_equal() -> None:
-    grid = plan_grid(plan_atlas(480, 640, 1.2, 8), 500, 8, 19, 7, CPU)
+    grid = plan_grid(plan_pyramid(480, 640, 1.2, 8), 500, 8, 19, 7, CPU)
     cells = torch.randint(0, grid.levels.shape[0], (20_000,), generator=torch.Generator().manual_seed(0))
     fast = (torch.arange(20_000) % 200 + 30).to(torch.uint8)
     offered, images = fast > 0, torch.zeros(20_000, dtype=torch.int64)
-    assert 500 <= int(contend(fast, offered, cells, images, grid, 1, 500).sum()) < 1500
+    assert 500 <= int(prefilter_candidates(fast, offered, cells, images, grid, 1, 500).sum()) < 1500

@@ -9,12 +9,11 @@ from torch import Tensor
 from torchslam.geometry import (
     Camera,
     KeypointNoise,
-    fits,
     innovation_covariances,
     mahalanobis_squared,
+    passes_gate,
 )
-from torchslam.geometry.gating import MARGIN, unpacked_information
-from torchslam.geometry.whitening import whitening
+from torchslam.geometry.gating import GATE_FACTOR, unpacked_information, whitening
 
 
 def test_distance_of_uncertain_predictions_is_chi_square(generator: torch.Generator) -> None:
@@ -57,17 +56,17 @@ def test_noise_is_the_same_however_it_is_said(kind: str, generator: torch.Genera
     weights, spread = (sigmas**-2, sigmas) if kind != "matrix" else (sigmas**-2, sigmas**2)
     if kind == "matrix":
         weights, spread = weights[:, None, None] * eye, spread[:, None, None] * eye
-    margin = 1.0 if kind == "scale" else MARGIN
+    margin = 1.0 if kind == "scale" else GATE_FACTOR
     wanted = errors.square().sum(-1) / (margin * sigmas) ** 2
     torch.testing.assert_close(noise.weights, weights)
-    torch.testing.assert_close(noise.spread, spread)
+    torch.testing.assert_close(noise.sigma_or_covariance, spread)
     torch.testing.assert_close(noise.sigmas, sigmas)
-    torch.testing.assert_close(noise.tolerance, margin * sigmas)
+    torch.testing.assert_close(noise.gate_sigma, margin * sigmas)
     torch.testing.assert_close(noise.squared(errors), wanted)
     wanted[3] = torch.inf  # behind the camera
     torch.testing.assert_close(noise.squared_reprojection(points_c, pixels, camera), wanted)
     torch.testing.assert_close(noise[rows].squared(errors[rows]), wanted[rows])
-    worse = noise.worse(said(kind, sigmas.flip(0)))
+    worse = noise.pairwise_max(said(kind, sigmas.flip(0)))
     torch.testing.assert_close(worse.sigmas, torch.maximum(sigmas, sigmas.flip(0)))
     back = unpacked_information(noise.information)
     assert (
@@ -88,13 +87,13 @@ def test_the_gate_keeps_95_percent_of_noise_that_has_a_direction(generator: torc
     ]
     information = axes @ torch.diag(lengths**-2) @ axes.mT
     noise = KeypointNoise.of(torch.ones(count, dtype=torch.float64), information)
-    assert abs(float(fits(noise.squared(MARGIN * errors)).double().mean()) - 0.95) < 0.01
+    assert abs(float(passes_gate(noise.squared(GATE_FACTOR * errors)).double().mean()) - 0.95) < 0.01
     torch.testing.assert_close(noise.sigmas, torch.full_like(turn, math.sqrt(3.0 * 0.3)))
-    torch.testing.assert_close(noise.spread, axes @ torch.diag(lengths**2) @ axes.mT)
+    torch.testing.assert_close(noise.sigma_or_covariance, axes @ torch.diag(lengths**2) @ axes.mT)
     S = innovation_covariances(
-        torch.zeros(count, 2, 3).double(), torch.zeros(count, 3, 3).double(), noise.spread
+        torch.zeros(count, 2, 3).double(), torch.zeros(count, 3, 3).double(), noise.sigma_or_covariance
     )
-    torch.testing.assert_close(mahalanobis_squared(errors, S), noise.squared(MARGIN * errors))
+    torch.testing.assert_close(mahalanobis_squared(errors, S), noise.squared(GATE_FACTOR * errors))
 
 
 def test_a_root_of_an_information_whitens_and_has_gradients(generator: torch.Generator) -> None:

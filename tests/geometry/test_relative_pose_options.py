@@ -12,8 +12,8 @@ from torch import Tensor
 from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
 from torchslam.geometry.motion_models import Fits, PlaneMotions, goes_both_ways, plane_holds
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import TwoViews
-from torchslam.geometry.two_view_essential import (
+from torchslam.geometry.two_view import (
+    TwoViews,
     ahead_and_parallax,
     best_in_front,
     possible_matches,

@@ -46,7 +46,7 @@ def test_whitened_slopes_give_errors_in_units_of_the_noise(kind):
     undistorted, error = UndistortedKeypoints.of(pixels(), camera), torch.tensor([0.01, -0.02]).double()
     white = (undistorted.whitened(noise) * error[:, None, None]).sum(0)
     off_px = (undistorted.slope * error[:, None, None]).sum(0).mT
-    torch.testing.assert_close(white.square().sum(0), noise.squared(off_px) * noise.margin**2)
+    torch.testing.assert_close(white.square().sum(0), noise.squared(off_px) * noise.gate_factor**2)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])

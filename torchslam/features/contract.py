@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchslam.errors import ConfigError
-from torchslam.geometry.whitening import is_definite
+from torchslam.geometry.gating import is_definite
 from torchslam.types import Features
 
 COLUMNS: dict[str, tuple[int, ...]] = {
@@ -95,3 +96,14 @@ def _check_information(
 
 def _described(values: object) -> str:
     return f"{tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+
+
+def only_where(features: Features, wanted: Tensor) -> Features:
+    """Features without the keypoints whose nearest pixel is not wanted; pixels beyond the image count as its edge.
+
+    wanted: (B, 1, H, W) bool.
+    """
+    height, width = wanted.shape[-2:]
+    x, y = features.keypoints.detach().round().to(torch.int64).unbind(-1)
+    inside = wanted[:, 0].flatten(1).gather(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1))
+    return replace(features, mask=features.mask & inside)

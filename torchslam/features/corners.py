@@ -1,18 +1,192 @@
-"""Harris responses of small patches and sub-pixel positions, hard (quadratic fit) and soft (arg-max with gradients)."""
+"""FAST corners, Harris responses, and sub-pixel positions of corners.
+
+Images are flattened and worked on in chunks: few calls, and intermediate results stay in the cache. On the CPU the
+chunks are NumPy's: for bytes, a call of NumPy takes half the time of one of torch, and gives the same.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
+from types import ModuleType
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-WINDOW = 7
+from torchslam.utils.indexing import true_indices
+
+CHUNK_PIXELS = 260_000
+"""Pixels worked on at once, at most: a dozen intermediate results of bytes stay in the third-level cache. With half as
+many they fill the second level, and more calls take 3 % longer."""
+
+
+def to_numpy(pixels: Tensor) -> Any:
+    """View pixels on the CPU as NumPy, in the same memory; those on a GPU are returned as they are.
+
+    What both can do is written once: slices, operators, and the functions of `array_module`.
+    """
+    return pixels.numpy() if pixels.is_cpu else pixels
+
+
+def array_module(pixels: Any) -> ModuleType:
+    """numpy or torch, whichever has the pixels: both have minimum, maximum, add and subtract, with `out`."""
+    return np if isinstance(pixels, np.ndarray) else torch
+
+
+def to_tensor(pixels: Any) -> Tensor:
+    """The inverse of `to_numpy`."""
+    return torch.from_numpy(pixels) if isinstance(pixels, np.ndarray) else pixels
+
+
+def chunks(pixels: Any, start: int, stop: int) -> list[tuple[int, int]]:
+    """(start, count) of chunks of nearly equal size from `start` to before `stop`; a single one on a GPU.
+
+    pixels: of `to_numpy`
+    """
+    count = max(0, stop - start)
+    number = max(1, -(-count // CHUNK_PIXELS)) if isinstance(pixels, np.ndarray) else 1
+    size = -(-count // number)
+    return [(first, min(size, stop - first)) for first in range(start, start + count, max(1, size))]
+
+
+# The circle of radius 3, (dx, dy), clockwise from the top.
+FAST_CIRCLE = (
+    (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
+    (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
+)  # fmt: skip
+
+Bands = tuple[tuple[int, int], ...]
+"""(start, stop) of runs of pixels in a flattened image, ascending."""
+
+Extremum = Callable[..., Any]
+Opposites = Callable[[Extremum, int, int], tuple[Any, Any]]
+"""(extremum, i, j) -> the extremum of neighbors i and j on the circle, and that of those opposite, i + 8 and j + 8."""
+
+
+def fast_scores(pixels: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
+    """Score of every pixel: the largest t at which it is brighter or darker by t than nine neighbors in a row.
+
+    pixels: (P,) uint8, a flattened image of row length `stride`; bands: the pixels whose scores are used, others are
+    undefined; None: all. Returns (P,) uint8; 0 where there is no such arc and in the first and last rows,
+    which the circle leaves. A pixel is a FAST-9 corner of threshold t where its score exceeds t.
+    """
+    margin, values = 3 * stride + 3, to_numpy(pixels)
+    parts = _chunks_of(bands, values, margin)
+    scores, end = [], 0
+    for start, count in parts:
+        scores += [torch.zeros_like(pixels[end:start])] * (start > end)
+        scores.append(to_tensor(_chunk_scores(values, stride, start, count)))
+        end = start + count
+    return torch.cat([*scores, torch.zeros_like(pixels[end:])])
+
+
+def _chunks_of(bands: Bands | None, pixels: Any, margin: int) -> list[tuple[int, int]]:
+    """(start, count) of chunks that hold all bands, ascending, except for margins at both ends of the pixels."""
+    last = len(pixels) - margin
+    if bands is None:
+        bands = ((margin, last),)
+    # Off the CPU a single chunk costs less than to leave out what lies between the bands.
+    if bands and not isinstance(pixels, np.ndarray):
+        bands = ((bands[0][0], bands[-1][1]),)
+    return [chunk for start, stop in bands for chunk in chunks(pixels, max(start, margin), min(stop, last))]
+
+
+def _chunk_scores(pixels: Any, stride: int, start: int, count: int) -> Any:
+    """`fast_scores` of `count` pixels of `to_numpy` from `start` on."""
+
+    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Any, Any]:
+        # The opposite pair has the same shape: it is this one elsewhere in the image.
+        first, second = (dy * stride + dx for dx, dy in (FAST_CIRCLE[i], FAST_CIRCLE[j]))
+        low, high = min(first, -second), max(first, -second)
+        here, there = (
+            pixels[k : k + count + high - low] for k in (start + low, start + low + second - first)
+        )
+        found = extremum(here, there)
+        return found[first - low :][:count], found[-second - low :][:count]
+
+    return _scores(opposites, pixels[start : start + count], array_module(pixels))
+
+
+def patch_scores(patches: Tensor) -> Tensor:
+    """FAST scores wherever the circle fits into a patch, differentiable: (N, S, S) floats -> (N, S - 6, S - 6)."""
+    inner = patches.shape[-1] - 6
+    ring = [patches[:, 3 + dy :, 3 + dx :][:, :inner, :inner] for dx, dy in FAST_CIRCLE]
+
+    def opposites(extremum: Extremum, i: int, j: int) -> tuple[Tensor, Tensor]:
+        return extremum(ring[i], ring[j]), extremum(ring[i - 8], ring[j - 8])
+
+    return _scores(opposites, patches[:, 3:-3, 3:-3], torch)
+
+
+def _scores(opposites: Opposites, center: Any, library: ModuleType) -> Any:
+    """FAST scores of pixels (`center`), given their neighbors on the circle."""
+    minimum, maximum, subtract = library.minimum, library.maximum, library.subtract
+    # The darkest pixel of the brightest arc, and the brightest pixel of the darkest one.
+    bright = _in_place(_best_arc(opposites, minimum, maximum), maximum, center)
+    dark = _in_place(_best_arc(opposites, maximum, minimum), minimum, center)
+    return _in_place(center - dark, maximum, _in_place(bright, subtract, center))
+
+
+def _best_arc(opposites: Opposites, inner: Extremum, outer: Extremum) -> Any:
+    """`outer` over the sixteen arcs of nine of `inner` within the arc.
+
+    Pair k holds the neighbors 2 k + 1 and 2 k + 2. The arcs from 2 k and 2 k + 1 on hold the pairs k to k + 3 and an
+    end, 2 k or 2 k + 9: min(pairs, a) and min(pairs, b) have the maximum min(pairs, max(a, b)).
+    """
+    pairs = [*zip(*(opposites(inner, 2 * k + 1, 2 * k + 2) for k in range(4)), strict=True)]
+    ends = [*zip(*(opposites(outer, 2 * k, 2 * k + 9) for k in range(4)), strict=True)]
+    halves = []
+    for half in (0, 1):  # eight arcs that have pair 3 of the half in common
+        p, e = (*pairs[half], *pairs[1 - half]), ends[half]
+        early = _in_place(inner(p[0], e[0]), outer, inner(p[4], e[1]))
+        early = _in_place(_in_place(early, inner, p[1]), inner, p[2])
+        late = _in_place(inner(p[2], e[2]), outer, inner(p[6], e[3]))
+        late = _in_place(_in_place(late, inner, p[4]), inner, p[5])
+        halves.append(_in_place(_in_place(early, outer, late), inner, p[3]))
+    return _in_place(halves[0], outer, halves[1])
+
+
+def _in_place(values: Any, function: Callable[..., Any], others: Any) -> Any:
+    """function(values, others), for bytes in the memory of the values: new memory costs more than the function."""
+    return function(values, others, out=values if values.itemsize == 1 else None)
+
+
+def find_peaks(scores: Tensor, floor: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
+    """Positions (K,) int64, ascending, of scores that exceed their floor and their eight neighbors; of equal ones the
+    first wins.
+
+    scores, floor: (P,) uint8, flattened with row length `stride`; bands: pixels beyond which
+    no score exceeds its floor; None: all except a margin.
+    """
+    values, floors = to_numpy(scores), to_numpy(floor)
+    parts = _chunks_of(bands, values, stride + 1)
+    found = [
+        true_indices(to_tensor(_chunk_peaks(values, floors, stride, start, count))) + start
+        for start, count in parts
+    ]
+    return torch.cat(found) if found else torch.zeros(0, dtype=torch.int64, device=scores.device)
+
+
+def _chunk_peaks(scores: Any, floor: Any, stride: int, start: int, count: int) -> Any:
+    """(count,) bool: peaks among the pixels of `to_numpy` from `start` on."""
+    maximum = array_module(scores).maximum
+    first, length = start - stride, count + 2 * stride
+    left, middle, right = (scores[first + k : first + k + length] for k in (-1, 0, 1))
+    rows = _in_place(maximum(left, right), maximum, middle)  # rows[i] covers columns i-1, i, i+1
+    before = _in_place(maximum(rows[:count], left[stride:][:count]), maximum, floor[start : start + count])
+    after = maximum(rows[2 * stride :], right[stride:][:count])
+    center = middle[stride:][:count]
+    return (center > before) & (center >= after)
+
+
+HARRIS_WINDOW = 7
 HARRIS_K = 0.04
 
 
 def gather_patches(pixels: Tensor, positions: Tensor, stride: int, radius: int) -> Tensor:
-    """Square neighbourhoods out of a flattened image: (P,), (N,) int64 -> (N, side, side), side = 2 radius + 1.
+    """Square neighborhoods out of a flattened image: (P,), (N,) int64 -> (N, side, side), side = 2 radius + 1.
 
     Whole rows are copied at once, which is ten times faster than an index per pixel.
     """
@@ -36,13 +210,13 @@ def _sobel(side: int, device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _windows(inner: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """(inner^2, outputs^2): sums over all WINDOW x WINDOW windows of an inner x inner map, as a matrix."""
-    outputs = inner - WINDOW + 1
+def _window_sums(inner: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """(inner^2, outputs^2): sums over all Harris windows of an inner x inner map, as a matrix."""
+    outputs = inner - HARRIS_WINDOW + 1
     matrix = torch.zeros(inner, inner, outputs, outputs)
     for row in range(outputs):
         for column in range(outputs):
-            matrix[row : row + WINDOW, column : column + WINDOW, row, column] = 1
+            matrix[row : row + HARRIS_WINDOW, column : column + HARRIS_WINDOW, row, column] = 1
     return matrix.view(inner * inner, -1).to(device=device, dtype=dtype)
 
 
@@ -55,7 +229,7 @@ def harris_responses(patches: Tensor) -> Tensor:
     side = patches.shape[-1]
     gradients = patches.flatten(1) @ _sobel(side, patches.device, patches.dtype)
     dx, dy = gradients.chunk(2, dim=-1)
-    windows = _windows(side - 2, patches.device, patches.dtype)
+    windows = _window_sums(side - 2, patches.device, patches.dtype)
     xx, yy, xy = (dx * dx) @ windows, (dy * dy) @ windows, (dx * dy) @ windows
     trace = xx + yy
     responses = (xx * yy - xy * xy) - HARRIS_K * trace * trace
@@ -64,20 +238,20 @@ def harris_responses(patches: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """(9, 5): 3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the centre."""
-    slope, bend, ones = torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([1.0, -2.0, 1.0]), torch.ones(3)
+    """(9, 5): 3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the center."""
+    slope, curve, ones = torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([1.0, -2.0, 1.0]), torch.ones(3)
     fits = [
         torch.outer(ones, slope) / 6,
         torch.outer(slope, ones) / 6,
-        torch.outer(ones, bend) / 3,
-        torch.outer(bend, ones) / 3,
+        torch.outer(ones, curve) / 3,
+        torch.outer(curve, ones) / 3,
         torch.outer(slope, slope) / 4,
     ]
     return torch.stack(fits, dim=-1).view(9, 5).to(device=device, dtype=dtype)
 
 
 def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
-    """Offset (x, y) of the maximum of the paraboloid fitted to 3x3 responses, in pixels from the centre.
+    """Offset (x, y) of the maximum of the paraboloid fitted to 3x3 responses, in pixels from the center.
 
     responses: (N, 3, 3). Returns (N, 2), within +-limit; zero where the fit has no maximum.
     """
@@ -91,9 +265,9 @@ def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
 
 
 def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
-    """Soft arg-max over a neighbourhood: offset (x, y) of its maximum from its centre, differentiable.
+    """Soft arg-max over a neighborhood: offset (x, y) of its maximum from its center, differentiable.
 
-    responses: (N, S, S), S odd. They are divided by the largest magnitude of their neighbourhood, so that
+    responses: (N, S, S), S odd. They are divided by the largest magnitude of their neighborhood, so that
     `temperature` has no unit. Returns (N, 2) pixels.
     """
     side = responses.shape[-1]

@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
+from torchslam.features.contract import only_where
 from torchslam.features.corners import soft_peak
-from torchslam.features.masking import only_where
 from torchslam.features.orb import check_images
 from torchslam.types import Features
 from torchslam.utils.bounded_read import check_regular

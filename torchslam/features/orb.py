@@ -12,34 +12,44 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
-from torchslam.features.corners import gather_patches, harris_responses, quadratic_peak, soft_peak
-from torchslam.features.fast import Bands, fast_scores, find_peaks, patch_scores
+from torchslam.features.corners import (
+    Bands,
+    fast_scores,
+    find_peaks,
+    gather_patches,
+    harris_responses,
+    patch_scores,
+    quadratic_peak,
+    soft_peak,
+)
 from torchslam.features.pyramid import (
     PackedPyramid,
     build_levels,
-    fill_atlas,
     gather_level_patches,
-    plan_atlas,
+    pack_levels,
+    plan_pyramid,
 )
-from torchslam.features.selection import Grid, best_of_cells, contend, plan_grid, spread
+from torchslam.features.selection import Grid, best_of_cells, plan_grid, prefilter_candidates, select_evenly
 from torchslam.types import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
 HARRIS_RADIUS = 4  # of the patch that a Harris response needs
 FAST_RADIUS = 3  # of the circle
 SOFT_RADIUS = 1  # of the soft arg-max
-NEVER = 255  # a score that no corner exceeds
-SPARSE = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
-FAINT = 4  # grey values: corners of an image of the weakest texture, above the noise of a good camera
-PER_CELL = 8  # keypoints of a cell if they were spread evenly
+MAX_SCORE = 255  # a score that no corner exceeds
+WEAK_TEXTURE_RATIO = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
+FAINT_THRESHOLD = (
+    4  # gray values: corners of an image of the weakest texture, above the noise of a good camera
+)
+KEYPOINTS_PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 
 @dataclass(frozen=True)
 class Corners:
     """The chosen corners of a batch of images, K in all, and the pyramid they were found in.
 
-    levels:    (B, 1, h, w) floats per level, grey values of 0 to 255 plus a half
-    pixels:    (B * rows * stride,) uint8, the flattened atlases
+    levels:    (B, 1, h, w) floats per level, gray values of 0 to 255 plus a half
+    pixels:    (B * rows * stride,) uint8, the flattened packed pyramids
     positions: (K,) int64 into pixels
     slots:     (K,) int64, row in the flattened (B, num_keypoints) table
     strengths: (K,) float32, by which they were ranked
@@ -49,7 +59,7 @@ class Corners:
 
     levels: list[Tensor]
     pixels: Tensor
-    atlas: PackedPyramid
+    pyramid: PackedPyramid
     positions: Tensor
     slots: Tensor
     strengths: Tensor
@@ -63,17 +73,15 @@ class ORB(nn.Module):
     """Oriented FAST corners with 256-bit descriptors, for batches of images on any device.
 
     num_keypoints:  keypoints per image, at most; rows beyond what the image offers are masked
-    scale_factor:   ratio of the sizes of neighbouring pyramid levels
+    scale_factor:   ratio of the sizes of neighboring pyramid levels
     num_levels:     of the pyramid; levels too small to hold a keypoint stay empty
-    threshold:      of FAST, in grey values of 0 to 255, for corners anywhere
+    threshold:      of FAST, in gray values of 0 to 255, for corners anywhere
     low_threshold:  for the best corner of each cell, so that regions of little contrast have keypoints too; for all
                     corners of an image of weak texture, which offers less than half of `num_keypoints` otherwise. Where
-                    even so there are fewer, faint corners count, of more than 4 grey values.
+                    even so there are fewer, faint corners count, of more than 4 gray values.
     ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
     differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
                     chosen, angles and descriptors stay discrete
-    compile:        run the FAST test through torch.compile: the same result in less time, after some seconds
-                    at the first image of each size
     """
 
     def __init__(
@@ -85,7 +93,6 @@ class ORB(nn.Module):
         low_threshold: int = 7,
         ranking: str = "fast",
         differentiable: bool = False,
-        compile: bool = False,
     ) -> None:
         super().__init__()
         if num_keypoints < 1 or num_levels < 1 or scale_factor <= 1:
@@ -101,7 +108,6 @@ class ORB(nn.Module):
         self.low_threshold = low_threshold
         self.ranking = ranking
         self.differentiable = differentiable
-        self._fast_scores = torch.compile(fast_scores, dynamic=False) if compile else fast_scores
 
     def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
@@ -111,11 +117,11 @@ class ORB(nn.Module):
         Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
         """
         corners = self.detect(images, wanted)
-        stride, dtype = corners.atlas.stride, images.dtype
+        stride, dtype = corners.pyramid.stride, images.dtype
         angles = orientations(corners.pixels, corners.positions, stride)
         descriptors = describe(blur(corners.pixels, stride), corners.positions, angles, stride)
         offsets, scores = self._refine(corners)
-        scale_xy = torch.tensor(corners.atlas.scales, dtype=dtype, device=images.device)[corners.level]
+        scale_xy = torch.tensor(corners.pyramid.scales, dtype=dtype, device=images.device)[corners.level]
         keypoints = (corners.xy + offsets.to(dtype) + 0.5) * scale_xy - 0.5
         scales = self.scale_factor ** corners.level.to(dtype)
 
@@ -138,42 +144,46 @@ class ORB(nn.Module):
         wanted: (B, 1, H, W) bool, where they may lie: the budget goes there alone
         """
         check_images(images, wanted)
-        atlas = plan_atlas(*images.shape[-2:], self.scale_factor, self.num_levels)
-        grid = plan_grid(atlas, self.num_keypoints, PER_CELL, BORDER, self.low_threshold, images.device)
+        pyramid = plan_pyramid(*images.shape[-2:], self.scale_factor, self.num_levels)
+        grid = plan_grid(
+            pyramid, self.num_keypoints, KEYPOINTS_PER_CELL, BORDER, self.low_threshold, images.device
+        )
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
-            levels = build_levels(images, atlas)
+            levels = build_levels(images, pyramid)
         with torch.no_grad():
-            pixels = fill_atlas(levels, atlas).flatten()
+            pixels = pack_levels(levels, pyramid).flatten()
             # Peaks lie in cells, and a score is asked for next to them as well.
-            scores = self._fast_scores(pixels, atlas.stride, _bands(grid, atlas, len(images), beside=1))
+            scores = fast_scores(pixels, pyramid.stride, _bands(grid, pyramid, len(images), margin=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if wanted is not None:
-                floor = torch.where(_on_atlas(wanted, atlas), floor, NEVER)
-            bands = _bands(grid, atlas, len(images))
-            positions = self._peaks(scores, floor, len(images), atlas.stride, bands)
-            positions, slots, strengths = self._choose(pixels, scores, positions, grid, atlas.stride)
-            fast = gather_patches(scores, positions, atlas.stride, 1)
+                floor = torch.where(_packed_mask(wanted, pyramid), floor, MAX_SCORE)
+            bands = _bands(grid, pyramid, len(images))
+            positions = self._peaks(scores, floor, len(images), pyramid.stride, bands)
+            positions, slots, strengths = self._choose(pixels, scores, positions, grid, pyramid.stride)
+            fast = gather_patches(scores, positions, pyramid.stride, 1)
             area = grid.table.shape[0]
             image, inside = positions // area, positions % area
             level = grid.levels[grid.table[inside].to(torch.int64)]
-            top, left = torch.tensor(atlas.corners, device=images.device)[level].unbind(-1)
-            xy = torch.stack([inside % atlas.stride - left, inside // atlas.stride - top], dim=-1)
-        return Corners(levels, pixels, atlas, positions, slots, strengths, fast, image, level, xy)
+            top, left = torch.tensor(pyramid.corners, device=images.device)[level].unbind(-1)
+            xy = torch.stack([inside % pyramid.stride - left, inside // pyramid.stride - top], dim=-1)
+        return Corners(levels, pixels, pyramid, positions, slots, strengths, fast, image, level, xy)
 
     def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int, bands: Bands) -> Tensor:
         """(K,) where corners are: peaks of the scores above a floor, which is lower in images that offer few."""
         positions = find_peaks(scores, floor, stride, bands)
         images = _images_of(positions, len(scores), batch)
         faint = self._are_few(torch.ones_like(positions, dtype=torch.bool), images, batch)
-        if self.low_threshold <= FAINT or not bool(faint.any()):
+        if self.low_threshold <= FAINT_THRESHOLD or not bool(faint.any()):
             return positions
-        lower = torch.where(faint[:, None] & (floor.view(batch, -1) < NEVER), FAINT, floor.view(batch, -1))
+        lower = torch.where(
+            faint[:, None] & (floor.view(batch, -1) < MAX_SCORE), FAINT_THRESHOLD, floor.view(batch, -1)
+        )
         return find_peaks(scores, lower.flatten(), stride, bands)
 
     def _are_few(self, corners: Tensor, images: Tensor, batch: int) -> Tensor:
         """(batch,) whether an image has few of some corners, a mask (K,), given the image (K,) of each."""
         count = corners.sum()[None] if batch == 1 else torch.bincount(images[corners], minlength=batch)
-        return count < SPARSE * self.num_keypoints
+        return count < WEAK_TEXTURE_RATIO * self.num_keypoints
 
     def _choose(
         self, pixels: Tensor, scores: Tensor, positions: Tensor, grid: Grid, stride: int
@@ -189,7 +199,8 @@ class ORB(nn.Module):
         strong |= self._are_few(strong | best, image, batch).index_select(0, image)
         if self.ranking == "fast":  # the whole part of what they compete by
             needed = best | (
-                strong & contend(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
+                strong
+                & prefilter_candidates(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
             )
         else:
             needed = best | strong
@@ -199,8 +210,8 @@ class ORB(nn.Module):
             patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)
             strengths = harris_responses(patches.to(torch.float32)).flatten()
         else:
-            strengths = _stand_out(gather_patches(scores, positions, stride, 1).to(torch.float32))
-        rows, places = spread(strengths, strong, cell, image, grid, batch, self.num_keypoints)
+            strengths = _contrast_score(gather_patches(scores, positions, stride, 1).to(torch.float32))
+        rows, places = select_evenly(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
 
     def _refine(self, corners: Corners) -> tuple[Tensor, Tensor]:
@@ -211,20 +222,20 @@ class ORB(nn.Module):
         """
         if not self.differentiable:
             return quadratic_peak(corners.fast.to(torch.float32)), corners.strengths
-        radius = FAST_RADIUS + SOFT_RADIUS  # just what the Harris response of the centre needs
+        radius = FAST_RADIUS + SOFT_RADIUS  # just what the Harris response of the center needs
         patches = gather_level_patches(corners.levels, corners.image, corners.level, corners.xy, radius)
         fast = patch_scores(patches)
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
-        return soft_peak(fast), _stand_out(fast)
+        return soft_peak(fast), _contrast_score(fast)
 
 
-def _bands(grid: Grid, atlas: PackedPyramid, batch: int, beside: int = 0) -> Bands:
-    """The pixels of the flattened atlases of so many images in whose rows there are cells, and rows beside them."""
+def _bands(grid: Grid, pyramid: PackedPyramid, batch: int, margin: int = 0) -> Bands:
+    """Runs of pixels of `batch` flattened pyramids in whose rows there are cells, with `margin` rows around them."""
     return tuple(
         (
-            (image * atlas.rows + first - beside) * atlas.stride,
-            (image * atlas.rows + last + beside) * atlas.stride,
+            (image * pyramid.rows + first - margin) * pyramid.stride,
+            (image * pyramid.rows + last + margin) * pyramid.stride,
         )
         for image in range(batch)
         for first, last in grid.rows
@@ -232,11 +243,11 @@ def _bands(grid: Grid, atlas: PackedPyramid, batch: int, beside: int = 0) -> Ban
 
 
 def _images_of(positions: Tensor, pixels: int, batch: int) -> Tensor:
-    """(K,) which of `batch` images positions (K,) in their flattened atlases, of so many pixels together, are in."""
+    """(K,) the image of each position (K,) in `batch` flattened pyramids of `pixels` pixels together."""
     return torch.zeros_like(positions) if batch == 1 else positions // (pixels // batch)
 
 
-def _stand_out(fast: Tensor) -> Tensor:
+def _contrast_score(fast: Tensor) -> Tensor:
     """The FAST score, and below its unit, to settle ties, by how much it exceeds the mean around it.
 
     fast: (K, 3, 3) scores, below 256. Returns (K,).
@@ -244,10 +255,10 @@ def _stand_out(fast: Tensor) -> Tensor:
     return fast[:, 1, 1] + (fast[:, 1, 1] - fast.flatten(1).mean(1)) / 256
 
 
-def _on_atlas(wanted: Tensor, atlas: PackedPyramid) -> Tensor:
-    """(B * rows * stride,) bool: whether the nearest pixel of a mask (B, 1, H, W) to each place on the atlas is set."""
-    levels = [F.interpolate(wanted.float(), size=size, mode="nearest-exact") for size in atlas.sizes]
-    return fill_atlas(levels, atlas).flatten() > 0
+def _packed_mask(wanted: Tensor, pyramid: PackedPyramid) -> Tensor:
+    """Masks (B, 1, H, W) bool at the pixels of the packed pyramids, by nearest neighbor: (B * rows * stride,) bool."""
+    levels = [F.interpolate(wanted.float(), size=size, mode="nearest-exact") for size in pyramid.sizes]
+    return pack_levels(levels, pyramid).flatten() > 0
 
 
 def check_images(images: Tensor, wanted: Tensor | None = None) -> None:

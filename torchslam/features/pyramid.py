@@ -1,6 +1,6 @@
-"""The image pyramid, packed in one flat atlas so that every dense step is one operation for all levels.
+"""The image pyramid, packed in one rectangle so that every dense step is one operation for all levels.
 
-All levels of an image lie in one rectangle with a common row stride. In the flattened rectangle the neighbour
+All levels of an image lie in one rectangle with a common row stride. In the flattened rectangle the neighbor
 (dx, dy) of pixel p is p + dy * stride + dx, on every level alike. Neighbourhoods reach over a level's edge into
 another level; keypoints keep a border from the edge, so these values are never used.
 """
@@ -14,12 +14,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-MIN_SIDE = 40  # of an atlas, so that every neighbourhood fits whatever the image
+MIN_SIDE = 40  # of a packed pyramid, so that every neighborhood fits whatever the image
 
 
 @dataclass(frozen=True)
 class PackedPyramid:
-    """Where the levels of a pyramid lie in the atlas. Everything in pixels of the atlas.
+    """Where the levels of a pyramid lie in the pyramid. Everything in pixels of the pyramid.
 
     sizes:  (height, width) of each level; corners: (top, left) of each level; scales: full-resolution pixels
     (x, y) per pixel of the level.
@@ -33,7 +33,7 @@ class PackedPyramid:
 
 
 @lru_cache(maxsize=32)
-def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) -> PackedPyramid:
+def plan_pyramid(height: int, width: int, scale_factor: float, num_levels: int) -> PackedPyramid:
     """Sizes of the levels and their places: each level goes on the first shelf with room, or opens a new one."""
     sizes = [
         (max(1, round(height / scale_factor**k)), max(1, round(width / scale_factor**k)))
@@ -54,23 +54,23 @@ def plan_atlas(height: int, width: int, scale_factor: float, num_levels: int) ->
     return PackedPyramid(tuple(sizes), tuple(corners), scales, max(bottom, MIN_SIDE), max(width, MIN_SIDE))
 
 
-def build_levels(images: Tensor, atlas: PackedPyramid) -> list[Tensor]:
-    """The pyramid in grey values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
+def build_levels(images: Tensor, pyramid: PackedPyramid) -> list[Tensor]:
+    """The pyramid in gray values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
 
     images: (B, 1, H, W) in [0, 1]. Returns one (B, 1, h, w) per level; cutting off what follows the point rounds.
     """
     levels = [(images * 255).add_(0.5)]
-    for size in atlas.sizes[1:]:
+    for size in pyramid.sizes[1:]:
         levels.append(F.interpolate(levels[-1], size=size, mode="bilinear", align_corners=False))
     return levels
 
 
-def fill_atlas(levels: list[Tensor], atlas: PackedPyramid) -> Tensor:
+def pack_levels(levels: list[Tensor], pyramid: PackedPyramid) -> Tensor:
     """Levels rounded to bytes at their places: (B, rows, stride) uint8."""
     filled = torch.zeros(
-        levels[0].shape[0], atlas.rows, atlas.stride, dtype=torch.uint8, device=levels[0].device
+        levels[0].shape[0], pyramid.rows, pyramid.stride, dtype=torch.uint8, device=levels[0].device
     )
-    for level, (top, left), (h, w) in zip(levels, atlas.corners, atlas.sizes, strict=True):
+    for level, (top, left), (h, w) in zip(levels, pyramid.corners, pyramid.sizes, strict=True):
         # Through int16: torch converts float to int16 and int16 to bytes with vector instructions.
         filled[:, top : top + h, left : left + w] = level[:, 0].to(torch.int16)
     return filled
@@ -89,7 +89,7 @@ def gather_level_patches(
     areas = heights * widths * levels[0].shape[0]
     starts = areas.cumsum(0) - areas
     flat = torch.cat([lv.reshape(-1) for lv in levels])
-    centres = starts[level] + (images * heights[level] + xy[:, 1]) * widths[level] + xy[:, 0]
+    centers = starts[level] + (images * heights[level] + xy[:, 1]) * widths[level] + xy[:, 0]
     axis = torch.arange(-radius, radius + 1, device=device)
-    rows = centres[:, None] + widths[level][:, None] * axis
+    rows = centers[:, None] + widths[level][:, None] * axis
     return flat[rows[:, :, None] + axis]

@@ -20,7 +20,7 @@ class Grid:
 
     table:   (rows * stride,) int32, the cell of each atlas pixel, -1 on the border and between levels
     floor:   (rows * stride,) uint8, the FAST score that a corner must exceed there; 255 where none may lie
-    rows:    of the atlas, runs (first, last + 1) of those in which there are cells
+    rows:    of the pyramid, runs (first, last + 1) of those in which there are cells
     levels:  (cells,) int64, the level of each cell
     budgets: (levels,) int64, how many keypoints each level may give
     """
@@ -34,16 +34,21 @@ class Grid:
 
 @lru_cache(maxsize=8)
 def plan_grid(
-    atlas: PackedPyramid, num_keypoints: int, per_cell: int, border: int, threshold: int, device: torch.device
+    pyramid: PackedPyramid,
+    num_keypoints: int,
+    per_cell: int,
+    border: int,
+    threshold: int,
+    device: torch.device,
 ) -> Grid:
     """Budgets per level and square cells whose share of the budget is about `per_cell` keypoints.
 
     threshold: the FAST score that a corner must exceed.
     """
-    table = torch.full((atlas.rows, atlas.stride), -1, dtype=torch.int32)
-    budgets = _level_budgets(num_keypoints, atlas, border)
+    table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32)
+    budgets = _level_budgets(num_keypoints, pyramid, border)
     levels: list[int] = []
-    for level, ((h, w), (top, left)) in enumerate(zip(atlas.sizes, atlas.corners, strict=True)):
+    for level, ((h, w), (top, left)) in enumerate(zip(pyramid.sizes, pyramid.corners, strict=True)):
         inner_h, inner_w = h - 2 * border, w - 2 * border
         if budgets[level] == 0:
             continue
@@ -70,11 +75,11 @@ def _runs(flags: Tensor) -> tuple[tuple[int, int], ...]:
     return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _level_budgets(num_keypoints: int, atlas: PackedPyramid, border: int) -> list[int]:
+def _level_budgets(num_keypoints: int, pyramid: PackedPyramid, border: int) -> list[int]:
     """Keypoints per level in proportion to its width; levels with no room inside the border get none."""
     shares = [
         1 / x if min(size) > 2 * border else 0.0
-        for (x, _), size in zip(atlas.scales, atlas.sizes, strict=True)
+        for (x, _), size in zip(pyramid.scales, pyramid.sizes, strict=True)
     ]
     total = sum(shares)
     if total == 0:
@@ -100,10 +105,10 @@ def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
     return scores == best.index_select(0, cells)
 
 
-def contend(
+def prefilter_candidates(
     scores: Tensor, offered: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
 ) -> Tensor:
-    """Which corners `spread` may choose beside the best of the cells: far fewer than there are, at no sort.
+    """Which corners `select_evenly` may choose beside the best of the cells: far fewer than there are, at no sort.
 
     scores: (N,) uint8, whole parts of the scores to be; offered: (N,) bool, what is to be spread; others as there.
     A level takes its budget and at most all that is left of others': who has as many stronger ones cannot be chosen.
@@ -122,7 +127,7 @@ def contend(
     return (stronger < (grid.budgets + left)[:, :, None]).view(-1).index_select(0, values)
 
 
-def spread(
+def select_evenly(
     scores: Tensor, strong: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
 ) -> tuple[Tensor, Tensor]:
     """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.

@@ -1,9 +1,7 @@
 """Multi-view geometry as pure, batched, differentiable functions over tensors."""
 
-from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
-from torchslam.geometry.alignment import umeyama
+from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose, start_pose
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.camera_tree import register
 from torchslam.geometry.essential import (
     decompose_essential,
     epipolar_offsets,
@@ -14,9 +12,9 @@ from torchslam.geometry.essential import (
 from torchslam.geometry.gating import (
     CHI_SQUARE_95,
     KeypointNoise,
-    fits,
     innovation_covariances,
     mahalanobis_squared,
+    passes_gate,
     squared_reprojection_errors,
 )
 from torchslam.geometry.homography import (
@@ -50,8 +48,7 @@ from torchslam.geometry.lie import (
 )
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
-from torchslam.geometry.similarity import Similarity, estimate_similarity
-from torchslam.geometry.start_pose import start_pose
+from torchslam.geometry.similarity import Similarity, estimate_similarity, umeyama
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
     Triangulation,
@@ -61,8 +58,6 @@ from torchslam.geometry.triangulation import (
     triangulation_covariance,
 )
 from torchslam.geometry.undistorted import UndistortedKeypoints, Undistortion
-
-register()
 
 __all__ = [
     "CHI_SQUARE_95",
@@ -83,13 +78,13 @@ __all__ = [
     "estimate_absolute_pose",
     "estimate_relative_pose",
     "estimate_similarity",
-    "fits",
     "five_point",
     "homography_from_matches",
     "innovation_covariances",
     "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
+    "passes_gate",
     "quaternion_from_matrix",
     "rigid",
     "rotation_from_matches",

@@ -1,4 +1,4 @@
-"""The pose of a camera from points and their pixels, some of them wrong."""
+"""The pose of a camera from points and their pixels, some of them wrong: RANSAC over P3P."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, se3_exp, transform
-from torchslam.geometry.local_optimization import State, minimize, retract_pose
+from torchslam.geometry.local_optimization import State, best_of, minimize, retract_pose
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import (
@@ -27,10 +27,12 @@ from torchslam.geometry.ransac import (
     gather_rows,
     is_significant,
     sample_minimal,
+    sample_minimal_of_all,
     search,
     truncated_rows,
     valid_first,
 )
+from torchslam.geometry.undistorted import UndistortedKeypoints
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimised
@@ -66,18 +68,28 @@ def estimate_absolute_pose(
     confidence: float = 0.9999,
     max_samples: int = 3000,
 ) -> AbsolutePose:
-    """Poses of B cameras by RANSAC over P3P, with local optimisation and a least-squares refinement.
+    """Estimate poses of B cameras by RANSAC over P3P, with local optimization and a least-squares refinement.
 
-    points_w:  (B, N, 3); pixels: (B, N, 2)
-    threshold: reprojection error of an inlier in pixels
-    mask:      (B, N), rows outside it, or with NaN, are ignored
+    The same arguments and seed give the same result. Where an input requires a gradient, T_cw carries that of the final
+    least squares with respect to points, pixels and camera parameters, with the set of rows it uses fixed (implicit
+    function theorem, exact Hessian). Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003;
+    for P3P see `p3p`.
 
-    The same arguments and seed give the same result. Too few points, points on a line, or pure noise give `success`
-    False for that camera.
+    Args:
+        points_w: (B, N, 3) points.
+        pixels: (B, N, 2) where they are seen.
+        camera: one for all, or a batch of B.
+        threshold: reprojection error of an inlier, pixels.
+        mask: (B, N) rows in use; rows with NaN are never used.
+        seed: of the random samples.
+        confidence: probability that some sample has no outlier.
+        max_samples: largest number of samples per camera.
 
-    Where an input requires a gradient, T_cw carries that of the final least squares with respect to points, pixels
-    and camera parameters, with the set of rows it uses fixed (implicit function theorem, exact Hessian).
-    Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003; for P3P see `p3p`.
+    Returns:
+        The poses; `success` is False for a camera with too few points, points on a line, or pure noise.
+
+    Raises:
+        ValueError: The shapes of points and pixels do not agree.
     """
     if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
         shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
@@ -106,57 +118,87 @@ def estimate_absolute_pose(
     return AbsolutePose(T_cw, (squared < 1) & mask, success, score)
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """The data of the search. Points are relative to their mean, so that float32 is enough for scores.
+@full_precision
+@torch.no_grad()
+def start_pose(
+    points_w: Tensor,
+    undistorted: UndistortedKeypoints,
+    size: tuple[int, int],
+    threshold: float,
+    seed: int = 0,
+    confidence: float = 0.9999,
+    max_samples: int = 3000,
+) -> Tensor | None:
+    """Estimate the pose of one camera by RANSAC over P3P, as a start for a refinement.
 
-    points, pixels, mask, rays: (B, N, ...); camera; threshold in pixels; centre: (B, 3) mean of the points
-    homogeneous: (B, 4, N), normalized: (B, N, 2), scale: (B, N, 2) thresholds per unit of them
+    The same search as `estimate_absolute_pose`, in fewer calls for a single problem without a mask. Errors are those of
+    undistorted coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
+
+    Args:
+        points_w: (N, 3) finite points.
+        undistorted: of the N keypoints that see them.
+        size: (width, height) of the image.
+        threshold: reprojection error of an inlier, pixels.
+        seed: of the random samples.
+        confidence: probability that some sample has no outlier.
+        max_samples: largest number of samples.
+
+    Returns:
+        T_cw (4, 4), locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are
+        on a line.
+    """
+    if len(points_w) < 4:
+        return None
+    center = points_w.mean(0)
+    points, xy = points_w - center, undistorted.xy.mT
+    mask = torch.ones_like(points[None, :, 0], dtype=torch.bool)
+    scale = (undistorted.pixel_scale / threshold)[None, :, None]
+    search_data = _Search.of(points[None], xy[None], scale, mask, is_single=True)
+    P = search_data.best_pose(seed, confidence, max_samples)
+    P = search_data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
+    inliers = search_data.squared_errors(P) < 1
+    if not bool(is_success(inliers, mask, search_data.points, size, threshold)):
+        return None
+    P = P[0]
+    T_cw = torch.eye(4, dtype=P.dtype, device=P.device)
+    T_cw[:3] = P
+    T_cw[:3, 3] -= P[:, :3] @ center
+    return T_cw
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The data of B searches in undistorted coordinates.
+
+    Points are relative to their mean, so that float32 is enough for scores.
+
+    points, rays: (B, N, 3); homogeneous: (B, 4, N); xy: (B, N, 2); scale: (B, N, 1 or 2) thresholds per unit of xy
+    mask:      (B, N)
+    is_single: one problem in which all rows count: samples and scores take fewer calls
     """
 
     points: Tensor
-    pixels: Tensor
-    camera: Camera
-    threshold: float
-    mask: Tensor
-    centre: Tensor
     rays: Tensor
     homogeneous: Tensor
-    normalized: Tensor
+    xy: Tensor
     scale: Tensor
+    mask: Tensor
+    is_single: bool
 
-    @staticmethod
-    def of(points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor) -> _Problem:
-        weights = mask[..., None].to(points_w.dtype)
-        centre = (points_w * weights).sum(1) / weights.sum(1).clamp_min(1.0)
-        points = points_w - centre[:, None]
-        params = camera.params.detach()
-        camera = camera.with_params(params.expand(len(points), -1))
-        normalized = camera.normalize(pixels)
-        ones = torch.ones_like(normalized[..., :1])
-        return _Problem(
-            points,
-            pixels,
-            camera,
-            threshold,
-            mask,
-            centre,
-            unit_rays(normalized),
-            torch.cat((points, ones), dim=-1).mT,
-            normalized,
-            camera.pixel_scale(normalized) / threshold,
-        )
+    @classmethod
+    def of(cls, points: Tensor, xy: Tensor, scale: Tensor, mask: Tensor, is_single: bool = False) -> _Search:
+        homogeneous = torch.cat((points, torch.ones_like(points[..., :1])), dim=-1).mT
+        return cls(points, unit_rays(xy), homogeneous, xy, scale, mask, is_single)
 
-    def select(self, rows: Tensor) -> _Problem:
+    def select(self, rows: Tensor) -> _Search:
         """Some of the problems."""
         if len(rows) == len(self.points):
             return self
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
-        return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
+        return replace(self, **{name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)})
 
-    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+    def best_pose(self, seed: int, confidence: float, max_samples: int) -> Tensor:
+        """(B, 3, 4) the pose of each problem with most support."""
         generator = torch.Generator().manual_seed(seed)
         (P,) = search(
             lambda rows, count: self.select(rows).propose(count, generator),
@@ -166,18 +208,25 @@ class _Problem:
             FIRST_ROUND,
             max_samples,
         )
-        P = self.refine(P)
-        squared = self.squared_errors(P)
-        inliers = (squared < 1) & self.mask
-        success = is_success(inliers, self.mask, self.points, self.camera.size, self.threshold)
-        score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-        R = P[..., :3]
-        T_cw = rigid(R, P[..., 3] - (R @ self.centre[..., None]).squeeze(-1))
-        eye = torch.eye(4, dtype=P.dtype, device=P.device)
-        return torch.where(success[:, None, None], T_cw, eye), success, squared, score
+        return P
 
     def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
-        """The best pose from `count` minimal samples, locally optimised, its score and its support."""
+        """The best pose from `count` minimal samples, locally optimized, its score and its support."""
+        P = (
+            self._candidates_of_one(count, generator)
+            if self.is_single
+            else self._candidates(count, generator)
+        )
+        if P.shape[1] == 0:
+            none = torch.zeros_like(self.xy[:, 0, 0])
+            return (P.new_zeros(len(P), 3, 4),), none - torch.inf, none
+        P, cost = self.fit(P, LOCAL_ITERATIONS)
+        (P,), cost = best_of((P,), cost)
+        near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
+        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
+
+    def _candidates(self, count: int, generator: torch.Generator) -> Tensor:
+        """(B, K, 3, 4) the poses of best score from `count` minimal samples."""
         sample = sample_minimal(self.mask, 3, count, generator)
         R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
@@ -185,54 +234,96 @@ class _Problem:
         P = gather_rows(torch.cat((R, t[..., None]), dim=-1).flatten(2), first)
         count = min(CANDIDATES, P.shape[1])
         best = best_models(self.score, P, valid.gather(1, first), self.mask, count, generator)
-        P = gather_rows(P, best).unflatten(-1, (3, 4))
-        P, cost = self.fit(P, LOCAL_ITERATIONS, 1.0)
-        cost, best = cost.nan_to_num(torch.inf).min(dim=1)
-        P = P[torch.arange(len(best), device=best.device), best]
-        near = (self.undistorted_errors(P) < SUPPORT_WIDTH**2) & self.mask
-        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
+        return gather_rows(P, best).unflatten(-1, (3, 4))
+
+    def _candidates_of_one(self, count: int, generator: torch.Generator) -> Tensor:
+        """`_candidates` of one problem in which all rows count, scored on all of them: (1, K, 3, 4)."""
+        rows = sample_minimal_of_all(self.points.shape[1], 3, count, generator).to(self.points.device)
+        R, t, valid = p3p(self.rays[0][rows], self.points[0][rows])
+        P = torch.cat((R, t[..., None]), dim=-1)[valid]
+        squared = squared_projections(
+            P.float()[None], self.homogeneous.float(), self.xy.float(), self.scale.float()
+        )
+        costs = squared[0].clamp_max_(1.0).nan_to_num_(1.0).sum(1)
+        return P[costs.topk(min(CANDIDATES, len(P)), largest=False).indices][None]
 
     def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
         """Truncated scores of many poses on some of the points, or all, in float32. (B, M, 12) -> (B, M)."""
-        homogeneous, x, scale, mask = self.homogeneous.mT, self.normalized, self.scale, self.mask
+        homogeneous, xy, scale, mask = self.homogeneous.mT, self.xy, self.scale, self.mask
         if rows is not None:
-            homogeneous, x, scale = (gather_rows(values, rows) for values in (homogeneous, x, scale))
+            homogeneous, xy, scale = (gather_rows(values, rows) for values in (homogeneous, xy, scale))
             mask = mask.gather(1, rows)
         P = P.float().unflatten(-1, (3, 4))
-        return score_projections(P, homogeneous.mT.float(), x.float(), scale, mask)
+        return score_projections(P, homogeneous.mT.float(), xy.float(), scale, mask)
 
-    def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
-        """Poses (B, K, 3, 4) of least truncated error in undistorted coordinates, and their costs (B, K)."""
+    def fit(self, P: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Poses (B, K, 3, 4) of least truncated error, and their costs (B, K); width: of the kernel, in thresholds."""
         tangent = pose_tangent(P.dtype, P.device)
         return fit_projections(
-            P, tangent, self.homogeneous, self.normalized, self.scale, self.mask, iterations, width
+            P, tangent, self.homogeneous, self.xy, self.scale, self.mask, iterations, width
         )
 
-    def undistorted_errors(self, P: Tensor) -> Tensor:
-        """Squared errors in thresholds of one pose per problem; infinite behind the camera. (B, N)."""
-        squared = squared_projections(P[:, None], self.homogeneous, self.normalized, self.scale)
+    def squared_errors(self, P: Tensor) -> Tensor:
+        """(B, N) squared errors in thresholds of one pose per problem; infinite behind the camera."""
+        squared = squared_projections(P[:, None], self.homogeneous, self.xy, self.scale)
         return squared[:, 0].nan_to_num(torch.inf)
 
+
+@dataclass(frozen=True)
+class _Problem:
+    """Poses of B cameras, whose distortion counts.
+
+    data: the search in undistorted coordinates; pixels: (B, N, 2); center: (B, 3) mean of the points
+    """
+
+    data: _Search
+    pixels: Tensor
+    camera: Camera
+    threshold: float
+    center: Tensor
+
+    @staticmethod
+    def of(points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor) -> _Problem:
+        weights = mask[..., None].to(points_w.dtype)
+        center = (points_w * weights).sum(1) / weights.sum(1).clamp_min(1.0)
+        points = points_w - center[:, None]
+        camera = camera.with_params(camera.params.detach().expand(len(points), -1))
+        xy = camera.normalize(pixels)
+        data = _Search.of(points, xy, camera.pixel_scale(xy) / threshold, mask)
+        return _Problem(data, pixels, camera, threshold, center)
+
+    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+        mask = self.data.mask
+        P = self.refine(self.data.best_pose(seed, confidence, max_samples))
+        squared = self.squared_errors(P)
+        success = is_success((squared < 1) & mask, mask, self.data.points, self.camera.size, self.threshold)
+        score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+        R = P[..., :3]
+        T_cw = rigid(R, P[..., 3] - (R @ self.center[..., None]).squeeze(-1))
+        eye = torch.eye(4, dtype=P.dtype, device=P.device)
+        return torch.where(success[:, None, None], T_cw, eye), success, squared, score
+
     def squared_errors(self, P: Tensor) -> Tensor:
-        """The same through the distortion, and infinite also beyond its monotone part."""
+        """Those of `_Search` through the distortion, and infinite also beyond its monotone part."""
         if self.camera.model == "pinhole":
-            return self.undistorted_errors(P)
-        projected, valid = self.camera.project((P @ self.homogeneous).mT)
+            return self.data.squared_errors(P)
+        projected, valid = self.camera.project((P @ self.data.homogeneous).mT)
         squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
         return squared.masked_fill(~valid, torch.inf)
 
     def refine(self, P: Tensor) -> Tensor:
         """The poses (B, 3, 4) of least truncated squared reprojection error."""
-        P = self.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
+        P = self.data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
         if self.camera.model == "pinhole":
             return P  # whose undistorted coordinates are pixels up to their scale
 
         def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
-            points_c = (P @ self.homogeneous).mT
+            points_c = (P @ self.data.homogeneous).mT
             projected, valid, J = self.camera.project_with_point_jacobians(points_c)
             residual = projected - self.pixels
             squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / self.threshold**2
-            used, cost = truncated_rows(squared[:, None], self.mask, FINAL_WIDTH)
+            used, cost = truncated_rows(squared[:, None], self.data.mask, FINAL_WIDTH)
             J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
             rows = torch.cat((J, J_rotation, residual[..., None]), dim=-1) * used[:, 0, :, None, None]
             rows = rows.flatten(1, 2)
@@ -259,8 +350,8 @@ def is_success(
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
     weights = inliers[..., None].to(points.dtype)
     mean = (weights * points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
-    centred = weights * (points - mean)
-    spread = torch.linalg.eigvalsh(centred.mT @ centred)
+    centered = weights * (points - mean)
+    spread = torch.linalg.eigvalsh(centered.mT @ centered)
     return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
 
 

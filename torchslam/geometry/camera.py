@@ -5,13 +5,15 @@ Camera frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchslam.geometry import distortion
 
@@ -268,3 +270,31 @@ def _stack(*values: Scalar) -> Tensor:
     device = tensors[0].device if tensors else None
     columns = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
     return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
+
+
+def _flatten(camera: Camera) -> tuple[list[Any], tuple[str, tuple[int, int]]]:
+    return [camera.params], (camera.model, camera.size)
+
+
+def _flatten_with_keys(camera: Camera) -> tuple[list[tuple[_pytree.KeyEntry, Any]], Any]:
+    leaves, structure = _flatten(camera)
+    return [(_pytree.GetAttrKey("params"), leaf) for leaf in leaves], structure
+
+
+def _unflatten(leaves: Iterable[Any], structure: tuple[str, tuple[int, int]]) -> Camera:
+    """Unchecked: trees hold other things than tensors, too, such as dimensions."""
+    camera = object.__new__(Camera)
+    model, size = structure
+    (params,) = leaves
+    camera.__dict__.update(model=model, params=params, size=size)
+    return camera
+
+
+def _collate(cameras: Sequence[Camera], *, collate_fn_map: object = None) -> Camera:
+    return Camera.stack(cameras)
+
+
+# A camera is a pytree of its parameters for `torch.func` and `default_collate`. Model and size are structure: they must
+# agree where trees are compared, and in a batch.
+_pytree.register_pytree_node(Camera, _flatten, _unflatten, flatten_with_keys_fn=_flatten_with_keys)
+default_collate_fn_map[Camera] = _collate

@@ -1,7 +1,8 @@
-"""Whether a measurement fits a prediction: the one model of what a keypoint's error may be, `KeypointNoise`.
+"""The noise of keypoints, `KeypointNoise`, and gates on the errors of predictions.
 
-In units of it the squared error of a right match follows a chi-square distribution of two degrees of freedom. Whatever
-weighs a keypoint, or asks whether it fits, asks it: tracking, mapping, adjusting, covariances, the graph of a run.
+In units of that noise, the squared error of a correct match follows a chi-square distribution of two degrees of
+freedom. Everything that weights or gates a keypoint uses it: tracking, mapping, bundle adjustment, covariances, and the
+graph of a run. Symmetric 2x2 matrices are written out: faster than general ones, and fit for `torch.func`.
 """
 
 from __future__ import annotations
@@ -14,25 +15,62 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.whitening import from_triangle, inverse_2x2, triangle
+
+
+def triangle(A: Tensor) -> Tensor:
+    """(..., 3) xx, xy, yy of matrices (..., 2, 2), of which the symmetric part counts."""
+    return torch.stack((A[..., 0, 0], 0.5 * (A[..., 0, 1] + A[..., 1, 0]), A[..., 1, 1]), dim=-1)
+
+
+def from_triangle(values: Tensor) -> Tensor:
+    """(..., 2, 2) symmetric matrices of xx, xy, yy (..., 3)."""
+    xx, xy, yy = values.unbind(-1)
+    return torch.stack((xx, xy, xy, yy), dim=-1).unflatten(-1, (2, 2))
+
+
+def is_definite(A: Tensor) -> Tensor:
+    """(...) whether matrices (..., 2, 2) are positive definite; false for what is not finite."""
+    xx, xy, yy = triangle(A).unbind(-1)
+    return (xx > 0) & (xx * yy - xy * xy > 0)
+
+
+def inverse_2x2(A: Tensor) -> Tensor:
+    """(..., 2, 2) inverses of definite matrices."""
+    xx, xy, yy = triangle(A).unbind(-1)
+    return from_triangle(torch.stack((yy, -xy, xx), dim=-1)) / (xx * yy - xy * xy)[..., None, None]
+
+
+def whitening(A: Tensor) -> Tensor:
+    """W (..., 2, 2), upper triangular, with W^T W = A; zero, with gradient zero, where A is not positive definite."""
+    xx, xy, yy = torch.where(is_definite(A)[..., None], triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
+    p = xx.sqrt()
+    q = xy / p
+    W = torch.stack((p, q, torch.zeros_like(p), (yy - q * q).sqrt()), dim=-1).unflatten(-1, (2, 2))
+    return torch.where(is_definite(A)[..., None, None], W, 0.0)
+
+
+def times(weights: Tensor, factors: Tensor) -> Tensor:
+    """Weights (..., N) or (..., N, 2, 2) times factors (..., N)."""
+    return weights * factors.view(*factors.shape, *(1,) * (weights.ndim - factors.ndim))
+
 
 CHI_SQUARE_95 = 5.991
 """95 % of a chi-square distribution of two degrees of freedom."""
 
 
-MARGIN = 2.0
-"""Times the standard deviation that a front end states: what a test takes for granted that compares a keypoint with
-the map, which has errors of its own. A scale, where nothing is stated, has that margin: ORB is right to half of it."""
+GATE_FACTOR = 2.0
+"""Inflation of the standard deviations that a front end provides when a keypoint is gated against the map, which has
+errors of its own. Scales, where no information is provided, include that factor: ORB is precise to half its scale."""
 
 
 @dataclass(frozen=True)
 class KeypointNoise:
-    """What is known of the errors of keypoints (...).
+    """The errors of keypoints (...).
 
-    scales:      (...) pixels, the sizes of their pyramid levels
-    information: (..., I) px^-2, what a front end says of them: nothing, I = 0, a keypoint then is known to its scale in
-                 each direction; I = 1: the inverse variance in each direction; I = 3: xx, xy, yy of the inverse
-                 covariance
+    Attributes:
+        scales: (...) pixels, the sizes of their pyramid levels.
+        information: (..., I) px^-2, as a front end provides it. I = 0: none, the standard deviation in each direction
+            is the scale; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse covariance.
     """
 
     scales: Tensor
@@ -40,47 +78,47 @@ class KeypointNoise:
 
     @classmethod
     def of(cls, scales: Tensor, information: Tensor | None) -> KeypointNoise:
-        """Of information (...) or (..., 2, 2) as `Features` has it, or none. Differentiable."""
+        """Pack information (...) or (..., 2, 2), as in `Features`, or none. Differentiable."""
         return cls(scales, packed_information(information, scales))
 
     @property
     def weights(self) -> Tensor:
-        """What observations count in least squares: (...) inverse variances or (..., 2, 2) inverse covariances."""
+        """Weights in least squares: (...) inverse variances or (..., 2, 2) inverse covariances."""
         size = self.information.shape[-1]
         if size == 0:
             return self.scales**-2
         return self.information[..., 0] if size == 1 else from_triangle(self.information)
 
     @property
-    def spread(self) -> Tensor:
+    def sigma_or_covariance(self) -> Tensor:
         """(...) standard deviations in pixels, or (..., 2, 2) covariances."""
         size = self.information.shape[-1]
         return inverse_2x2(self.weights) if size == 3 else self.sigmas
 
     @property
     def sigmas(self) -> Tensor:
-        """(...) standard deviations in pixels: of covariances that of a circle of equal area."""
+        """(...) standard deviations in pixels; for a covariance, that of the circle of equal area."""
         size = self.information.shape[-1]
         if size == 0:
             return self.scales
         return self.weights**-0.5 if size == 1 else torch.linalg.det(self.weights) ** -0.25
 
     def __getitem__(self, rows: Any) -> KeypointNoise:
-        """Of some keypoints, as one indexes a tensor."""
+        """The noise of some of the keypoints, indexed as a tensor."""
         return KeypointNoise(self.scales[rows], self.information[rows])
 
-    def stated(self) -> KeypointNoise:
-        """The same noise, stated where it was only known by scale: tests that know MARGIN stay as they are."""
+    def with_explicit_information(self) -> KeypointNoise:
+        """The same noise with information, where only scales were known; gates stay as they are."""
         if self.information.shape[-1]:
             return self
-        return KeypointNoise(self.scales, MARGIN**2 * self.scales[..., None] ** -2)
+        return KeypointNoise(self.scales, GATE_FACTOR**2 * self.scales[..., None] ** -2)
 
-    def weighed(self, factors: Tensor) -> KeypointNoise:
-        """Stated information, multiplied with factors (...)."""
+    def scaled(self, factors: Tensor) -> KeypointNoise:
+        """The noise with its information multiplied by factors (...)."""
         return KeypointNoise(self.scales, self.information * factors[..., None])
 
-    def worse(self, other: KeypointNoise) -> KeypointNoise:
-        """Of each pair of keypoints that of the one that is known less well."""
+    def pairwise_max(self, other: KeypointNoise) -> KeypointNoise:
+        """The larger noise of each pair of keypoints."""
         first = self.sigmas >= other.sigmas
         return KeypointNoise(
             torch.maximum(self.scales, other.scales),
@@ -88,66 +126,77 @@ class KeypointNoise:
         )
 
     @property
-    def margin(self) -> float:
-        """Times `sigmas`: what tests take for granted, MARGIN where the noise is stated."""
-        return 1.0 if self.information.shape[-1] == 0 else MARGIN
+    def gate_factor(self) -> float:
+        """The factor of `sigmas` in gates: GATE_FACTOR if there is information, else 1."""
+        return 1.0 if self.information.shape[-1] == 0 else GATE_FACTOR
 
     @property
-    def tolerance(self) -> Tensor:
-        """(...) px, the standard deviation that tests take for granted: `sigmas`, with MARGIN where they are stated."""
-        return self.sigmas if self.information.shape[-1] == 0 else MARGIN * self.sigmas
+    def gate_sigma(self) -> Tensor:
+        """(...) px, the standard deviations used by gates: `gate_factor` times `sigmas`."""
+        return self.sigmas if self.information.shape[-1] == 0 else GATE_FACTOR * self.sigmas
 
     def squared(self, errors: Tensor) -> Tensor:
-        """(...) squared errors (..., 2), px, in units of the noise, with MARGIN where it is stated: for `fits`."""
+        """Squared errors in units of the gate's noise, for `passes_gate`. (..., 2) px -> (...)."""
         if self.information.shape[-1] < 3:
             return self._squared(errors.square().sum(-1))
-        return (errors[..., None, :] @ self.weights @ errors[..., None])[..., 0, 0] / MARGIN**2
+        return (errors[..., None, :] @ self.weights @ errors[..., None])[..., 0, 0] / GATE_FACTOR**2
 
     def squared_reprojection(self, points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-        """(...) what `squared` says of the errors between projections of points_c (..., 3) and pixels (..., 2).
-
-        Infinite behind the camera.
-        """
+        """(...) `squared` of the reprojections of points_c (..., 3) at pixels (..., 2); infinite behind the camera."""
         if self.information.shape[-1] < 3:
             return self._squared(squared_reprojection_errors(points_c, pixels, camera))
         projected, valid = camera.project(points_c)
         return self.squared(projected - pixels).where(valid, torch.inf)
 
     def _squared(self, squared_px: Tensor) -> Tensor:
-        return squared_px / self.tolerance**2
+        return squared_px / self.gate_sigma**2
 
 
 def packed_information(information: Tensor | None, like: Tensor) -> Tensor:
-    """Information (...) or (..., 2, 2) of keypoints, or none, as `KeypointNoise` has it; like: (...)."""
+    """Pack information (...) or (..., 2, 2) of keypoints, or none, as in `KeypointNoise`; like: (...)."""
     if information is None:
         return like.new_zeros(*like.shape, 0)
     return information[..., None] if information.ndim == like.ndim else triangle(information)
 
 
 def unpacked_information(information: Tensor) -> Tensor | None:
-    """The way back: (...), (..., 2, 2) or None."""
+    """The inverse of `packed_information`: (...), (..., 2, 2) or None."""
     size = information.shape[-1]
     return None if size == 0 else information[..., 0] if size == 1 else from_triangle(information)
 
 
 @full_precision
 def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-    """(...) px^2 between projections of points (..., 3) in the camera frame and pixels (..., 2); infinite behind it."""
+    """Squared reprojection errors (...) in px^2.
+
+    Args:
+        points_c: (..., 3) points in the camera frame.
+        pixels: (..., 2) where they are seen.
+        camera: its model.
+
+    Returns:
+        (...) squared distances, infinite behind the camera.
+    """
     projected, valid = camera.project(points_c)
     return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
 
 
-def fits(squared: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
-    """(...) bool: squared errors (...), as `KeypointNoise` says them, that keypoints may well have."""
+def passes_gate(squared: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
+    """Test squared errors (...) in units of `KeypointNoise` against a quantile of chi-square: (...) bool."""
     return squared < chi_square
 
 
 @full_precision
 def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Tensor:
-    """S = R + J Sigma J^T: of pixels measured minus pixels predicted. (..., 2, 2).
+    """Covariances S = R + J Sigma J^T of measured minus predicted pixels.
 
-    J: (..., 2, D) derivative of the prediction in what it is made from; covariances: (..., D, D) of that;
-    sigmas: (...) standard deviations of the measured pixels, R = sigma^2 I, or (..., 2, 2) their covariances R
+    Args:
+        J: (..., 2, D) derivatives of the predictions with respect to their parameters.
+        covariances: (..., D, D) of those parameters.
+        sigmas: (...) standard deviations of the measured pixels, R = sigma^2 I, or (..., 2, 2) their covariances R.
+
+    Returns:
+        (..., 2, 2) covariances, px^2.
     """
     if sigmas.ndim == J.ndim:
         return sigmas + J @ covariances @ J.mT

@@ -12,19 +12,18 @@ from torch import Tensor
 from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.local_optimization import best_of
 from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, is_unlikely
-from torchslam.geometry.two_view import TRANSFER_WIDTH, TwoViews
-from torchslam.geometry.two_view_essential import (
+from torchslam.geometry.two_view import (
+    TRANSFER_WIDTH,
+    TwoViews,
     ahead_and_parallax,
-    noise_variance,
-    sampson_squared,
-    twisted,
-)
-from torchslam.geometry.two_view_mappings import (
     fit_homography,
     fit_rotation,
+    noise_variance,
     propose_homography,
     propose_rotation,
+    sampson_squared,
     transfer_squared,
+    twisted,
 )
 
 MODELS = ("essential", "homography", "rotation")

@@ -22,8 +22,7 @@ from torchslam.geometry.relative_pose_search import (
     find_relative_pose,
 )
 from torchslam.geometry.robust import Kernel, robustify
-from torchslam.geometry.two_view import TwoViews
-from torchslam.geometry.two_view_essential import tangent_basis
+from torchslam.geometry.two_view import TwoViews, tangent_basis
 
 _MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 

@@ -29,9 +29,9 @@ from torchslam.geometry.motion_models import (
 )
 from torchslam.geometry.ransac import search
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import TwoViews
-from torchslam.geometry.two_view_essential import (
+from torchslam.geometry.two_view import (
     NOISE_WIDTH,
+    TwoViews,
     fit_essential,
     noise_variance,
     propose_essential,

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.gating import inverse_2x2, whitening
 from torchslam.geometry.lie import se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.whitening import inverse_2x2, whitening
 
 
 @dataclass(frozen=True)
@@ -178,11 +178,11 @@ def triangulate_many(
     rays_c = camera.unproject(pixels.flatten(-3, -2)).unflatten(-2, pixels.shape[-3:-1])
     R_cw, t_cw = T_cw[..., None, :, :3, :3], T_cw[..., None, :, :3, 3]
     rays_w = (R_cw.mT @ rays_c[..., None]).squeeze(-1)
-    centres_w = -(R_cw.mT @ t_cw[..., None]).squeeze(-1)
+    centers_w = -(R_cw.mT @ t_cw[..., None]).squeeze(-1)
 
     eye = torch.eye(3, dtype=pixels.dtype, device=pixels.device)
     across = (eye - rays_w[..., :, None] * rays_w[..., None, :]) * seen[..., None, None]
-    points_w = _solve_3x3(across.sum(-3), (across @ centres_w[..., None]).sum(-3).squeeze(-1))
+    points_w = _solve_3x3(across.sum(-3), (across @ centers_w[..., None]).sum(-3).squeeze(-1))
     for _ in range(iterations):
         points_w = _refine_points(points_w, T_cw, pixels, camera, seen)
 
@@ -194,7 +194,7 @@ def triangulate_many(
     errors = _reprojection_error(camera, flat, pixels.flatten(-3, -2), seen.flatten(-2)).unflatten(
         -1, seen.shape[-2:]
     )
-    return MultiViewTriangulation(points_w, _largest_angle(points_w, centres_w, seen), depths, errors, mask)
+    return MultiViewTriangulation(points_w, _largest_angle(points_w, centers_w, seen), depths, errors, mask)
 
 
 def _refine_points(points_w: Tensor, T_cw: Tensor, pixels: Tensor, camera: Camera, seen: Tensor) -> Tensor:
@@ -253,9 +253,9 @@ def _angle(u: Tensor, v: Tensor) -> Tensor:
     return torch.atan2(sine, torch.where((sine == 0) & (dot == 0), 1.0, dot))
 
 
-def _largest_angle(points_w: Tensor, centres_w: Tensor, seen: Tensor) -> Tensor:
+def _largest_angle(points_w: Tensor, centers_w: Tensor, seen: Tensor) -> Tensor:
     """The largest angle at each point between two of the cameras that see it."""
-    rays = points_w[..., None, :] - centres_w
+    rays = points_w[..., None, :] - centers_w
     pairs = seen[..., :, None] & seen[..., None, :]
     first, second = torch.broadcast_tensors(rays[..., :, None, :], rays[..., None, :, :])
     return torch.where(pairs, _angle(first, second), 0.0).amax((-2, -1))

@@ -1,19 +1,44 @@
-"""Matches of pairs of views, as the fits of all three models see them.
+"""Matches of two views, and the fits of their three models: essential matrix, homography and pure rotation.
 
-Residuals are in units of the threshold: to first order, the distance by which the match would have to move in both
-images together.
+Each model has minimal samples, scores, and truncated least squares over many candidates at once. Residuals are in units
+of the threshold: to first order, the distance by which the match would have to move in both images together.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.ransac import gather_rows
+from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
+from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
+from torchslam.geometry.lie import skew
+from torchslam.geometry.local_optimization import (
+    State,
+    best_of,
+    generators,
+    in_parts,
+    minimize,
+    small_rotation,
+)
+from torchslam.geometry.projections import (
+    fit_projections,
+    homography_tangent,
+    rotation_tangent,
+    score_projections,
+)
+from torchslam.geometry.ransac import (
+    SUPPORT_WIDTH,
+    best_models,
+    gather_rows,
+    pad_groups,
+    sample_minimal,
+    truncated_score,
+)
+from torchslam.geometry.robust import Kernel, robustify
 
 # Thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one.
 TRANSFER_WIDTH = 1.5
@@ -105,3 +130,295 @@ class TwoViews:
         return (
             self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()
         ).rsqrt() / TRANSFER_WIDTH
+
+
+_CANDIDATES = 4  # essential matrices of each round that are optimized
+_MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras,
+_CHECKED_CANDIDATES = 24  # of so many
+_ITERATIONS = 4  # of their local optimisation
+# Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
+# far from the noise ranks the samples all the same, but tells less between those that come close.
+_SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
+NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
+
+
+def sampson_squared(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
+    """Squared Sampson errors in thresholds of poses. (B, K, 3, 3), (B, K, 3) -> (B, K, N)."""
+    E = essential_from_pose(R, t)
+    constraint, variance = views.epipolar
+    squared = (E.flatten(-2) @ constraint).square()
+    return squared / (_variance_form(E) @ variance).clamp_min(torch.finfo(R.dtype).tiny)
+
+
+def _variance_form(E: Tensor) -> Tensor:
+    """The coefficients of the variance of the constraint. (..., 3, 3) -> (..., 18)."""
+    rows, columns = E[..., :2, :].mT @ E[..., :2, :], E[..., :2] @ E[..., :2].mT
+    return torch.cat((rows, columns), dim=-2).flatten(-2)
+
+
+@lru_cache(maxsize=16)
+def _essential_tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Two linear maps that make E, its derivatives and those of its variance matrix products.
+
+    (9, 54): from the frame of the direction (t, a, b, as rows) to the left factors of the derivatives of E = L R
+    by the rotation (three) and by turning the frame about its b and a, and to L itself; (9, 162): from E to the (9, 18)
+    matrix that takes dE to half the derivative of `_variance_form`.
+    """
+    axes = generators(dtype, device)
+    units = torch.eye(9, dtype=dtype, device=device).unflatten(-1, (3, 3))
+    crosses = skew(units)  # (9, row of the frame, 3, 3)
+    left = torch.cat((crosses[:, :1] @ axes, crosses[:, 1:2], -crosses[:, 2:], crosses[:, :1]), dim=1)
+    bilinear = [[_variance_form(E + F) - _variance_form(E) - _variance_form(F) for F in units] for E in units]
+    return left.flatten(1), 0.5 * torch.stack([torch.stack(row) for row in bilinear]).flatten(1)
+
+
+def tangent_basis(t: Tensor) -> Tensor:
+    """Two unit vectors perpendicular to t and to each other. (..., 3) -> (..., 2, 3)."""
+    axis = torch.nn.functional.one_hot(t.abs().argmin(-1), 3).to(t.dtype)
+    a = torch.linalg.cross(t, axis, dim=-1)
+    a = a / a.norm(dim=-1, keepdim=True)
+    return torch.stack((a, torch.linalg.cross(t, a, dim=-1)), dim=-2)
+
+
+def _retract_essential(state: State, step: Tensor) -> State:
+    """Turns R from the left and the frame of t, whose rows are t, a, b, about its own b and a."""
+    zero, (a, b) = torch.zeros_like(step[:, :1]), step[:, 3:].split(1, dim=-1)
+    turns = torch.cat((step[:, :3], zero, -b, -a), dim=-1)
+    return (torch.bmm(small_rotation(turns.view(-1, 3)), state[0].view(-1, 3, 3)).view_as(state[0]),)
+
+
+def fit_essential(
+    views: TwoViews,
+    R: Tensor,
+    t: Tensor,
+    iterations: int,
+    scales: Tensor,
+    kernel: Kernel = "truncated",
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
+
+    scales: (B,) of the kernel, in thresholds
+    """
+
+    def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _fit_essential_part(iterations, kernel, *part)
+
+    numbers = t.shape[1] * 6 * views.mask.shape[1]
+    R, t, cost = in_parts(fit, numbers, R, t, *views.epipolar, views.mask, scales)
+    return R, t, cost
+
+
+def _fit_essential_part(
+    iterations: int,
+    kernel: Kernel,
+    R: Tensor,
+    t: Tensor,
+    constraint: Tensor,
+    variance: Tensor,
+    mask: Tensor,
+    scales: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    B, K = t.shape[:2]
+    left_table, variance_table = _essential_tables(R.dtype, R.device)
+    frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
+
+    def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
+        left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
+        E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
+        form = torch.bmm(E, (E[:, -1] @ variance_table).view(B * K, 9, 18))
+        value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, constraint.shape[-1])
+        spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, constraint.shape[-1])
+        inverse = spread[:, :, -1:].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt_()
+        # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
+        rows = value.mul_(inverse)
+        residual = rows[:, :, -1:]
+        rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
+        robust = robustify(residual.squeeze(2).square(), kernel, scales[:, None, None])
+        cost = torch.where(mask[:, None], robust.rho, 0.0).sum(-1)
+        weight = torch.where(mask[:, None], robust.weight, 0.0).sqrt_()
+        rows = rows.mul_(weight[:, :, None]).view(B * K, 6, constraint.shape[-1])
+        return torch.bmm(rows, rows.mT), cost.view(-1)
+
+    start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
+    (pose,), cost = minimize((start,), evaluate, _retract_essential, iterations)
+    pose = pose.view(B, K, 2, 3, 3)
+    return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
+
+
+def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
+    """(B,) variance of the noise, in squared thresholds, by the squared Sampson errors (B, N) of a pose."""
+    near = (squared < NOISE_WIDTH**2) & mask
+    return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
+
+
+def score_essential(views: TwoViews, E: Tensor, soft: bool = False) -> Tensor:
+    """Scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M).
+
+    soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of `truncated_score`
+    """
+    constraint, variance = views.epipolar_float
+    squared = (E.flatten(-2).float() @ constraint).square_()
+    spread = (_variance_form(E).float() @ variance).clamp_min_(1e-20)
+    if not soft:
+        return truncated_score(squared.div_(spread), views.mask)
+    support = spread.div_(squared.add_(spread)).nan_to_num_(0.0)
+    return (support @ views.mask.to(support.dtype)[..., None]).squeeze(-1)
+
+
+def propose_essential(
+    views: TwoViews, count: int, generator: torch.Generator, by_noise: bool
+) -> tuple[State, Tensor, Tensor]:
+    """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support.
+
+    by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
+    lie behind a camera count as wrong
+    """
+    B = len(views.mask)
+    sample = sample_minimal(views.mask, 5, count, generator)
+    x_1, x_2 = gather_rows(views.x_1, sample), gather_rows(views.x_2, sample)
+    E, row = five_point(x_1.flatten(0, 1), x_2.flatten(0, 1))
+    candidates = _CHECKED_CANDIDATES if by_noise else _CANDIDATES
+    E, valid = pad_groups(E.flatten(1), row // count, B, candidates)
+
+    def score(E: Tensor, rows: Tensor | None) -> Tensor:
+        some = views if rows is None else views.rows(rows)
+        return score_essential(some, E.unflatten(-1, (3, 3)), by_noise)
+
+    best = best_models(score, E, valid, views.mask, candidates, generator)
+    R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
+    # Padding has no pose; start it from the identity.
+    R = torch.where(
+        valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
+    )
+    t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
+    R, t, cost = _optimized(views, R, t, by_noise)
+    near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
+    return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
+
+
+def _optimized(views: TwoViews, R: Tensor, t: Tensor, by_noise: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The best of candidates (B, K), the first of which scored best, locally optimised: R, t, cost (B,)."""
+    if not by_noise:
+        R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(len(t)))
+        (R, t), cost = best_of((R, t), cost)
+        return R, t, cost
+    R, t, cost = best_in_front(views, R, t)
+    best = cost.topk(_MORE_CANDIDATES, dim=1, largest=False).indices
+    R, t = gather_rows(R.flatten(2), best).unflatten(-1, (3, 3)), gather_rows(t, best)
+    noise = noise_variance(sampson_squared(views, R[:, :1], t[:, :1])[:, 0], views.mask).sqrt()
+    unit = (_SUPPORT_DEVIATIONS * noise).clamp(_LEAST_UNIT, _LARGEST_UNIT)
+    in_units = views.in_units(unit[:, None])
+    R, t, _ = fit_essential(in_units, R, t, _ITERATIONS, t.new_ones(len(t)))
+    R, t, cost = best_in_front(in_units, R, t)
+    (R, t), _ = best_of((R, t), cost)
+    # Rounds are compared in thresholds, which are the same for all of them.
+    _, _, cost = best_in_front(views, R[:, None], t[:, None])
+    return R, t, cost[:, 0]
+
+
+def twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """The four poses of one essential matrix. (B, 3, 3), (B, 3) -> (B, 4, 3, 3), (B, 4, 3)."""
+    turn = 2 * t[..., :, None] * t[..., None, :] - torch.eye(3, dtype=t.dtype, device=t.device)
+    return torch.stack((R, R, turn @ R, turn @ R), dim=1), torch.stack((t, -t, t, -t), dim=1)
+
+
+def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Which matches lie in front of both cameras, and their parallax in thresholds. Poses (B, K) -> (B, K, N) twice."""
+    ray_1 = views.h_1[:, None] @ R.mT
+    ray_2 = views.h_2[:, None].expand_as(ray_1)
+    normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
+    t_rows = t[:, :, None].expand_as(ray_1)
+    depth_1 = -(torch.linalg.cross(t_rows, ray_2, dim=-1) * normal).sum(-1)
+    depth_2 = -(torch.linalg.cross(t_rows, ray_1, dim=-1) * normal).sum(-1)
+    parallax = normal.norm(dim=-1) * torch.minimum(views.scale_1, views.scale_2)[:, None]
+    return (depth_1 > 0) & (depth_2 > 0), parallax
+
+
+def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the four poses of each essential matrix (B, K) the one of least cost, and that cost (B, K).
+
+    The cost of a match is r^2 / (1 + r^2), by Geman and McClure. Matches behind a camera count as wrong, but where
+    their parallax is within the threshold.
+    """
+    support = torch.where(views.mask[:, None], 1 / (1 + sampson_squared(views, R, t)), 0.0)
+    score = torch.where(possible_matches(views, R, t), support[:, :, None], 0.0).sum(-1)
+    score, best = score.max(dim=-1)
+    four = (x.unflatten(0, best.shape) for x in twisted(R.flatten(0, 1), t.flatten(0, 1)))
+    R, t = (x.flatten(3).take_along_dim(best[..., None, None], 2)[:, :, 0] for x in four)
+    return R.unflatten(-1, (3, 3)), t, views.mask.sum(-1, keepdim=True) - score
+
+
+def possible_matches(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
+    """(B, K, 4, N): by which of the `twisted` poses of (B, K) matches lie before both cameras, or too far to tell.
+
+    As `ahead_and_parallax`, but from the products of the rays r_1, r_2 and t alone, which the four poses share.
+    """
+    t_1, t_2 = (t[:, :, None] @ R).squeeze(2) @ views.h_1.mT, t @ views.h_2.mT
+    r_12 = R.flatten(2) @ views.epipolar[0]
+    r_12 = torch.stack((r_12, 2 * t_1 * t_2 - r_12), dim=2)
+    t_1, t_2 = t_1[:, :, None], t_2[:, :, None]
+    r_11, r_22 = (h.square().sum(-1)[:, None, None] for h in (views.h_1, views.h_2))
+    depth_1, depth_2 = t_2 * r_12 - t_1 * r_22, t_2 * r_11 - t_1 * r_12
+    scale = torch.minimum(views.scale_1, views.scale_2)[:, None, None]
+    far = (r_11 * r_22 - r_12.square()) * scale.square() < 1
+    ahead = torch.stack(((depth_1 > 0) & (depth_2 > 0), (depth_1 < 0) & (depth_2 < 0)), dim=3)
+    return (ahead | far[:, :, :, None]).flatten(2, 3)
+
+
+_MAPPING_CANDIDATES = 2  # of all samples, that are worth a fit
+
+
+def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
+    """Squared transfer errors in thresholds of homographies or rotations. (B, K, 3, 3) -> (B, K, N)."""
+    difference = transfer_errors(H, views.x_1[:, None], views.x_2[:, None])
+    return difference.square().sum(-1) * views.transfer_scale[:, None].square()
+
+
+def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
+    """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
+    tangent = homography_tangent(H.dtype, H.device)
+    H, cost = fit_projections(H, tangent, *_transfer(views), iterations, width)
+    return (H,), cost
+
+
+def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
+    """Optimises pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
+    tangent = rotation_tangent(R.dtype, R.device)
+    R, cost = fit_projections(R, tangent, *_transfer(views), iterations, width)
+    return (R,), cost
+
+
+def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The matches as a problem for `fit_projections`."""
+    return views.h_1.mT, views.x_2, views.transfer_scale[..., None], views.mask
+
+
+def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
+    """Truncated scores of homographies or rotations, in float32. (B, M, 3, 3) -> (B, M)."""
+    h_1, x_2, scale, mask = _transfer(views)
+
+    def score(*part: Tensor) -> tuple[Tensor]:
+        return (score_projections(*part),)
+
+    (scores,) = in_parts(
+        score, 3 * H.shape[1] * mask.shape[1], H.float(), h_1.float(), x_2.float(), scale, mask
+    )
+    return scores
+
+
+def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
+    """The best homographies (B, K, 3, 3) of `count` samples of four matches."""
+    sample = sample_minimal(views.mask, 4, count, generator)
+    H = homography_from_matches(gather_rows(views.x_1, sample), gather_rows(views.x_2, sample))
+    best = score_mappings(views, H).topk(_MAPPING_CANDIDATES, dim=1).indices
+    return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
+
+
+def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
+    """The best pure rotations (B, K, 3, 3) of `count` samples of two matches."""
+    sample = sample_minimal(views.mask, 2, count, generator)
+    R = rotation_from_matches(gather_rows(views.h_1, sample), gather_rows(views.h_2, sample))
+    regular = torch.isfinite(R).all((-2, -1))[..., None, None]
+    R = torch.where(regular, R, torch.eye(3, dtype=R.dtype, device=R.device))
+    best = score_mappings(views, R).topk(_MAPPING_CANDIDATES, dim=1).indices
+    return gather_rows(R.flatten(2), best).unflatten(-1, (3, 3))

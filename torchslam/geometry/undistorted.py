@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.gating import KeypointNoise
-from torchslam.geometry.whitening import whitening
+from torchslam.geometry.gating import KeypointNoise, whitening
 
 _NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
 _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some thousandths of one

@@ -12,7 +12,7 @@ from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     estimate_similarity,
-    fits,
+    passes_gate,
     rigid,
     se3_inverse,
     sim3_inverse,
@@ -139,7 +139,7 @@ def agreeing(
     view = other.view(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
-    good = fits(errors, WIDER**2 * config.measurement.max_chi_square)
+    good = passes_gate(errors, WIDER**2 * config.measurement.max_chi_square)
     return ids[good], keypoints[good]
 
 
@@ -167,8 +167,8 @@ def _first_guess(
         view_2.keypoints[rows_2][None],
         camera,
         camera,
-        view_1.noise[rows_1].tolerance[None],
-        view_2.noise[rows_2].tolerance[None],
+        view_1.noise[rows_1].gate_sigma[None],
+        view_2.noise[rows_2].gate_sigma[None],
         seed=config.seed,
         confidence=_CONFIDENCE,
         max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
@@ -194,4 +194,4 @@ def _refined(
         scale=_KERNEL_SCALE,
         backward="detached",
     ).T_cw[0]
-    return refined, fits(noise.squared_reprojection(transform(refined, points_w), pixels, camera))
+    return refined, passes_gate(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

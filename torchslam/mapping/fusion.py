@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.features import match_by_projection
-from torchslam.geometry import Camera, fits
+from torchslam.geometry import Camera, passes_gate
 from torchslam.map.map import Map
 from torchslam.tracking.correspondences import look_at
 from torchslam.tracking.matcher import max_distance
@@ -56,7 +56,7 @@ def find_in(
     errors = slam_map.noise(keyframe, keypoint).squared(
         pixels[which, row] - table["keypoints"][keyframe, keypoint]
     )
-    agrees = fits(errors, config.measurement.max_chi_square)
+    agrees = passes_gate(errors, config.measurement.max_chi_square)
     ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
     taken = table["point_ids"][keyframe, keypoint]
     is_free = taken < 0

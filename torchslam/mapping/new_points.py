@@ -13,7 +13,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
-    fits,
+    passes_gate,
     se3_inverse,
     transform,
     triangulate,
@@ -109,7 +109,7 @@ def _triangulate(
     good = seen.mask
     for T_cw, noise, seen_at in ((T_1w, noise_1, pixels[0]), (T_2w, noise_2, pixels[1])):
         points_c = transform(T_cw, seen.points_w)
-        good &= fits(noise.squared_reprojection(points_c, seen_at, camera), limit)
+        good &= passes_gate(noise.squared_reprojection(points_c, seen_at, camera), limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
     sizes = tuple(size[found.which] for size in slam_map.scale_ranges(neighbours))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
@@ -117,7 +117,13 @@ def _triangulate(
     keep = keep[first_of_each(found.at_1[keep])]
     points_w = seen.points_w[keep]
     covariances_w = triangulation_covariance(
-        T_1w, T_2w[keep], points_w, noise_1[keep].spread, noise_2[keep].spread, camera, camera
+        T_1w,
+        T_2w[keep],
+        points_w,
+        noise_1[keep].sigma_or_covariance,
+        noise_2[keep].sigma_or_covariance,
+        camera,
+        camera,
     )
     found = found.select(keep)
     descriptors = here.features.descriptors[0, found.at_1]

@@ -15,8 +15,7 @@ from torchslam.config import Config
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
-from torchslam.features.contract import check_features
-from torchslam.features.masking import only_where
+from torchslam.features.contract import check_features, only_where
 from torchslam.geometry import Camera
 from torchslam.plugins import load_front_end
 from torchslam.types import Features, Frame

@@ -114,7 +114,7 @@ def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Ma
 def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFeatures:
     """A view as a matcher wants it: with the image, with stated noise that weights can multiply."""
     if getattr(matcher, "weighs", False):
-        view = replace(view, information=view.noise.stated().information)
+        view = replace(view, information=view.noise.with_explicit_information().information)
     if getattr(matcher, "wants_images", False) and frame.image.numel():
         view = replace(view, image=frame.image)
     return view

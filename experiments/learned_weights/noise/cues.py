@@ -1,4 +1,4 @@
-"""What a keypoint of ORB shows that may tell how far off it is: level, response, contrast, form, neighbourhood."""
+"""What a keypoint of ORB shows that may tell how far off it is: level, response, contrast, form, neighborhood."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchslam import ORB, Features
-from torchslam.features.fast import patch_scores
+from torchslam.features.corners import patch_scores
 from torchslam.features.matching.hamming import hamming
-from torchslam.features.pyramid import build_levels, gather_level_patches, plan_atlas
+from torchslam.features.pyramid import build_levels, gather_level_patches, plan_pyramid
 
 NAMES = (
     "level",
@@ -26,7 +26,7 @@ NAMES = (
     "sharpness",
 )
 """level: log of the scale; response: log of the FAST score; peakedness: log of by how much it exceeds the mean of its
-eight neighbours; contrast: log of the standard deviation of grey values, gradient: log of the mean squared gradient,
+eight neighbors; contrast: log of the standard deviation of gray values, gradient: log of the mean squared gradient,
 isotropy: log of the ratio of the structure tensor's eigenvalues, the smaller one first, all of the 9 x 9 pixels of the
 level; offset: pixels of the level between the keypoint and the nearest pixel; distance: log of that to the nearest
 other keypoint, in scales; ambiguity: bits by which the most similar other descriptor of the image differs, of 256;
@@ -35,7 +35,7 @@ sharpness: the median gradient of the image's keypoints, which motion blur lower
 RADIUS = 4
 _BITS = 256
 _NEAR = 0.5  # scales: keypoints of two levels at one place are no nearer than that to each other
-_FLAT = 1.0  # grey value: the noise of a camera, below which a contrast says nothing
+_FLAT = 1.0  # gray value: the noise of a camera, below which a contrast says nothing
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class Cues:
 def describe(orb: ORB, images: Tensor, features: Features) -> Cues:
     """The cues of what ORB found in images (B, 1, H, W)."""
     batch, number = features.mask.shape
-    atlas = plan_atlas(*images.shape[-2:], orb.scale_factor, orb.num_levels)
+    atlas = plan_pyramid(*images.shape[-2:], orb.scale_factor, orb.num_levels)
     level = (features.scales.log() / math.log(orb.scale_factor)).round().to(torch.int64)
     sizes = images.new_tensor(atlas.scales)[level]
     xy = (features.keypoints + 0.5) / sizes - 0.5
-    centres = torch.where(features.mask[..., None], xy.round().to(torch.int64), RADIUS)
+    centers = torch.where(features.mask[..., None], xy.round().to(torch.int64), RADIUS)
     of = torch.arange(batch, device=images.device)[:, None].expand(-1, number)
     level = torch.where(features.mask, level, 0)
     patches = gather_level_patches(
-        build_levels(images, atlas), of.flatten(), level.flatten(), centres.flatten(0, 1), RADIUS
+        build_levels(images, atlas), of.flatten(), level.flatten(), centers.flatten(0, 1), RADIUS
     )
     tensors = structure_tensors(patches)
     trace = tensors.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -83,8 +83,8 @@ def describe(orb: ORB, images: Tensor, features: Features) -> Cues:
             contrast,
             gradient,
             isotropy,
-            (xy - centres).norm(dim=-1).clamp_max(1.0),
-            *_neighbourhoods(features),
+            (xy - centers).norm(dim=-1).clamp_max(1.0),
+            *_neighborhoods(features),
             median.nan_to_num().expand_as(gradient),
         ),
         dim=-1,
@@ -102,7 +102,7 @@ def structure_tensors(patches: Tensor) -> Tensor:
     return gradients @ gradients.mT / dx.shape[1]
 
 
-def _neighbourhoods(features: Features) -> tuple[Tensor, Tensor]:
+def _neighborhoods(features: Features) -> tuple[Tensor, Tensor]:
     """(B, N) each: log distance in scales to the nearest other keypoint, share of bits to the most similar one."""
     apart = torch.cdist(features.keypoints, features.keypoints)
     none = ~features.mask[:, None, :] | torch.eye(apart.shape[-1], dtype=torch.bool, device=apart.device)

@@ -17,7 +17,7 @@ from experiments.learned_weights.noise.report import HAND, LIKELIHOOD, RULES, SH
 from experiments.learned_weights.noise.runs import Outcome, outcome_of
 from experiments.learned_weights.noise.training import Settings, at_level, fit_likelihood, fit_trajectories
 from torchslam import load_config
-from torchslam.geometry.gating import MARGIN
+from torchslam.geometry.gating import GATE_FACTOR
 
 HERE = Path(__file__).parent
 SEQUENCES = ("fr2_desk_20", "shelf_bin", "kitti07", "machine_hall", "drone", "redkitchen")
@@ -57,11 +57,11 @@ class Experiment:
     def _fitted(self, rule: str, test: str, seed: int) -> NoiseModel:
         settings = Settings(seed=seed)
         if rule == STATED:
-            return constant(MARGIN**2)
+            return constant(GATE_FACTOR**2)
         seen = {name: self.example(name) for name in SEQUENCES if name != test}
         if rule in KINDS:
             model = fit_likelihood(list(seen.values()), KINDS[rule], settings)
-            return at_level(model, MARGIN**2) if rule == SHAPE else model
+            return at_level(model, GATE_FACTOR**2) if rule == SHAPE else model
         taught = [seen[name] for name in TAUGHT if name in seen]
         return fit_trajectories(load(self.model(SHAPE, test, seed)), taught, settings)
 

@@ -1,4 +1,4 @@
-"""Features under a mask: none, and the budget goes elsewhere."""
+"""Keypoints only where they are wanted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchslam.config import Config
 from torchslam.data import open_sequence
 from torchslam.errors import FrameError
 from torchslam.features import ORB, extractor
-from torchslam.features.masking import only_where
+from torchslam.features.contract import only_where
 from torchslam.system.front_end import check_size, image_extractor
 from torchslam.types import Features
 

@@ -1,0 +1,128 @@
+"""Changes of rigid transforms and similarities: distances, corrections, and the conventions of other programs.
+
+Every change of axes is made here:
+
+| | pose | camera axes | world | centre of the top left pixel |
+|---|---|---|---|---|
+| torchslam | `T_cw`, `T_wc` | x right, y down, z forward | that of the map | (0, 0) |
+| COLMAP | `T_cw`, quaternion w first | the same | that of the map | (0.5, 0.5) |
+| nerfstudio | `T_wc` | OpenGL: x right, y up, z backward | z up | (0.5, 0.5) |
+| PLY | | | z up | |
+| rerun | `T_wc` | x right, y down, z forward (RDF) | z up | (0.5, 0.5) |
+| TUM, KITTI | `T_wc` | x right, y down, z forward | that of the map | |
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import (
+    quaternion_from_matrix,
+    rigid,
+    se3_inverse,
+    sim3_inverse,
+    sim3_scale,
+    transform,
+)
+
+
+def apart(T_cw: Tensor, T_kw: Tensor, depth: Tensor | float) -> tuple[Tensor, Tensor]:
+    """(k,), (k,) how far cameras T_kw (k, 4, 4) are from T_cw (4, 4): shares of a depth, and degrees."""
+    T_ck = T_cw @ se3_inverse(T_kw)
+    translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
+    return translation, torch.rad2deg(rotation_angle(T_ck[:, :3, :3]))
+
+
+def rotation_angle(R: Tensor) -> Tensor:
+    """Angles of rotation matrices, to decide by: without a gradient at 0 and pi. (..., 3, 3) -> (...) radians."""
+    sine = torch.linalg.vector_norm(R - R.mT, dim=(-2, -1)) / math.sqrt(8)
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return torch.atan2(sine, cosine)
+
+
+def reorthonormalized(T: Tensor) -> Tensor:
+    """Rigid transforms (..., 4, 4) whose rotations are so to rounding, of such that are so nearly.
+
+    Where a pose is predicted from those before it, with transposes for inverses, what they lack of a rotation grows by
+    1 + sqrt(2) from frame to frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
+    """
+    R = T[..., :3, :3]
+    return rigid(1.5 * R - 0.5 * R @ (R.mT @ R), T[..., :3, 3])
+
+
+def carry_points(
+    points_w: Tensor, covariances_w: Tensor, normals_w: Tensor, T_cw: Tensor, S_cw: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points, their covariances and unit normals in the world in which a similarity S_cw stands for the pose T_cw.
+
+    points_w: (..., 3); covariances_w: (..., 3, 3); normals_w: (..., 3); T_cw, S_cw: (..., 4, 4), one for each point,
+    world to camera. What is seen in the direction and with the relative depth p_c = T_cw p is seen so by S_cw after.
+    """
+    S_wc = sim3_inverse(S_cw)
+    moved_w = transform(S_wc, transform(T_cw, points_w[..., None, :]))[..., 0, :]
+    R_wc = S_wc[..., :3, :3] @ T_cw[..., :3, :3]
+    normals = (sim3_scale(S_cw)[..., None, None] * R_wc @ normals_w[..., None])[..., 0]
+    return moved_w, R_wc @ covariances_w @ R_wc.mT, normals
+
+
+def with_unit(T: Tensor, unit: Tensor) -> Tensor:
+    """Rigid transforms (..., 4, 4) in a unit of length that is (...) times as long."""
+    return rigid(T[..., :3, :3], T[..., :3, 3] / unit[..., None])
+
+
+def without_scale(S_cw: Tensor) -> Tensor:
+    """The pose (..., 4, 4) of the camera of a similarity: its rotation and its centre, in the unit of the world."""
+    scale = sim3_scale(S_cw)
+    return rigid(S_cw[..., :3, :3] / scale[..., None, None], S_cw[..., :3, 3] / scale[..., None])
+
+
+def covariances_with_unit(covariances: Tensor, unit: Tensor) -> Tensor:
+    """Covariances (..., 6, 6) of poses, translation first, in a unit of length that is (...) times as long."""
+    units = torch.ones_like(covariances[..., 0])
+    units[..., :3] = 1 / unit[..., None]
+    return units[..., :, None] * covariances * units[..., None, :]
+
+
+HALF_PIXEL = 0.5  # from an origin at the centre of the top left pixel to one at its corner
+
+
+def corner_pixels(pixels: Tensor) -> Tensor:
+    """Pixels (..., 2) from the corner of the image, not from the centre of its first pixel."""
+    return pixels + HALF_PIXEL
+
+
+def corner_camera(camera: Camera) -> Camera:
+    """The camera whose pixels are those of `corner_pixels`."""
+    params = camera.params.clone()
+    params[..., 2:4] += HALF_PIXEL
+    return camera.with_params(params)
+
+
+def opengl(T_wc: Tensor) -> Tensor:
+    """Camera to world (..., 4, 4) for camera axes x right, y up, z backward."""
+    return T_wc * T_wc.new_tensor((1.0, -1.0, -1.0, 1.0))
+
+
+def quaternion_wxyz(R: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), w first and not negative, of rotation matrices (..., 3, 3)."""
+    return quaternion_from_matrix(R).roll(1, dims=-1)
+
+
+def upright_rotation(T_wc: Tensor) -> Tensor:
+    """(3, 3) from the world to one whose z is up and whose x is as near to the world's x as can be.
+
+    T_wc: (N, 4, 4). Gravity is not known: up is the mean up direction of the cameras. Where they have none, as when
+    half of them hang upside down, it is that of a world whose y points down.
+    """
+    down = T_wc[:, :3, 1].mean(dim=0) if len(T_wc) else T_wc.new_zeros(3)
+    if float(down.norm()) < 1e-3:  # a unit vector in any but made-up cases
+        down = T_wc.new_tensor((0.0, 1.0, 0.0))
+    up = -down / down.norm()
+    axis = T_wc.new_tensor((1.0, 0.0, 0.0) if abs(float(up[0])) < 0.9 else (0.0, 0.0, 1.0))
+    right = axis - (axis @ up) * up
+    right = right / right.norm()
+    return torch.stack((right, torch.linalg.cross(up, right), up))
