@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.accelerator import SimulatedTensor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
-from torchslam import ORB, SLAM, ClipSLAM, evaluate, load_config, open_sequence, solve
+from torchslam import ORB, SLAM, ClipSLAM, evaluate, load_config, open_sequence, solve_graph
 from torchslam.cli.main import main
 from torchslam.evaluation import ate
 
@@ -31,7 +31,7 @@ def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
     graph = run.graph
     pixels = graph.pixels.clone().requires_grad_()
     camera = graph.camera.with_params(graph.camera.params.clone().requires_grad_())
-    solution = solve(replace(graph, pixels=pixels, camera=camera))
+    solution = solve_graph(replace(graph, pixels=pixels, camera=camera))
     ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids.cpu()].to(device)).backward()
     assert pixels.grad is not None
     assert camera.params.grad is not None

@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from torchslam.utils.optional_deps import explained
+from torchslam.utils.console import with_install_hint
 
 if TYPE_CHECKING:
     from torchslam.config import Config, load_config
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
         triangulate,
         umeyama,
     )
-    from torchslam.learning.clip import ClipGraph, ClipPoses, ClipSLAM, clip_loss
+    from torchslam.learning.clip_slam import ClipGraph, ClipPoses, ClipSLAM, clip_loss
     from torchslam.optim import BundleProblem, bundle_adjust, minimize, refine_pose
-    from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve
+    from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
     from torchslam.system.run import Run
     from torchslam.system.slam import SLAM
     from torchslam.types import Features, Frame, Matches, State, StepResult, Trajectory
@@ -67,7 +67,7 @@ __all__ = [
     "minimize",
     "open_sequence",
     "refine_pose",
-    "solve",
+    "solve_graph",
     "triangulate",
     "umeyama",
 ]
@@ -79,11 +79,11 @@ HOMES = {
     "torchslam.evaluation": "evaluate",
     "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_by_projection",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
-    "torchslam.learning.clip": "ClipGraph ClipPoses ClipSLAM clip_loss",
+    "torchslam.learning.clip_slam": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",
     "torchslam.optim": "BundleProblem bundle_adjust minimize refine_pose",
-    "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve",
+    "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
 
@@ -97,7 +97,7 @@ def __getattr__(name: str) -> Any:
             try:
                 value = globals()[name] = getattr(import_module(home), name)
             except ModuleNotFoundError as error:
-                raise explained(error) from error
+                raise with_install_hint(error) from error
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from experiments.common import sequences, table, write_between
 from torchslam.config import load_config
-from torchslam.data.association import interpolate_poses
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
+from torchslam.data.trajectories import interpolate_poses
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve
+from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
 from torchslam.system.slam import SLAM
 
 matplotlib.use("Agg")
@@ -80,11 +80,11 @@ def measure(name: str, sequence: Sequence) -> dict[str, float]:
     before = _peak_mib()
     start = time.process_time()
     if name != "adjust and differentiate":
-        solution = solve(disturbed(graph) if "disturbed" in name else graph, backward="detached")
+        solution = solve_graph(disturbed(graph) if "disturbed" in name else graph, backward="detached")
         seconds = {"adjust": time.process_time() - start}
     else:
         leaves, _, _ = with_leaves(graph)
-        solution = solve(leaves)
+        solution = solve_graph(leaves)
         loss = ate(solution.T_cw[known], T_cw[known])
         middle = time.process_time()
         loss.backward()
@@ -123,12 +123,12 @@ def check(
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(graph.pixels.shape, generator=generator, dtype=graph.pixels.dtype)
     one_frame = noise * (graph.frame_index == len(graph.T_cw) // 2)[:, None]
-    focal, centre = torch.zeros_like(params), torch.zeros_like(params)
-    focal[:2], centre[2] = 1.0, 1.0
+    focal, center = torch.zeros_like(params), torch.zeros_like(params)
+    focal[:2], center[2] = 1.0, 1.0
     still, fixed = torch.zeros_like(noise), torch.zeros_like(params)
     directions = [
         ("fx and fy, by 1 px", still, focal, 1e-2),
-        ("cx, by 1 px", still, centre, 1e-2),
+        ("cx, by 1 px", still, center, 1e-2),
         ("all keypoints, at random by 1 px", noise, fixed, 1e-4),
         ("the keypoints of one frame, at random by 1 px", one_frame, fixed, 1e-2),
     ]
@@ -139,7 +139,7 @@ def check(
             pixels=graph.pixels + step_pixels,
             camera=graph.camera.with_params(graph.camera.params + step_params),
         )
-        solution = solve(moved, backward="detached", iterations=12, tolerance=0.0)
+        solution = solve_graph(moved, backward="detached", iterations=12, tolerance=0.0)
         return float(ate(solution.T_cw[known], T_cw[known]))
 
     rows = []
@@ -228,7 +228,7 @@ def main() -> None:
         graph = graph_of(sequence)
         T_cw, known = truth_of(graph, sequence)
         leaves, pixels, params = with_leaves(graph)
-        solution = solve(leaves)
+        solution = solve_graph(leaves)
         loss = ate(solution.T_cw[known], T_cw[known])
         loss.backward()
         assert pixels.grad is not None

@@ -14,7 +14,7 @@ from experiments.trials.edited import Edited, shots
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, rigid, so3_exp
-from torchslam.optim.run_graph import ObservationGraph, solve
+from torchslam.optim.run_graph import ObservationGraph, solve_graph
 from torchslam.system.run import Run
 from torchslam.types import Trajectory
 
@@ -64,13 +64,13 @@ def check(run: Run, sequence: Sequence) -> list[list[str]]:
     assert len(graph.submaps) == 1
     assert len(T_true) == len(graph.T_cw)
     pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
-    ate(solve(_moved(graph, pixels, params)).T_cw, T_true).backward()
+    ate(solve_graph(_moved(graph, pixels, params)).T_cw, T_true).backward()
     assert pixels.grad is not None
     assert params.grad is not None
 
     def error(step_pixels: Tensor, step_params: Tensor) -> float:
         moved = _moved(graph, graph.pixels + step_pixels, graph.camera.params + step_params)
-        solution = solve(moved, backward="detached", iterations=ITERATIONS, tolerance=0.0)
+        solution = solve_graph(moved, backward="detached", iterations=ITERATIONS, tolerance=0.0)
         return float(ate(solution.T_cw, T_true))
 
     rows = []
@@ -83,9 +83,9 @@ def check(run: Run, sequence: Sequence) -> list[list[str]]:
     return rows
 
 
-def report(run: Run, sequence: Sequence, file: Path, recalls: list[tuple[int, int]]) -> None:
-    """Check the gradient and write what came out between the marks of a file; recalls: frames and their places."""
-    closed = ", ".join(f"frame {frame} at {place}" for frame, place in recalls)
+def report(run: Run, sequence: Sequence, file: Path, loop_closures: list[tuple[int, int]]) -> None:
+    """Check the gradient and write the result between the marks of a file; loop closures: frames and their places."""
+    closed = ", ".join(f"frame {frame} at {place}" for frame, place in loop_closures)
     graph = run.graph
     counts = (
         f"{len(graph.T_cw)} frames, {int(graph.is_keyframe.sum())} of them keyframes, {len(graph.points_w)} points, "

@@ -30,7 +30,7 @@ from experiments.learned_weights.noise.training import (
 )
 from torchslam import ORB, Camera
 from torchslam.geometry import se3_exp, transform
-from torchslam.optim.run_graph import ObservationGraph, solve
+from torchslam.optim.run_graph import ObservationGraph, solve_graph
 
 FRAMES, POINTS = 10, 150
 SMALL = Settings(rounds=3, likelihood_steps=120, likelihood_rate=0.05, trajectory_steps=3)
@@ -146,7 +146,7 @@ def test_a_dependence_on_cues_is_found_and_serves_the_graph() -> None:
     for seed in (30, 40, 50):
         example = simulated(seed, slope=1.0)
         with torch.no_grad():
-            plain, told = solve(example.graph), solve(weighed(example, model).graph)
+            plain, told = solve_graph(example.graph), solve_graph(weighed(example, model).graph)
         better += float(position_error(example, told)) < float(position_error(example, plain))
     assert better >= 2
 
@@ -160,7 +160,9 @@ def test_trajectories_move_the_model_downhill() -> None:
 
     @torch.no_grad()
     def loss(model: NoiseModel) -> float:
-        return sum(float(position_error(each, solve(weighed(each, model).graph)).log()) for each in examples)
+        return sum(
+            float(position_error(each, solve_graph(weighed(each, model).graph)).log()) for each in examples
+        )
 
     assert loss(moved) < loss(start)
 
@@ -175,12 +177,12 @@ def test_without_truth_no_trajectory_teaches() -> None:
 def test_keyframes_of_the_largest_world_stand_alone() -> None:
     graph = simulated(5).graph
     is_keyframe = torch.arange(FRAMES) % 2 == 0
-    world = (torch.arange(FRAMES) >= 8).to(torch.int64)
-    part, frames, rows = keyframes_of(replace(graph, is_keyframe=is_keyframe, world=world))
+    submap = (torch.arange(FRAMES) >= 8).to(torch.int64)
+    part, frames, rows = keyframes_of(replace(graph, is_keyframe=is_keyframe, submap=submap))
     assert frames.tolist() == [0, 2, 4, 6]
     torch.testing.assert_close(part.pixels, graph.pixels[rows])
     torch.testing.assert_close(part.points_w[part.point_index], graph.points_w[graph.point_index[rows]])
-    assert solve(part).success.all()
+    assert solve_graph(part).success.all()
 
 
 @pytest.mark.parametrize("kind", ["constant", "isotropic", "directed"])

@@ -13,8 +13,8 @@ from torch.func import vmap
 from torchslam.geometry import se3_exp
 from torchslam.optim import BundleProblem, CameraPrior, PosePrior, bundle_adjust
 from torchslam.optim.bundle import _minimization as minimization
-from torchslam.optim.bundle._dense import GridBundle
-from torchslam.optim.bundle._problem import sanitized, what_moves
+from torchslam.optim.bundle._dense import DenseBundle
+from torchslam.optim.bundle._problem import sanitized, select_moving
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 EQUAL = {"rtol": 1e-8, "atol": 1e-10}
@@ -95,7 +95,7 @@ def mixed(bundle_scene, **options) -> list[BundleProblem]:
 @pytest.mark.parametrize("grids", [True, False])
 def test_a_batch_is_the_loop(bundle_scene, model, grids, monkeypatch):
     if not grids:
-        monkeypatch.setattr(minimization, "fits_grids", lambda *_: False)
+        monkeypatch.setattr(minimization, "suits_dense", lambda *_: False)
     problems = mixed(bundle_scene, model=model)
     assert_as_alone(batch_of(problems), problems, "cauchy", 2.0)
 
@@ -140,7 +140,7 @@ def test_many_at_once_or_few(bundle_scene, monkeypatch):
     batch = batch_of(problems)
     bundle_adjust(batch, progress=lambda now, most: told.append((now, most)))
     given = sanitized(batch, 1.0)
-    assert len(minimization._parts(given, what_moves(given))) == 2
+    assert len(minimization._parts(given, select_moving(given))) == 2
     assert told == sorted(told)
     assert {most for _, most in told} == {60}
     assert_as_alone(batch, problems)
@@ -152,9 +152,9 @@ def test_what_has_converged_does_no_more_work(bundle_scene, monkeypatch):
     done = bundle_adjust(problems[1], tolerance=1e-14, iterations=50)
     problems[1] = replace(problems[1], T_cw=done.T_cw, points_w=done.points_w)
     sizes = []
-    evaluate = GridBundle.evaluate
+    evaluate = DenseBundle.evaluate
     monkeypatch.setattr(
-        GridBundle, "evaluate", lambda self, at, near: sizes.append(len(near)) or evaluate(self, at, near)
+        DenseBundle, "evaluate", lambda self, at, near: sizes.append(len(near)) or evaluate(self, at, near)
     )
     solution = bundle_adjust(batch_of(problems), tolerance=1e-8)
     iterations = solution.convergence.iterations

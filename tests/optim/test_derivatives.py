@@ -1,4 +1,4 @@
-"""Derivatives of minimisers in both directions, twice, and under `torch.func`'s transforms, against one another."""
+"""Derivatives of minimizers in both directions, twice, and under `torch.func`'s transforms, against one another."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.optim.pose_graph.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
 from torchslam.optim import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
-from torchslam.optim.run_graph import solve
+from torchslam.optim.run_graph import solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 EXACT = {"rtol": 0.0, "atol": 1e-10}
@@ -77,9 +77,9 @@ def graph_problem() -> Problem:
             weights=graph.weights * (1 + x[2] * ramp[:, 0].square()),
             camera=graph.camera.with_params(graph.camera.params * (1 + 0.01 * x[3])),
         )
-        T_cw = solve(moved, "cauchy", 3.0, **CONVERGED).T_cw
-        centres = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
-        return torch.cat((T_cw[:, :3, :3].flatten(), (centres / centres.norm()).flatten()))
+        T_cw = solve_graph(moved, "cauchy", 3.0, **CONVERGED).T_cw
+        centers = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
+        return torch.cat((T_cw[:, :3, :3].flatten(), (centers / centers.norm()).flatten()))
 
     return poses, torch.linspace(-0.3, 0.4, 4, dtype=torch.float64)
 
@@ -247,7 +247,7 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     _, graph = simulated()
     T_cw = graph.T_cw.clone()
     T_cw[4, 0, 3] = torch.nan
-    success = solve(replace(graph, T_cw=T_cw)).success
+    success = solve_graph(replace(graph, T_cw=T_cw)).success
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
 
 

@@ -10,7 +10,7 @@ import torch
 from tests.optim.test_run_graph import aligned_error, simulated
 from torchslam.errors import TorchslamError
 from torchslam.optim import bundle_adjust, refine_pose
-from torchslam.optim.run_graph import ObservationGraph, solve
+from torchslam.optim.run_graph import ObservationGraph, solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -137,7 +137,7 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
     assert torch.equal(loaded.weights, graph.weights)
 
     def loss(weights):
-        return aligned_error(solve(replace(graph, weights=weights), "cauchy", 2.0, **CONVERGED), truth)
+        return aligned_error(solve_graph(replace(graph, weights=weights), "cauchy", 2.0, **CONVERGED), truth)
 
     leaf = graph.weights.clone().requires_grad_()
     loss(leaf).backward()

@@ -1,4 +1,4 @@
-"""The general minimiser against closed forms, the special solvers, and finite differences."""
+"""The general minimizer against closed forms, the special solvers, and finite differences."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from torchslam.errors import TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
 from torchslam.map.posed_frames import RunGraph
-from torchslam.optim.run_graph import ObservationGraph, join, solve
+from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -46,22 +46,22 @@ def simulated(noise=0.5, frames=10, points=50, seed=0):
 
 
 def aligned_error(solution, truth):
-    """RMSE of the camera centres after the best similarity: independent of the gauge."""
-    centres, target = solution.trajectory.positions_w, se3_inverse(truth)[:, :3, 3]
-    s, R, t = umeyama(centres, target)
-    return (s * centres @ R.mT + t - target).square().sum(-1).mean().sqrt()
+    """RMSE of the camera centers after the best similarity: independent of the gauge."""
+    centers, target = solution.trajectory.positions_w, se3_inverse(truth)[:, :3, 3]
+    s, R, t = umeyama(centers, target)
+    return (s * centers @ R.mT + t - target).square().sum(-1).mean().sqrt()
 
 
 def test_exact_data_gives_the_exact_trajectory():
     truth, graph = simulated(noise=0.0)
-    solution = solve(graph)
+    solution = solve_graph(graph)
     assert solution.success.all()
     assert aligned_error(solution, truth) < 1e-8
 
 
 def test_noisy_data_improves_on_the_start():
     truth, graph = simulated()
-    solution = solve(graph)
+    solution = solve_graph(graph)
     before = se3_log(graph.T_cw @ se3_inverse(truth)).norm()
     assert aligned_error(solution, truth) < 0.3 * before
 
@@ -72,7 +72,7 @@ def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
 
     def loss(pixels, weights, params):
         camera = graph.camera.with_params(params)
-        solution = solve(
+        solution = solve_graph(
             replace(graph, pixels=pixels, weights=weights, camera=camera), "cauchy", 2.0, **CONVERGED
         )
         return aligned_error(solution, truth)
@@ -97,14 +97,14 @@ def test_every_observation_has_a_gradient_and_free_camera_ends_it():
     truth, graph = simulated()
     pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
     graph = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
-    solution = solve(graph)
+    solution = solve_graph(graph)
     aligned_error(solution, truth).backward()
     counted = solution.moved_points[graph.point_index]  # points that at least two keyframes see
     assert counted.sum() > 0.7 * len(counted)
     assert torch.equal((pixels.grad != 0).any(-1), counted)
     assert (params.grad != 0).all()
     params.grad = None
-    solution = solve(graph, free_camera=True)
+    solution = solve_graph(graph, free_camera=True)
     aligned_error(solution, truth).backward()
     assert params.grad is None or (params.grad == 0).all()
     assert not torch.equal(solution.camera.params, params)
@@ -121,7 +121,7 @@ def test_a_frame_that_sees_nothing_stays_and_is_flagged():
         pixels=pixels,
         weights=graph.weights[keep],
     )
-    solution = solve(blind)
+    solution = solve_graph(blind)
     assert solution.success.tolist() == [row != 4 for row in range(10)]
     assert torch.equal(solution.T_cw[4], graph.T_cw[4])
     solution.T_cw.sum().backward()
@@ -131,7 +131,7 @@ def test_a_frame_that_sees_nothing_stays_and_is_flagged():
 def test_a_graph_without_observations_fails_without_an_error():
     _, graph = simulated()
     names = ("frame_index", "point_index", "pixels", "weights")
-    solution = solve(replace(graph, **{name: getattr(graph, name)[:0] for name in names}))
+    solution = solve_graph(replace(graph, **{name: getattr(graph, name)[:0] for name in names}))
     assert not solution.success.any()
     assert torch.equal(solution.T_cw, graph.T_cw)
     assert torch.equal(solution.points_w, graph.points_w)
@@ -141,20 +141,20 @@ def test_a_graph_without_observations_fails_without_an_error():
 
 def test_frames_say_whether_they_are_at_a_minimum():
     _, graph = simulated()
-    first = solve(graph, iterations=1)
+    first = solve_graph(graph, iterations=1)
     assert not first.converged.any()  # without points there, no frame is where it belongs
-    there = replace(graph, T_cw=solve(graph).T_cw, points_w=solve(graph).points_w)
+    there = replace(graph, T_cw=solve_graph(graph).T_cw, points_w=solve_graph(graph).points_w)
     off = replace(there, T_cw=torch.where(graph.is_keyframe[:, None, None], there.T_cw, graph.T_cw))
-    assert solve(there, iterations=2).converged.all()
-    assert torch.equal(solve(off, iterations=2).converged, graph.is_keyframe)
+    assert solve_graph(there, iterations=2).converged.all()
+    assert torch.equal(solve_graph(off, iterations=2).converged, graph.is_keyframe)
 
 
 def test_keyframes_only_and_no_keyframe():
     _, graph = simulated()
     everyone = replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))
-    assert solve(everyone).success.all()
+    assert solve_graph(everyone).success.all()
     with pytest.raises(ValueError, match="no keyframe"):
-        solve(replace(graph, is_keyframe=torch.zeros(10, dtype=torch.bool)))
+        solve_graph(replace(graph, is_keyframe=torch.zeros(10, dtype=torch.bool)))
 
 
 def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
@@ -162,7 +162,7 @@ def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
     graph.save(tmp_path / "graph.safetensors")
     loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
     assert loaded.camera.size == (640, 480)
-    assert torch.equal(solve(loaded).T_cw, solve(graph).T_cw)
+    assert torch.equal(solve_graph(loaded).T_cw, solve_graph(graph).T_cw)
 
 
 def run_graph(graph, start=0):
@@ -207,7 +207,7 @@ def two_worlds():
     """Truths and graphs of two worlds that share a camera, and both as one graph in an order of its own."""
     (truth_1, one), (truth_2, two) = simulated(seed=0), simulated(frames=7, points=30, seed=1)
     one, two = replace(one, submap=torch.full((10,), 4)), replace(two, submap=torch.full((7,), 1))
-    return (truth_1, truth_2), (one, two), join([one, two])
+    return (truth_1, truth_2), (one, two), concatenate_graphs([one, two])
 
 
 def close(found, expected):
@@ -217,7 +217,7 @@ def close(found, expected):
 def test_worlds_are_solved_each_on_its_own():
     _, (one, two), both = two_worlds()
     assert both.submaps == [1, 4]
-    solution, first, second = solve(both), solve(one), solve(two)
+    solution, first, second = solve_graph(both), solve_graph(one), solve_graph(two)
     # Frames in between are refined in one batch: on some processors that moves their last digits.
     close(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
     keyframes = both.is_keyframe
@@ -251,7 +251,7 @@ def test_rows_of_worlds_may_be_mixed():
         frame_index=place[both.frame_index[rows]],
         **{name: getattr(both, name)[rows] for name in ("point_index", "pixels", "weights")},
     )
-    solution, expected = solve(shuffled), solve(both)
+    solution, expected = solve_graph(shuffled), solve_graph(both)
     assert torch.allclose(solution.T_cw, expected.T_cw[order], atol=1e-9)
     assert torch.allclose(solution.points_w, expected.points_w, atol=1e-8)
 
@@ -262,7 +262,7 @@ def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
     def gradients(graph, loss):
         pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
         moved = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
-        loss(solve(moved, **CONVERGED).T_cw).backward()
+        loss(solve_graph(moved, **CONVERGED).T_cw).backward()
         return pixels.grad, params.grad
 
     pixels, params = gradients(both, lambda T_cw: ate(T_cw[:10], truth_1) + ate(T_cw[10:], truth_2))
@@ -277,18 +277,18 @@ def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
 def test_worlds_that_cannot_be_solved_are_refused():
     _, _, both = two_worlds()
     with pytest.raises(ValueError, match="free camera"):
-        solve(both, free_camera=True)
+        solve_graph(both, free_camera=True)
     with pytest.raises(ValueError, match="no keyframe"):
-        solve(replace(both, is_keyframe=both.is_keyframe & (both.submap == 1)))
+        solve_graph(replace(both, is_keyframe=both.is_keyframe & (both.submap == 1)))
     shared = both.point_index.clone()
     shared[both.frame_index == 10] = 0
-    with pytest.raises(ValueError, match="seen in two worlds"):
-        solve(replace(both, point_index=shared))
+    with pytest.raises(ValueError, match="seen in two submaps"):
+        solve_graph(replace(both, point_index=shared))
 
 
 def test_joined_run_graphs_keep_their_names():
     _, graph = simulated()
-    both = join(
+    both = concatenate_graphs(
         [run_graph(graph), replace(run_graph(graph, start=100), submap=torch.ones(10, dtype=torch.int64))]
     )
     assert type(both) is RunGraph

@@ -27,7 +27,7 @@ from torchslam.optim import (
     pose_graph_optimize,
     refine_pose,
 )
-from torchslam.optim.run_graph import solve
+from torchslam.optim.run_graph import solve_graph
 
 Case = tuple[Callable[..., Any], tuple[Tensor, ...]]
 
@@ -140,7 +140,7 @@ def estimator_cases() -> dict[str, Case]:
         "squared_reprojection_errors": (
             with_camera(geometry.squared_reprojection_errors), (points_c, pixels, params)
         ),
-        "fits": (geometry.fits, (normal(9).square(), normal(9, seed=1))),
+        "passes_gate": (geometry.passes_gate, (normal(9).square(), normal(9, seed=1))),
         "innovation_covariances": (geometry.innovation_covariances, (J, spd(6), torch.ones_like(J[:, 0, 0]))),
         "mahalanobis_squared": (geometry.mahalanobis_squared, (normal(2, 3), spd(3))),
         "umeyama": (geometry.umeyama, (normal(9, 3), normal(9, 3, seed=1))),
@@ -181,9 +181,9 @@ def solver_cases() -> dict[str, Case]:
             BundleProblem(T_cw, points, graph.frame_index, graph.point_index, pixels, camera)
         )
 
-    def solve_graph(pixels: Tensor, params: Tensor) -> Any:
+    def solve(pixels: Tensor, params: Tensor) -> Any:
         camera = replace(graph.camera, params=params)
-        return solve(replace(cast(graph, pixels), pixels=pixels, camera=camera))
+        return solve_graph(replace(cast(graph, pixels), pixels=pixels, camera=camera))
 
     def align(start: Tensor, points: Tensor, targets: Tensor) -> Any:
         def residual(T: Tensor, points: Tensor, targets: Tensor) -> Tensor:
@@ -195,7 +195,7 @@ def solver_cases() -> dict[str, Case]:
         "minimize": (align, (start, points_w, points_w + 0.1 * normal(*points_w.shape, seed=8))),
         "refine_pose": (refine, (start, points_w, pixels, params, spd(6)[:1])),
         "bundle_adjust": (bundle, (graph.T_cw, graph.points_w, graph.pixels, graph.camera.params)),
-        "solve": (solve_graph, (graph.pixels, graph.camera.params)),
+        "solve_graph": (solve, (graph.pixels, graph.camera.params)),
         "pose_graph_optimize": (
             lambda S: pose_graph_optimize(replace(cast(pose_graph, S), S_ji=S)), (pose_graph.S_ji,)
         ),
@@ -264,7 +264,9 @@ def test_autocast_changes_no_bit(name: str) -> None:
         assert torch.equal(found.nan_to_num(), expected.nan_to_num())
 
 
-@pytest.mark.parametrize("name", ["refine_pose", "bundle_adjust", "solve", "pose_graph_optimize", "minimize"])
+@pytest.mark.parametrize(
+    "name", ["refine_pose", "bundle_adjust", "solve_graph", "pose_graph_optimize", "minimize"]
+)
 def test_autocast_does_not_reach_the_backward_pass_of_a_minimum(name: str) -> None:
     function, inputs = CASES[name]
     gradients = []

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
-from torchslam import SLAM, ClipSLAM, Features, Run, evaluate, load_config, solve
+from torchslam import SLAM, ClipSLAM, Features, Run, evaluate, load_config, solve_graph
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.evaluation import ate
@@ -30,7 +30,7 @@ CONFIG = load_config(
         "simulated.points_per_view=150",
         "simulated.noise_px=0.3",
         "simulated.with_scales=true",
-        "bundle_adjustment.delay_frames=0",  # young or not, a world grows alike
+        "bundle_adjustment.delay_frames=0",  # young or not, a submap grows alike
     ],
 )
 WALK = Walk(arc(30)[:16])
@@ -77,7 +77,7 @@ def test_a_run_carries_what_is_said(told: tuple[SLAM, Run, Say]) -> None:
     if say is by_matrix:
         wanted = wanted[:, None, None] * torch.eye(2, dtype=torch.float64)
     torch.testing.assert_close(graph.weights[of_keyframes], wanted)
-    assert solve(graph).success.all()
+    assert solve_graph(graph).success.all()
 
 
 def test_a_number_is_the_matrix_that_it_stands_for(told: tuple[SLAM, Run, Say]) -> None:

@@ -12,15 +12,26 @@ import torch
 
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, there_and_elsewhere, turn
-from torchslam import SLAM, Config, Frame, Run, State, StepResult, evaluate, load_config, open_sequence, solve
+from torchslam import (
+    SLAM,
+    Config,
+    Frame,
+    Run,
+    State,
+    StepResult,
+    evaluate,
+    load_config,
+    open_sequence,
+    solve_graph,
+)
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import KeypointNoise, se3_inverse, se3_log, transform
+from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.mapping.async_bundle import AsyncBundleAdjustment
-from torchslam.mapping.map_initialization import MapInitializer
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment
+from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.front_end import Simulated
 from torchslam.tracking.localizer import Localizer
 from torchslam.types import FrameFeatures, Reason, TwoViewMap
@@ -71,7 +82,7 @@ def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, mess
     run = run_walk(Walk(poses), "simulated.noise_px=0.3", "simulated.depth_near=2", "simulated.depth_far=6")
     assert run.map.num_keyframes == 0
     assert len(run.trajectory) == 0
-    assert "no map was initialised in 20 frames" in run.failure
+    assert "no map was initialized in 20 frames" in run.failure
     assert re.search(message, run.failure)
 
 
@@ -107,8 +118,8 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     assert run.results[40].reason == Reason.FOUND_AGAIN
     assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
     assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
-    assert len(run.worlds) == 1
-    assert {r.world for r in run.results if r.T_cw is not None} == {0}
+    assert len(run.submaps) == 1
+    assert {r.submap for r in run.results if r.T_cw is not None} == {0}
     assert len(run.trajectory) == 55
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
@@ -123,7 +134,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
     run = slam.run(walk)
     assert [r.state for r in run.results[-2:]] == [State.UNCERTAIN] * 2
-    assert run.history.frames["frame_index"][-2:].tolist() == [40, 41]
+    assert run.posed_frames.frames["frame_index"][-2:].tolist() == [40, 41]
     assert len(run.trajectory) == 37
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
     assert torch.equal(run.map.positions_w, without.map.positions_w)  # nothing was built on them
@@ -132,7 +143,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     states = [slam.step(whole[index]).state for index in range(42, 46)]
     assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
     assert states[-1] is State.TRACKING
-    frames = slam.history.frames["frame_index"]
+    frames = slam.posed_frames.frames["frame_index"]
     assert len(torch.unique(frames)) == len(frames) == 41
 
 
@@ -155,7 +166,7 @@ def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
     assert run.results[28].reason == Reason.FOUND_AGAIN
     assert len(run.trajectory) == 25
     assert int(run.map.keyframes["frame_index"].max()) < 25
-    assert int(run.history.frames["frame_index"].max()) < 25
+    assert int(run.posed_frames.frames["frame_index"].max()) < 25
 
 
 @pytest.mark.parametrize(("least", "believed"), [(0.4, True), (0.6, False)])
@@ -167,7 +178,7 @@ def test_a_start_must_explain_the_frames_since_its_reference(
     monkeypatch.setattr(
         MapInitializer,
         "_explains",
-        lambda founder, world, view: explains(founder, world, view) and view.index == 0,
+        lambda founder, submap, view: explains(founder, submap, view) and view.index == 0,
     )
     walk = Walk(arc(40)[[0, 3]])
     run = run_walk(
@@ -176,7 +187,7 @@ def test_a_start_must_explain_the_frames_since_its_reference(
         "simulated.depth_far=25",
         f"initialization.min_explained_ratio={least}",
     )
-    assert (len(run.worlds) == 1) is believed
+    assert (len(run.submaps) == 1) is believed
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
 
 
@@ -187,26 +198,28 @@ def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
     """No support is enough here: whatever start the first and the last frame make is a rival."""
     few = ("initialization.min_matches=30", "initialization.min_points=20")
     walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
-    monkeypatch.setattr("torchslam.tracking.provisional_map.LEAST_SUPPORT", 2.0)
-    found, founded = MapInitializer.found, []
+    monkeypatch.setattr("torchslam.tracking.provisional_map.MIN_SUPPORT_RATIO", 2.0)
+    found, founded = MapInitializer.build, []
 
-    def counted(founder: MapInitializer, world: Submap, start: TwoViewMap, views: list[FrameFeatures]) -> str:
+    def counted(
+        founder: MapInitializer, submap: Submap, start: TwoViewMap, views: list[FrameFeatures]
+    ) -> str:
         founded.append(views)
-        return found(founder, world, start, views) if explained or len(founded) == 1 else "it does not"
+        return found(founder, submap, start, views) if explained or len(founded) == 1 else "it does not"
 
-    monkeypatch.setattr(MapInitializer, "found", counted)
+    monkeypatch.setattr(MapInitializer, "build", counted)
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *few]))
     run = slam.run(walk)
     anew = [r for r in run.results if r.reason == Reason.STARTED_ANEW]
     assert len(founded) > 1
     assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
     assert len(run.trajectory) == 30
-    assert len(run.worlds) == 1
-    assert run.worlds[0].number == len(anew)
+    assert len(run.submaps) == 1
+    assert run.submaps[0].number == len(anew)
     if explained:
         assert len(anew) == len(founded) - 1
         assert all(r.is_keyframe and r.state is State.TRACKING for r in anew)
-        assert len(slam.memory.places) == run.map.num_keyframes
+        assert len(slam.loop_closer.keyframe_database) == run.map.num_keyframes
         assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-4
     else:
         assert not anew
@@ -231,11 +244,11 @@ JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.nois
 def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
     walk = Walk(there_and_elsewhere())
     run = run_walk(walk, *JOINED)
-    worlds = [r.world for r in run.results if r.T_cw is not None]
-    assert set(worlds) == {0, 1}
-    assert worlds[0] == worlds[-1] == 0
-    assert len(run.worlds) == 1
-    assert sum(len(part) for part in run.online_parts) == len(worlds) > len(run.online)
+    submaps = [r.submap for r in run.results if r.T_cw is not None]
+    assert set(submaps) == {0, 1}
+    assert submaps[0] == submaps[-1] == 0
+    assert len(run.submaps) == 1
+    assert sum(len(part) for part in run.online_parts) == len(submaps) > len(run.online)
     assert ate_apart(run.online_parts, walk.groundtruth) < 0.015  # keyframes are adjusted two frames later
     assert len(run.trajectory) == len(walk)
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
@@ -244,9 +257,9 @@ def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
 def test_worlds_that_do_not_meet_are_kept_beside_each_other() -> None:
     walk = Walk(there_and_elsewhere()[4:33])
     run = run_walk(walk, *JOINED)
-    assert [len(world.history) for world in run.worlds] == [12, 17]
-    assert [world.number for world in run.worlds] == [0, 1]
-    assert len(run.trajectory) == 17  # of the world with most frames
+    assert [len(submap.posed_frames) for submap in run.submaps] == [12, 17]
+    assert [submap.number for submap in run.submaps] == [0, 1]
+    assert len(run.trajectory) == 17  # of the submap with most frames
 
 
 class Damaged(Walk):
@@ -301,10 +314,10 @@ def test_every_frame_looks_at_a_bounded_part_of_the_map() -> None:
     )
     slam.run(walk)
     assert slam.map.num_keyframes > 10
-    assert slam.world is not None
-    track = slam.world.track
-    assert len(track.local_keyframes) <= Config().tracking.local_keyframes + 1
-    assert len(track.local_points) < 0.5 * slam.map.num_points
+    assert slam.submap is not None
+    tracking = slam.submap.tracking
+    assert len(tracking.local_keyframes) <= Config().tracking.local_keyframes + 1
+    assert len(tracking.local_points) < 0.5 * slam.map.num_points
 
 
 def test_a_rendered_room_is_tracked() -> None:
@@ -338,7 +351,7 @@ def test_the_trajectory_of_a_run_is_the_minimiser_of_its_graph() -> None:
     graph = run.graph
     assert int(graph.is_keyframe.sum()) == run.map.num_keyframes
     assert len(graph.timestamps) == 20
-    solution = solve(graph, backward="detached")
+    solution = solve_graph(graph, backward="detached")
     assert torch.allclose(solution.trajectory.timestamps, run.trajectory.timestamps)
     assert torch.allclose(solution.trajectory.T_wc, run.trajectory.T_wc, atol=1e-5)
 
@@ -350,7 +363,7 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
     def error(fx: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         params = torch.cat([fx[None], graph.camera.params[1:]])
         moved = replace(graph, camera=graph.camera.with_params(params), pixels=pixels)
-        solution = solve(moved, tolerance=1e-14, iterations=60)
+        solution = solve_graph(moved, tolerance=1e-14, iterations=60)
         return ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids])
 
     fx = graph.camera.params[0].clone().requires_grad_()
@@ -394,7 +407,7 @@ def test_covariances_tell_the_errors_of_the_map() -> None:
 
 
 def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions (n, 3) in the world of the walk, and ids (n,) of the map's points, by their descriptors."""
+    """Positions (n, 3) in the submap of the walk, and ids (n,) of the map's points, by their descriptors."""
     settings = slam.config.simulated
     scene = SimulatedFeatures(
         true_T_cw(walk),
@@ -439,10 +452,10 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
 
 
 def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
-    """When adjustments were asked for and taken over, of worlds that are no longer young."""
+    """When adjustments were asked for and taken over, of submaps that are no longer young."""
     events: list[tuple[str, int]] = []
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides]))
-    ask, take_over = slam.mapper.adjusting.ask, slam.mapper.adjusting.take_over
+    ask, take_over = slam.mapper.adjustment.request, slam.mapper.adjustment.apply
 
     def asking(slam_map: Map, keyframe: int, due: int | None) -> None:
         events.append(("asked", int(slam_map.keyframes["frame_index"][keyframe])))
@@ -453,17 +466,17 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
         events.append(("taken", slam.last_frame[0]))
         take_over(slam_map)
 
-    monkeypatch.setattr(slam.mapper.adjusting, "ask", asking)
-    monkeypatch.setattr(slam.mapper.adjusting, "take_over", taking_over)
-    old: list[int] = []  # frames in which the world is no longer young
+    monkeypatch.setattr(slam.mapper.adjustment, "request", asking)
+    monkeypatch.setattr(slam.mapper.adjustment, "apply", taking_over)
+    old: list[int] = []  # frames in which the submap is no longer young
 
     def after(result: StepResult) -> None:
-        assert not (slam.world is None and slam.mapper.adjusting)  # nothing is left behind
-        if slam.world is not None and slam.youth is None:
+        assert not (slam.submap is None and slam.mapper.adjustment.is_pending)  # nothing is left behind
+        if slam.submap is not None and slam.provisional_map is None:
             old.append(result.index)
 
     slam.run(walk, after)
-    assert not slam.mapper.adjusting
+    assert not slam.mapper.adjustment.is_pending
     return [event for event in events if event[1] in old[1:]]
 
 
@@ -494,14 +507,14 @@ def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
-    begin = AsyncBundleAdjustment.begin
+    begin = AsyncBundleAdjustment.start
 
     def beginning(self: AsyncBundleAdjustment) -> None:
-        if self and self._begun is None:
+        if self and self._running is None:
             begun.append(self.due)
         begin(self)
 
-    monkeypatch.setattr(AsyncBundleAdjustment, "begin", beginning)
+    monkeypatch.setattr(AsyncBundleAdjustment, "start", beginning)
     for delay in (0, 2):
         begun.clear()
         runs.append(

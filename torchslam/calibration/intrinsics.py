@@ -21,51 +21,62 @@ from torchslam.geometry import Camera
 from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.run_graph import ObservationGraph
 
-# A bend of the lens is believed where it lowers the cost by this share; a smaller one trades places with the focal
-# length and what else is wrong with a map.
+# A distortion coefficient must lower the cost by this ratio; a smaller gain may also come from an error of the focal
+# length or the map.
 MIN_COST_DECREASE = 0.02
-# Relative standard errors of what is not calibrated: centres of sensors lie this far, in widths, off their axes; k1 of
-# a lens that shows no bend.
+# Prior standard deviations of what is not calibrated: the principal point from the image center, in widths, and k1
+# of a lens without visible distortion.
 PRINCIPAL_POINT_STD, K1_STD = 0.01, 0.05
-NUM_PARTS, PART_KEYFRAMES = 4, 6  # of the way, and at least so many keyframes in each
-UNCHECKED_FACTOR = 2.0  # how much too small a formal error is where the way is too short to be parted
+NUM_PARTS, PART_KEYFRAMES = 4, 6  # parts of the trajectory, and minimum keyframes of each
+UNCHECKED_FACTOR = 2.0  # on the formal error of a trajectory too short to be split
 BOUNDS = 0.3, 5.0  # of the focal length in widths
-MAX_DETERMINED_STD = 0.1  # relative error from which on a focal length counts as unknown
+MAX_DETERMINED_STD = 0.1  # relative error above which a focal length counts as unknown
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """The camera under which a graph costs least.
+class IntrinsicsEstimate:
+    """The camera that minimizes the cost of a graph.
 
-    num_radial:  how many coefficients of the distortion were fitted beside the focal length
-    std:         relative standard error of the focal length, with all that is not certain
-    given_rest:  the same if principal point and distortion are as they are said to be
-    k_std:       standard errors of the coefficients that were fitted
-    cost, cost_before: the least ones per observation, with this camera and with the one of the run
+    Attributes:
+        camera: With the estimated parameters.
+        num_radial: Number of estimated distortion coefficients.
+        focal_std: Relative standard error of the focal length, all uncertainties included.
+        conditional_focal_std: The same if principal point and distortion are given exactly.
+        k_std: Standard errors of the estimated distortion coefficients.
+        cost: Minimal cost per observation with this camera.
+        initial_cost: Minimal cost per observation with the camera of the run.
     """
 
     camera: Camera
     num_radial: int
-    std: float
-    given_rest: float
+    focal_std: float
+    conditional_focal_std: float
     k_std: tuple[float, ...]
     cost: float
-    cost_before: float
+    initial_cost: float
 
     @property
     def is_determined(self) -> bool:
-        """Whether the motion says what the focal length is."""
+        """Whether the motion determines the focal length."""
         low, high = BOUNDS
-        return self.std < MAX_DETERMINED_STD and low < float(self.camera.focal) / self.camera.width < high
+        return (
+            self.focal_std < MAX_DETERMINED_STD and low < float(self.camera.focal) / self.camera.width < high
+        )
 
 
 def estimate_intrinsics(
     graph: ObservationGraph, start: Camera | None = None, radial: int = 0, principal_point: bool = False
-) -> Refinement:
-    """Fit focal length and, where the residuals ask for them, up to `radial` coefficients to a run's graph.
+) -> IntrinsicsEstimate:
+    """Fit the focal length, and up to `radial` distortion coefficients that lower the cost enough, to a run's graph.
 
-    start:  whose distortion is kept where none is fitted, the graph's camera if None
-    centre: its principal point is a guess, too: the images move it as far as they are surer than the guess
+    Args:
+        graph: Of a run.
+        start: Camera whose distortion is kept where none is fitted; the graph's camera if None.
+        radial: Maximum number of distortion coefficients.
+        principal_point: Whether the principal point of `start` is a guess, to be combined with that of the images.
+
+    Returns:
+        The estimate with its standard errors.
     """
     camera = with_radial_terms(graph.camera)
     base = camera if start is None else with_radial_terms(start)
@@ -79,17 +90,21 @@ def estimate_intrinsics(
     best = fits[num_radial]
     count = max(1, int(best.moved_points[problem.point_index].sum()))
     at = replace(problem, T_cw=best.T_cw, points_w=best.points_w, camera=best.camera)
-    doubt = _disagreement(at, _fitted(num_radial))
-    if int(graph.is_keyframe.sum()) < 2 * PART_KEYFRAMES:  # frames between the same keyframes err together
-        doubt = max(doubt, UNCHECKED_FACTOR)
-    bend = float((fits[1].camera.params - base.params)[4]) if radial and not num_radial else None
+    inflation = _disagreement(at, _fitted(num_radial))
+    if (
+        int(graph.is_keyframe.sum()) < 2 * PART_KEYFRAMES
+    ):  # frames between the same keyframes have correlated errors
+        inflation = max(inflation, UNCHECKED_FACTOR)
+    rejected_k1 = float((fits[1].camera.params - base.params)[4]) if radial and not num_radial else None
     guess = base.params[2:4] if principal_point else None
-    params, stds, given_rest = _propagate_held_parameters(at, _fitted(num_radial), doubt, bend, guess)
-    return Refinement(
+    params, stds, conditional_focal_std = _propagate_held_parameters(
+        at, _fitted(num_radial), inflation, rejected_k1, guess
+    )
+    return IntrinsicsEstimate(
         simplify_model(best.camera.with_params(params)),
         num_radial,
         stds[0],
-        given_rest,
+        conditional_focal_std,
         tuple(stds[1:]),
         costs[num_radial] / count,
         float(adjust_with_camera(problem, []).cost) / count,
@@ -101,21 +116,22 @@ def _fitted(num_radial: int) -> list[int]:
 
 
 def _propagate_held_parameters(
-    at: BundleProblem, fitted: list[int], doubt: float, bend: float | None, guess: Tensor | None
+    at: BundleProblem, fitted: list[int], inflation: float, rejected_k1: float | None, guess: Tensor | None
 ) -> tuple[Tensor, list[float], float]:
-    """The parameters (K,) once the centre has moved, their errors, and that of the focal length given the rest.
+    """The parameters (K,), their standard errors, and that of the focal length given the held parameters.
 
-    What was fitted follows what was held in proportion; the centre is the mean of the guess and of what the images say
-    of it, weighted by how sure they are.
+    Fitted parameters depend linearly on held ones; the principal point is the mean of its guess and its estimate,
+    weighted by their information.
 
-    at:    the problem at its solution; doubt: factor on the formal errors
-    bend:  k1 by a fit that was not believed, where there was one
-    guess: (2,) the principal point before the images were asked; None where it is given
+    at:          the problem at its solution
+    inflation:   factor on the formal errors
+    rejected_k1: k1 of a fit that did not lower the cost enough, if any
+    guess:       (2,) prior of the principal point; None if it is given exactly
     """
-    n, k, principal_point = len(fitted), int(bend is not None), [CX, CY] if guess is not None else []
+    n, k, principal_point = len(fitted), int(rejected_k1 is not None), [CX, CY] if guess is not None else []
     which = fitted + [K1] * k + principal_point
     free = adjust_with_camera(at, which)
-    covariance = doubt**2 * free.covariance().camera
+    covariance = inflation**2 * free.covariance().camera
     if not bool((covariance.diagonal() > 0).all()):
         return at.camera.params, [math.inf] * n, math.inf
     information = torch.linalg.inv(covariance)
@@ -123,8 +139,8 @@ def _propagate_held_parameters(
     follows = -own @ information[:n, n:]
     held = torch.zeros_like(information[n:, n:])
     move = at.camera.params.new_zeros(len(which))
-    if bend is not None:
-        held[0, 0] = min(K1_STD, math.hypot(bend, float(covariance[n, n].sqrt()))) ** 2
+    if rejected_k1 is not None:
+        held[0, 0] = min(K1_STD, math.hypot(rejected_k1, float(covariance[n, n].sqrt()))) ** 2
     if guess is not None:
         said = torch.linalg.inv(covariance[n + k :, n + k :])
         prior = torch.eye(2, dtype=said.dtype, device=said.device) / PRINCIPAL_POINT_STD**2
@@ -137,7 +153,7 @@ def _propagate_held_parameters(
 
 
 def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
-    """By how much parts of the way disagree on the focal length, in units of their formal errors; one at least."""
+    """The disagreement of parts of the trajectory on the focal length, in formal standard errors; at least one."""
     keyframes = len(at.T_cw)
     count = min(NUM_PARTS, keyframes // PART_KEYFRAMES)
     if count < 2:
@@ -152,16 +168,16 @@ def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
     return max(1.0, math.sqrt(sum(squares) / (count - 1)))
 
 
-KERNEL_SCALE = 2.45  # as in `solve`: ends the quadratic part at 95 % of a Gaussian
+KERNEL_SCALE = 2.45  # as in `solve_graph`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6
-ITERATIONS = 400  # where all depths have to move with a focal length that is far off, 200 are needed
-MIN_FRAMES = 24  # frames that a camera is refined on, if there are
-# What is looked at of a camera, in this order: the logarithm of the focal length, k1, k2, and the principal point.
+ITERATIONS = 400  # 200 are needed if all depths change with a focal length that is far off
+MIN_FRAMES = 24  # frames of the problem, if available
+# Parameters of a camera that may be free: the logarithm of the focal length, k1, k2, and the principal point.
 FOCAL, K1, K2, CX, CY = range(5)
 
 
 def problem_of(graph: ObservationGraph) -> BundleProblem:
-    """The frames of `frames_of` and the points that they see."""
+    """The bundle adjustment of the frames of `frames_of` and the points that they observe."""
     frames = frames_of(graph)
     slots = torch.full_like(graph.submap, -1)
     slots[frames] = torch.arange(len(frames), device=slots.device)
@@ -179,7 +195,7 @@ def problem_of(graph: ObservationGraph) -> BundleProblem:
 
 
 def subproblem(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
-    """The frames from `start` to before `stop` and the points that they see."""
+    """The frames from `start` to before `stop` and the points that they observe."""
     rows = ((problem.frame_index >= start) & (problem.frame_index < stop)).nonzero().squeeze(-1)
     points, point_index = torch.unique(problem.point_index[rows], return_inverse=True)
     assert problem.weights is not None
@@ -195,7 +211,7 @@ def subproblem(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
 
 
 def frames_of(graph: ObservationGraph) -> Tensor:
-    """(n,) the keyframes of the graph's largest world, by time; where they are few, frames in between with them."""
+    """(n,) the keyframes of the graph's largest world, by time, with other frames if they are few."""
     submap = torch.bincount(graph.submap).argmax()
     frames = (graph.submap == submap).nonzero().squeeze(-1)
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
@@ -209,7 +225,7 @@ def frames_of(graph: ObservationGraph) -> Tensor:
 
 
 def directions(camera: Camera, which: list[int]) -> Tensor:
-    """(K, n) how the camera's parameters change with the log of the focal length, k1, k2, and the centre in widths."""
+    """Derivatives (K, n) of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
     columns = camera.params.new_zeros(len(camera.params), 5)
     columns[:2, FOCAL] = camera.params[:2]
     columns[[2, 3], [CX, CY]] = float(camera.width)
@@ -221,7 +237,7 @@ def directions(camera: Camera, which: list[int]) -> Tensor:
 def adjust_with_camera(
     problem: BundleProblem, which: list[int], iterations: int = ITERATIONS
 ) -> BundleSolution:
-    """The least robust cost over poses, points and those parameters of the camera."""
+    """Minimize the robust cost over poses, points and the selected parameters of the camera."""
     return bundle_adjust(
         problem,
         "huber",
@@ -234,14 +250,14 @@ def adjust_with_camera(
 
 
 def with_radial_terms(camera: Camera) -> Camera:
-    """The same camera in a model that can bend the image."""
+    """The same camera in a model with distortion."""
     if camera.model != "pinhole":
         return camera
     return Camera("radial_tangential", torch.cat([camera.params, camera.params.new_zeros(5)]), camera.size)
 
 
 def simplify_model(camera: Camera) -> Camera:
-    """The same camera, as a pinhole where it does not bend the image."""
+    """The same camera, as a pinhole if it has no distortion."""
     if camera.model != "radial_tangential" or bool(camera.params[4:].any()):
         return camera
     return Camera("pinhole", camera.params[:4], camera.size)

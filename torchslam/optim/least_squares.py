@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from math import prod
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -13,12 +14,106 @@ from torch.func import grad, jvp, vmap
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.optim.core import levenberg_marquardt as levenberg
-from torchslam.optim.core.batching import Tensors, chosen, taken
-from torchslam.optim.core.implicit import Backward, Ndims, check_backward, minimum
+from torchslam.optim.core import tangent
+from torchslam.optim.core.batching import Tensors, index_tree, where_tree
+from torchslam.optim.core.implicit import Backward, Ndims, check_backward, implicit_minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence
 from torchslam.optim.core.linear import DefiniteFactor, factorize
-from torchslam.optim.core.manifold import Manifold, Product
 from torchslam.optim.core.residuals import Linearization, flat_along
+
+Manifold = Literal["euclidean", "se3", "sim3"]
+"""What an unknown moves on.
+
+"euclidean": any tensor (B, ...), as a vector
+"se3":       rigid transforms (B, ..., 4, 4), by left perturbations (translation, rotation)
+"sim3":      similarities (B, ..., 4, 4), by left perturbations (translation, rotation, log scale)
+"""
+
+
+class _Moves(NamedTuple):
+    """For steps (..., D) of matrices (..., 4, 4): as the functions of `tangent`."""
+
+    dims: int
+    retract: Callable[[Tensor, Tensor], Tensor]
+    push: Callable[[Tensor, Tensor], Tensor]
+    pull_back: Callable[[Tensor, Tensor], Tensor]
+
+
+_MATRICES = {
+    "se3": _Moves(6, tangent.retract, tangent.push, tangent.pull_back),
+    "sim3": _Moves(7, tangent.retract_sim3, tangent.push_sim3, tangent.pull_back_sim3),
+}
+
+
+@dataclass(frozen=True)
+class Product:
+    """The manifold of several unknowns, each of a shape without the batch; steps are (B, n), one after the other."""
+
+    manifolds: tuple[Manifold, ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    @staticmethod
+    def of(manifolds: Sequence[Manifold], unknowns: Sequence[Tensor]) -> Product:
+        """Raises ValueError for names and shapes that do not fit."""
+        if len(manifolds) != len(unknowns):
+            raise ValueError(f"there are {len(unknowns)} unknowns, but {len(manifolds)} manifolds")
+        for name, unknown in zip(manifolds, unknowns, strict=True):
+            if name not in get_args(Manifold):
+                raise ValueError(f"unknown manifold {name!r}; known are {', '.join(get_args(Manifold))}")
+            if name in _MATRICES and (unknown.ndim < 3 or unknown.shape[-2:] != (4, 4)):
+                raise ValueError(f"an unknown on {name} must be (B, ..., 4, 4), not {tuple(unknown.shape)}")
+        return Product(tuple(manifolds), tuple(tuple(unknown.shape[1:]) for unknown in unknowns))
+
+    @property
+    def step_shapes(self) -> list[tuple[int, ...]]:
+        """Of a step of each unknown, without the batch."""
+        return [
+            (*shape[:-2], _MATRICES[name].dims) if name in _MATRICES else shape
+            for name, shape in zip(self.manifolds, self.shapes, strict=True)
+        ]
+
+    def sanitized(self, unknowns: Tensors) -> tuple[Tensors, Tensor]:
+        """The unknowns, zero or the identity in elements that are not finite, and which are, (B,)."""
+        finite = torch.stack([torch.isfinite(x).flatten(1).all(-1) for x in unknowns]).all(0)
+        eye = torch.eye(4, dtype=unknowns[0].dtype, device=unknowns[0].device)
+        return tuple(
+            torch.where(finite.view(-1, *(1,) * (x.ndim - 1)), x, eye if name in _MATRICES else 0.0)
+            for name, x in zip(self.manifolds, unknowns, strict=True)
+        ), finite
+
+    def basis(self, unknowns: Tensors) -> Tensor:
+        """(n, B, n) unit steps, each for the whole batch."""
+        size = sum(prod(shape) for shape in self.step_shapes)
+        eye = torch.eye(size, dtype=unknowns[0].dtype, device=unknowns[0].device)
+        return eye[:, None].expand(size, len(unknowns[0]), size)
+
+    def retract(self, unknowns: Tensors, step: Tensor) -> Tensors:
+        """The unknowns moved along a step (B, n)."""
+        return tuple(
+            _MATRICES[name].retract(x, part) if name in _MATRICES else x + part
+            for name, x, part in zip(self.manifolds, unknowns, self._parts(step), strict=True)
+        )
+
+    def push(self, unknowns: Tensors, step: Tensor) -> Tensors:
+        """The change of the unknowns, to first order, along a step (B, n)."""
+        return tuple(
+            _MATRICES[name].push(x, part) if name in _MATRICES else part
+            for name, x, part in zip(self.manifolds, unknowns, self._parts(step), strict=True)
+        )
+
+    def pull_back(self, unknowns: Tensors, gradient: Tensors) -> Tensor:
+        """(B, n) the gradient in the step of a loss with this gradient in the unknowns."""
+        parts = [
+            _MATRICES[name].pull_back(x, part) if name in _MATRICES else part
+            for name, x, part in zip(self.manifolds, unknowns, gradient, strict=True)
+        ]
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+    def _parts(self, step: Tensor) -> list[Tensor]:
+        shapes = self.step_shapes
+        parts = step.split([prod(shape) for shape in shapes], dim=-1)
+        return [part.reshape(len(step), *shape) for part, shape in zip(parts, shapes, strict=True)]
+
 
 Residual = Callable[..., Tensor]
 """residual(*unknowns, *inputs) -> (B, N) or (B, N, D), each element from its own rows alone."""
@@ -28,11 +123,12 @@ Residual = Callable[..., Tensor]
 class LeastSquaresSolution:
     """The minima of a batch.
 
-    unknowns:    as they were given, in the order in which they were given
-    cost:        (B,) half the sum of robustified squared whitened residuals, detached
-    success:     (B,) bool, the start and its residuals are finite, and all that moves is determined. If not, the
-                 estimate is the best that was found, but it has no gradient.
-    convergence: per element
+    Attributes:
+        unknowns: the estimates, in the order and shapes of the start.
+        cost: (B,) half the sum of robustified squared whitened residuals, detached.
+        success: (B,) bool, the start and its residuals are finite, and all unknowns are determined. If False, the
+            estimate is the best one found, but it has no gradient.
+        convergence: iterations and convergence per element.
     """
 
     unknowns: Tensors
@@ -55,19 +151,7 @@ def minimize(
     iterations: int = 50,
     tolerance: float = 1e-10,
 ) -> LeastSquaresSolution:
-    """Minimise half the sum of rho(weight * |residual|^2) over unknowns by Levenberg-Marquardt, many problems at once.
-
-    residual:  function of the unknowns, then the inputs, to (B, N) or, where D numbers are robustified as one,
-               (B, N, D). It is called with any part of the batch. Its derivatives come from torch, which must be able
-               to take them forward and twice: `grid_sample` for instance can not, bilinear sums of gathered pixels can.
-    start:     one or several unknowns, all leading with B, together of few dimensions: their Hessian is dense
-    inputs:    all tensors that differ between elements or want a gradient, leading with B
-    manifolds: what each unknown moves on, see `Manifold`
-    weights:   (B, N) inverse variances, one if None
-    mask:      (B, N) bool, residuals that count, all if None; the others must be finite, with finite derivatives
-    scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
-    backward:  how gradients reach inputs, weights and scale, see `implicit.Backward`
-    tolerance: stop where a step promises to lower the cost by less than this share of it
+    """Minimize half the sum of rho(weight * |residual|^2) over unknowns by Levenberg-Marquardt, many problems at once.
 
     Dense depth to dense depth, for instance, is a pose per element that depths and intrinsics have gradients through:
 
@@ -78,8 +162,25 @@ def minimize(
         solution = minimize(residual, T_21, (depth_1, depth_2, K), "se3", kernel="huber", scale=0.02)
 
     The implicit gradient is zero where the exact Hessian is not positive definite, that is, not at a strict minimum.
-    Raises ValueError for shapes and dtypes that do not fit, for unknown names, and for a residual that has gradients to
-    other tensors than its inputs, to which none would come.
+
+    Args:
+        residual: function of the unknowns, then the inputs, to (B, N) or, where D numbers are robustified as one,
+            (B, N, D). It is called with any part of the batch. PyTorch must be able to differentiate it in forward
+            mode and twice: it cannot for `grid_sample`, it can for bilinear sums of gathered pixels.
+        start: one or several unknowns, all leading with B, together of few dimensions: their Hessian is dense.
+        inputs: all tensors that differ between elements or require a gradient, leading with B.
+        manifolds: manifold of each unknown, or one for all.
+        weights: (B, N) inverse variances, one if None.
+        mask: (B, N) bool, residuals that count, all if None; the others must be finite, with finite derivatives.
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
+        backward: how gradients reach inputs, weights and scale.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
+
+    Raises:
+        ValueError: a shape or a dtype does not fit, a name is unknown, or the residual has gradients to tensors other
+            than its inputs, which would not receive any.
     """
     check_backward(backward)
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
@@ -93,7 +194,9 @@ def minimize(
         found = minimization.minimize(tensors)
     else:
         attached = backward == "implicit"
-        found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
+        found = implicit_minimum(
+            minimization, tensors if attached else [tensor.detach() for tensor in tensors]
+        )
     solution, (success, cost, steps, converged, initial_cost) = (
         found[: len(unknowns)],
         found[len(unknowns) :],
@@ -169,10 +272,10 @@ class _Problem:
     solvable: Tensor
 
     def part(self, rows: Tensor) -> _Problem:
-        data, solvable = taken((self.data, self.solvable), rows)
+        data, solvable = index_tree((self.data, self.solvable), rows)
         return _Problem(self.residual, self.product, self.kernel, data, solvable)
 
-    def evaluate(self, unknowns: Tensors, near: Tensor) -> _Model:
+    def evaluate(self, unknowns: Tensors, use_curvature: Tensor) -> _Model:
         basis = self.product.basis(unknowns)
 
         def moved(step: Tensor) -> Tensor:
@@ -183,8 +286,8 @@ class _Problem:
         J = vmap(lambda step: jvp(moved, (zero,), (step,))[1], out_dims=-1)(basis)
         lin = self._weighed(r, J)
         J = lin.J.flatten(1, 2)
-        hessian = J.mT @ _pull(lin, near[:, None]).flatten(1, 2)
-        gradient = (J.mT @ lin.force.flatten(1)[..., None]).squeeze(-1)
+        hessian = J.mT @ _pull(lin, use_curvature[:, None]).flatten(1, 2)
+        gradient = (J.mT @ lin.gradient_wrt_residual.flatten(1)[..., None]).squeeze(-1)
         return _Model(unknowns, lin.cost.sum(1), gradient, hessian)
 
     def step(self, model: _Model, damping: Tensor) -> tuple[Tensors, Tensor]:
@@ -197,7 +300,7 @@ class _Problem:
         return self.product.retract(model.unknowns, -step), decrease
 
     def select(self, accept: Tensor, new: _Model, old: _Model) -> _Model:
-        return new if accept.all() else chosen(accept, new, old)
+        return new if accept.all() else where_tree(accept, new, old)
 
     def cost(self, unknowns: Tensors) -> Tensor:
         """(B,)"""
@@ -211,7 +314,7 @@ class _Problem:
             return self._residuals(self.product.retract(unknowns, step))
 
         r, velocity = jvp(moved, (torch.zeros_like(direction),), (direction,))[:2]
-        return (self._weighed(r, velocity[..., None]).force * velocity).sum((1, 2))
+        return (self._weighed(r, velocity[..., None]).gradient_wrt_residual * velocity).sum((1, 2))
 
     def exact_factor(self, unknowns: Tensors) -> DefiniteFactor:
         """Of the exact Hessians (B, n, n)."""
@@ -235,16 +338,16 @@ class _Problem:
         return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
 
 
-def _pull(lin: Linearization, near: Tensor) -> Tensor:
-    """The Hessians of the costs in the residuals times J, (B, N, D, n); `near` as in `gauss_newton_expansion`."""
+def _pull(lin: Linearization, use_curvature: Tensor) -> Tensor:
+    """The Hessians of the costs in the residuals times J, (B, N, D, n); see `gauss_newton_expansion`."""
     residual, weight = lin.residual, lin.weight
-    bend = flat_along(weight, lin.bend, residual.square().sum(-1), near)
-    along = (residual[..., None, :] @ lin.J) * (bend[..., None] * residual)[..., None]
+    curvature_term = flat_along(weight, lin.curvature_term, residual.square().sum(-1), use_curvature)
+    along = (residual[..., None, :] @ lin.J) * (curvature_term[..., None] * residual)[..., None]
     return weight[..., None, None] * lin.J + along
 
 
 class _Minimization:
-    """`minimize` for `implicit.minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
+    """`minimize` for `implicit_minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
 
     num_vectors = 1
 
@@ -296,7 +399,7 @@ class _Minimization:
         found, inputs = (tuple(x.index_select(0, rows) for x in part) for part in (found, inputs))
         return self._problem(inputs).slope(found[: self.num_unknowns], direction[0]).sum()
 
-    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+    def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         split = self.num_unknowns
         return *self.product.retract(found[:split], direction[0]), *found[split:]
 
@@ -311,7 +414,7 @@ class _Minimization:
         problem = self._problem(inputs)
         last = problem.evaluate(tuple(tensor.detach() for tensor in unknowns), ~success)
         stepped, _ = problem.step(last, torch.zeros_like(last.cost))
-        return chosen(success, stepped, unknowns)
+        return where_tree(success, stepped, unknowns)
 
     def _problem(self, inputs: Tensors, solvable: Tensor | None = None) -> _Problem:
         counted, weights, scale, *rest = inputs[self.num_unknowns :]

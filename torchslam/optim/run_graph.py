@@ -1,8 +1,8 @@
 """What a run leaves behind, as one differentiable problem: the answer is differentiated, not the path to it.
 
-The trajectory of a finished run minimises the reprojection errors of its observation graph. However many frames
+The trajectory of a finished run minimizes the reprojection errors of its observation graph. However many frames
 and discrete choices led there, its gradient with respect to every pixel, weight and camera parameter is that of the
-minimiser: one linear solve for the keyframes and the points, one small one for each frame in between.
+minimizer: one linear solve for the keyframes and the points, one small one for each frame in between.
 """
 
 from __future__ import annotations
@@ -10,43 +10,49 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust, refine_pose
+from torchslam.optim.bundle.api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.core.implicit import Backward
 from torchslam.optim.core.levenberg_marquardt import Progress
+from torchslam.optim.pose.refinement import refine_pose
 from torchslam.types import Trajectory
 from torchslam.utils.bounded_read import check_regular
 
 _FRAMES_AT_ONCE = 64
 _MAX_BYTES = 1 << 34
+# Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
+_MAX_SIZE_RATIO = 2.0
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
-"""Of whom each column has a row - F frames, P points, O observations -, the shape of a row and the kind of numbers."""
+"""Per column: what it has a row for (F frames, P points or O observations), the shape of a row, the kind of numbers."""
 
 
 @dataclass(frozen=True)
 class ObservationGraph:
-    """Who saw what where: O observations of P points by F frames, in any order.
+    """O observations of P points by F frames, in any order.
 
-    timestamps:  (F,) float64 seconds
-    T_cw:        (F, 4, 4) world to camera, as the run left them
-    points_w:    (P, 3)
-    frame_index: (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
-    pixels:      (O, 2)
-    weights:     (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances
-    camera:      one for all frames
-    is_keyframe: (F,) bool; keyframes and points are solved together, the other frames against the points
-    submap:       (F,) int64 in which world a frame is; worlds share nothing but the camera. All in world 0 if left out
+    Attributes:
+        timestamps: (F,) float64 seconds.
+        T_cw: (F, 4, 4) world to camera, as the run left them.
+        points_w: (P, 3)
+        frame_index: (O,) int64 rows of T_cw.
+        point_index: (O,) int64 rows of points_w.
+        pixels: (O, 2)
+        weights: (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances.
+        camera: one for all frames.
+        is_keyframe: (F,) bool. Keyframes and points are solved together, the other frames against the points.
+        submap: (F,) int64 submap of each frame, 0 if omitted. Submaps share nothing but the camera.
     """
 
     timestamps: Tensor
@@ -78,13 +84,13 @@ class ObservationGraph:
 
     @property
     def submaps(self) -> list[int]:
-        """The worlds that there are, ascending."""
+        """The submaps that there are, ascending."""
         return [
             int(submap) for submap in torch.unique(self.submap)
         ]  # `tolist` fails in transforms of torch 2.5
 
     def part(self, submap: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows of the frames, the observations and the points of one world; points without observations have none."""
+        """Rows of the frames, the observations and the points of one submap; points without observations have none."""
         frames = (self.submap == submap).nonzero().squeeze(-1)
         rows = (self.submap[self.frame_index] == submap).nonzero().squeeze(-1)
         return frames, rows, torch.unique(self.point_index[rows])
@@ -101,7 +107,7 @@ class ObservationGraph:
     def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote. Raises TorchslamError where the file is something else.
 
-        A file of a graph that knows more than this class is read without the rest; one from before there were worlds
+        A file of a graph that knows more than this class is read without the rest; one from before there were submaps
         has one.
         """
         try:
@@ -162,18 +168,20 @@ Graph = TypeVar("Graph", bound=ObservationGraph)
 
 @dataclass(frozen=True)
 class GraphSolution:
-    """The minimiser of a graph, differentiable with respect to its pixels, weights and camera.
+    """The minimum of a graph, differentiable with respect to its pixels, weights and camera.
 
-    T_cw:      (F, 4, 4); points_w: (P, 3)
-    camera:    of all frames, with other parameters where it was free
-    success:   (F,) bool. A frame that its observations do not determine stays where it was, without gradient; if the
-               keyframes of a world together are not determined, none of them succeeds.
-    moved_points: (P,) bool. What too few keyframes see stayed where it was; its observations did not count.
-    converged: (F,) bool, the search for a frame's pose, and before for its world's keyframes and points, ended at a
-               minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
-    submap:     (F,) in which world a frame is; poses and points of different worlds have nothing to do with each other
-    keyframes: the bundle adjustments of keyframes and points, with their covariances, one per world in the order of
-               `ObservationGraph.submaps`; rows are those of the world's keyframes and of the points its frames see
+    Attributes:
+        T_cw: (F, 4, 4) world to camera.
+        points_w: (P, 3)
+        camera: of all frames, with refined parameters where it was free.
+        success: (F,) bool. A frame that its observations do not determine stays at its start, without gradient. If the
+            keyframes of a submap together are not determined, none of them succeeds.
+        moved_points: (P,) bool. Points that too few keyframes see stay at their start; their observations do not count.
+        converged: (F,) bool, the search for a frame's pose, and before for its submap's keyframes and points, ended at
+            a minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
+        submap: (F,) submap of each frame; different submaps share no coordinate frame.
+        keyframes: the bundle adjustment of each submap, in the order of `ObservationGraph.submaps`, with its
+            covariances; its rows are the submap's keyframes and the points that its frames see.
     """
 
     timestamps: Tensor
@@ -188,19 +196,19 @@ class GraphSolution:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Camera to world, ordered by time, differentiable; of the world with most frames."""
-        worlds, frames = torch.unique(self.submap, return_counts=True)
-        return self.trajectory_in(int(worlds[frames.argmax()]))
+        """Camera to submap, ordered by time, differentiable; of the submap with most frames."""
+        submaps, frames = torch.unique(self.submap, return_counts=True)
+        return self.trajectory_in(int(submaps[frames.argmax()]))
 
     def trajectory_in(self, submap: int) -> Trajectory:
-        """Camera to world, ordered by time, differentiable; of one world."""
+        """Camera to submap, ordered by time, differentiable; of one submap."""
         rows = (self.submap == submap).nonzero().squeeze(-1)
         order = rows[torch.argsort(self.timestamps[rows], stable=True)]
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
 @full_precision
-def solve(
+def solve_graph(
     graph: ObservationGraph,
     kernel: Kernel = "huber",
     scale: Tensor | float = 2.45,
@@ -210,23 +218,37 @@ def solve(
     tolerance: float = 1e-10,
     progress: Progress | None = None,
 ) -> GraphSolution:
-    """Minimise the robust reprojection errors of a run's graph: keyframes and points, then the frames in between.
+    """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
-    Every world is solved on its own: its first keyframe stays where it is, and so does its scale; a loss should not
-    depend on them, as aligned trajectory errors do not. Options as in `bundle_adjust`; the default kernel ends its
-    quadratic part at 95 % of a Gaussian. Raises ValueError if a world has no keyframe, if a point is seen in two
-    worlds, and for `free_camera` with several worlds, of which each would find a camera of its own.
+    Every submap is solved on its own. Its first keyframe and its scale stay those of the start; a loss should not
+    depend on them (aligned trajectory errors do not).
+
+    Args:
+        graph: observation graph, as `Run.graph`.
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened residual; the default is the 95 % quantile of a Gaussian.
+        free_camera: as in `bundle_adjust`; for a graph of one submap.
+        backward: how gradients reach pixels, weights and camera.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
+        progress: called before each iteration of a bundle adjustment.
+
+    Returns:
+        The minimum, differentiable with respect to pixels, weights and camera.
+
+    Raises:
+        ValueError: a submap has no keyframe, two submaps see the same point, or the camera is free for several submaps.
     """
-    worlds = graph.submaps
-    if free_camera is not False and len(worlds) > 1:
-        raise ValueError("a free camera needs a graph of one world")
+    submaps = graph.submaps
+    if free_camera is not False and len(submaps) > 1:
+        raise ValueError("a free camera needs a graph of one submap")
     solved = graph.points_w.new_zeros(len(graph.points_w), dtype=torch.int64)
     T_cw, points_w = graph.T_cw.detach(), graph.points_w.detach()
     success, moved = torch.zeros_like(graph.is_keyframe), torch.zeros_like(solved, dtype=torch.bool)
     bundles: list[BundleSolution] = []
     options = (kernel, scale, backward, iterations, tolerance)
-    for submap in worlds:
-        keyframes, points, problem = keyframes_of(graph, submap)
+    for submap in submaps:
+        keyframes, points, problem = keyframe_problem(graph, submap)
         solved[points] += 1
         bundle = bundle_adjust(
             problem, kernel, scale, free_camera, backward, iterations, tolerance, progress=progress
@@ -240,24 +262,24 @@ def solve(
         success = success.index_copy(0, keyframes, bundle.success & finite)
         moved = moved.index_copy(0, points, bundle.moved_points)
     if bool((solved > 1).any()):
-        raise ValueError("a point is seen in two worlds")
+        raise ValueError("a point is seen in two submaps")
     if not bundles:
         raise ValueError("the graph has no keyframe")
     camera = bundles[0].camera
-    T_cw, success, settled = between(graph, T_cw, points_w, camera, moved, success, *options)
-    found = T_cw, points_w, camera, success, moved, settled & converged_of(graph, bundles)
+    T_cw, success, converged = pose_other_frames(graph, T_cw, points_w, camera, moved, success, *options)
+    found = T_cw, points_w, camera, success, moved, converged & bundle_converged(graph, bundles)
     return GraphSolution(graph.timestamps, *found, graph.submap, tuple(bundles))
 
 
-def keyframes_of(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
-    """The keyframes (k,) of one world, its points (p,), and their bundle adjustment.
+def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
+    """The keyframes (k,) of one submap, its points (p,), and their bundle adjustment.
 
     Raises ValueError where there is no keyframe.
     """
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
     if len(keyframes) == 0:
-        raise ValueError("a world of the graph has no keyframe")
+        raise ValueError("a submap of the graph has no keyframe")
     slots = torch.full_like(graph.submap, -1)
     slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
@@ -274,13 +296,13 @@ def keyframes_of(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, 
     return keyframes, points, problem
 
 
-def converged_of(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
-    """(F,) whether the bundle adjustment of each frame's world, in the order of `graph.submaps`, has converged."""
+def bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
+    """(F,) whether the bundle adjustment of each frame's submap, in the order of `graph.submaps`, has converged."""
     converged = torch.cat([bundle.convergence.converged for bundle in bundles])
     return converged[torch.unique(graph.submap, return_inverse=True)[1]]
 
 
-def between(
+def pose_other_frames(
     graph: ObservationGraph,
     T_cw: Tensor,
     points_w: Tensor,
@@ -293,10 +315,9 @@ def between(
     iterations: int,
     tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses T_cw (F, 4, 4), those of frames that are no keyframes found against the points; who succeeded, and
-    whose search ended at a minimum: all keyframes, here.
+    """The poses (F, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
 
-    camera: of all frames, or with params (F, K) of each its own
+    camera: one for all frames, or one for each, params (F, K)
     """
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
@@ -326,8 +347,8 @@ def between(
     return T_cw, success, converged
 
 
-def join(graphs: Sequence[Graph]) -> Graph:
-    """One graph of several that are each of a world of their own; they have the camera of the first."""
+def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
+    """One graph of several with submaps of their own; the camera is that of the first."""
     frames, points = (
         torch.tensor([0, *(len(getattr(graph, name)) for graph in graphs)]).cumsum(0).tolist()
         for name in ("T_cw", "points_w")
@@ -340,3 +361,158 @@ def join(graphs: Sequence[Graph]) -> Graph:
             parts = [part + start for part, start in zip(parts, starts, strict=False)]
         columns[name] = torch.cat(parts)
     return replace(graphs[0], **columns)
+
+
+class _GraphSubmap(NamedTuple):
+    """A submap of a graph: rows of its keyframes and of its points there, and its bundle adjustment."""
+
+    graph: int
+    keyframes: Tensor
+    points: Tensor
+    problem: BundleProblem
+
+    @property
+    def cells(self) -> int:
+        """How large it is where many are solved at once."""
+        return len(self.problem.T_cw) * len(self.points)
+
+
+@full_precision
+def solve_graphs(
+    graphs: Sequence[ObservationGraph],
+    kernel: Kernel = "huber",
+    scale: Tensor | float = 2.45,
+    backward: Backward = "implicit",
+    iterations: int = 30,
+    tolerance: float = 1e-10,
+) -> tuple[GraphSolution, ...]:
+    """The minimum of every graph as `solve_graph` finds it, up to rounding; options and errors as there.
+
+    Graphs need not be of one size, nor see through one camera; those whose cameras have the same model, and whose
+    weights are both numbers or both matrices, are solved together. What has converged leaves the batch, and one that
+    fails does not touch the others.
+    """
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for row, graph in enumerate(graphs):
+        kind = (graph.camera.model, graph.camera.params.dtype, graph.camera.params.device, graph.weights.ndim)
+        alike.setdefault(kind, []).append(row)
+    solved: dict[int, GraphSolution] = {}
+    found: Sequence[GraphSolution]
+    for rows in alike.values():
+        if len(rows) == 1:
+            found = (solve_graph(graphs[rows[0]], kernel, scale, False, backward, iterations, tolerance),)
+        else:
+            some = [graphs[row] for row in rows]
+            found = _solve_alike(some, kernel, scale, backward, iterations, tolerance)
+        solved.update(zip(rows, found, strict=True))
+    return tuple(solved[row] for row in range(len(graphs)))
+
+
+def _solve_alike(
+    graphs: Sequence[ObservationGraph],
+    kernel: Kernel,
+    scale: Tensor | float,
+    backward: Backward,
+    iterations: int,
+    tolerance: float,
+) -> tuple[GraphSolution, ...]:
+    """Graphs whose cameras have one model, together."""
+    options = kernel, scale, backward, iterations, tolerance
+    submaps = [
+        _GraphSubmap(number, *keyframe_problem(graph, submap))
+        for number, graph in enumerate(graphs)
+        for submap in graph.submaps
+    ]
+    bundles = _bundles(submaps, *options)
+    # Rows of all graphs, one after the other, as `concatenate_graphs` has them; `submap` tells the graphs apart.
+    joined = concatenate_graphs([_plain(graph, number) for number, graph in enumerate(graphs)])
+    frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
+    frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])
+    points = torch.cat([submap.points + point_starts[submap.graph] for submap in submaps])
+    if len(torch.unique(points)) < len(points):
+        raise ValueError("a point is seen in two submaps")
+    success, moved = torch.zeros_like(joined.is_keyframe), joined.points_w.new_zeros(len(joined.points_w))
+    finite = joined.T_cw[frames].isfinite().flatten(1).all(-1)
+    succeeded = torch.cat([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles])
+    T_cw = joined.T_cw.detach().index_copy(0, frames, torch.cat([bundle.T_cw for bundle in bundles]))
+    points_w = torch.cat([bundle.points_w for bundle in bundles])
+    points_w = joined.points_w.detach().index_copy(0, points, points_w)
+    moved = moved.bool().index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
+    success = success.index_copy(0, frames, succeeded & finite)
+    params = torch.stack([graph.camera.params for graph in graphs])
+    camera = graphs[0].camera.with_params(params[joined.submap])
+    T_cw, success, is_minimum = pose_other_frames(joined, T_cw, points_w, camera, moved, success, *options)
+    solutions = []
+    for number, graph in enumerate(graphs):
+        rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
+        places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
+        own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
+        converged = is_minimum[rows] & bundle_converged(graph, own)
+        found = T_cw[rows], points_w[places], graph.camera, success[rows], moved[places], converged
+        solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
+    return tuple(solutions)
+
+
+def _bundles(
+    submaps: Sequence[_GraphSubmap],
+    kernel: Kernel,
+    scale: Tensor | float,
+    backward: Backward,
+    iterations: int,
+    tolerance: float,
+) -> list[BundleSolution]:
+    """The bundle adjustment of each submap, found together with those of like size."""
+    found: dict[int, BundleSolution] = {}
+    for rows in _group_by_size(submaps):
+        problems = [submaps[row].problem for row in rows]
+        together = bundle_adjust(_padded(problems), kernel, scale, False, backward, iterations, tolerance)
+        for number, (row, problem) in enumerate(zip(rows, problems, strict=True)):
+            found[row] = together.element(number, len(problem.T_cw), len(problem.points_w))
+    return [found[row] for row in range(len(submaps))]
+
+
+def _group_by_size(submaps: Sequence[_GraphSubmap]) -> list[list[int]]:
+    """Rows of the submaps, in groups within which none is much larger than another."""
+    groups: list[list[int]] = []
+    for row in sorted(range(len(submaps)), key=lambda row: submaps[row].cells):
+        least = submaps[groups[-1][0]].cells if groups else 0
+        if groups and submaps[row].cells <= _MAX_SIZE_RATIO * least:
+            groups[-1].append(row)
+        else:
+            groups.append([row])
+    return groups
+
+
+def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
+    """One batch of problems of different sizes, each with a camera of its own."""
+    first = problems[0]
+    T_cw, points_w, frame_index, point_index, pixels = (
+        pad_sequence([getattr(problem, name) for problem in problems], batch_first=True)
+        for name in ("T_cw", "points_w", "frame_index", "point_index", "pixels")
+    )
+    weights = [problem.weights for problem in problems if problem.weights is not None]
+    counted = [torch.ones_like(problem.frame_index, dtype=torch.bool) for problem in problems]
+    cameras = torch.stack([problem.camera.params for problem in problems])
+    return BundleProblem(
+        T_cw,
+        points_w,
+        frame_index,
+        point_index,
+        pixels,
+        first.camera.with_params(cameras),
+        pad_sequence(weights, batch_first=True),
+        first.fixed_frames,
+        mask=pad_sequence(counted, batch_first=True),
+    )
+
+
+def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:
+    """The columns that every graph has, all of one submap, whose number is the graph's."""
+    columns = {name: getattr(graph, name) for name in ObservationGraph.columns()}
+    whole = ObservationGraph(camera=graph.camera, **columns)
+    return replace(whole, submap=torch.full_like(graph.submap, number))
+
+
+def _starts(tables: Sequence[Tensor]) -> list[int]:
+    """In which row each of some tables begins where they stand one after the other."""
+    return torch.tensor([0, *(len(table) for table in tables)]).cumsum(0).tolist()[:-1]

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchslam.calibration.find_camera import contradiction
-from torchslam.calibration.intrinsics import Refinement, estimate_intrinsics
+from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
 from torchslam.calibration.rounds import MAX_ROUNDS, MIN_CHANGE, MIN_CHANGE_IN_STD
 from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
@@ -26,7 +26,7 @@ from torchslam.errors import FrameError, TrajectoryError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.optim.run_graph import solve
+from torchslam.optim.run_graph import solve_graph
 from torchslam.refine.map_building import align_rotations, build_map
 from torchslam.refine.non_keyframes import FramePoser, graph_of
 from torchslam.refine.tracks import Pair, choose_keyframes, find_pairs, join_matches
@@ -38,11 +38,11 @@ MIN_KEYFRAMES = 2  # keyframes of a map
 
 
 class CameraChoice(Enum):
-    """What becomes of the given camera.
+    """How the given camera is treated.
 
-    JUDGED: another focal length is taken where the images contradict the given one
-    FREE:   what the images say is taken wherever they determine it
-    FIXED:  it stays as it is
+    IF_CONTRADICTED: its focal length is replaced if the images contradict it.
+    FREE: it is replaced if the images determine it.
+    FIXED: it is kept.
     """
 
     IF_CONTRADICTED = "if_contradicted"
@@ -51,32 +51,33 @@ class CameraChoice(Enum):
 
 
 @dataclass(frozen=True)
-class Refined:
-    """What refining came to.
+class RefinementResult:
+    """Refined poses with their map.
 
-    run:     as of a run: its worlds are in the frame and unit of the given poses, its camera the refined one, and the
-             poses "as they were given" those of the other program
-    given:   the poses it began with
-    rows:    (F,) which of them each frame of the sequence has, -1 where none
-    camera:  what the images say of the camera; None where it stayed fixed, or nothing came of it
-    rounds:  how many cameras a map was made with
+    Attributes:
+        run: Its submap is in the frame and unit of the given poses, its camera is the refined one, and its online
+            poses are the given ones.
+        given: The given poses.
+        pose_rows: (F,) row of the given pose of each frame of the sequence, -1 for none.
+        intrinsics: Estimate of the camera; None if it was fixed or no map was built.
+        rounds: Number of cameras with which a map was built.
     """
 
     run: Run
     given: GivenPoses
-    rows: Tensor
-    camera: Refinement | None
+    pose_rows: Tensor
+    intrinsics: IntrinsicsEstimate | None
     rounds: int
 
     @property
     def without_image(self) -> int:
-        """How many poses are of no image."""
-        return len(self.given) - int((self.rows >= 0).sum())
+        """The number of poses without an image."""
+        return len(self.given) - int((self.pose_rows >= 0).sum())
 
     @property
     def without_pose(self) -> int:
-        """How many images have no pose, and were left out."""
-        return int((self.rows < 0).sum())
+        """The number of images without a pose, which were ignored."""
+        return int((self.pose_rows < 0).sum())
 
 
 def refine_poses(
@@ -88,16 +89,24 @@ def refine_poses(
     device: torch.device | str = "cpu",
     extractor: FrontEnd | None = None,
     on_progress: Callable[[str], None] | None = None,
-) -> Refined:
-    """Make somebody else's poses of the images of a sequence better.
+) -> RefinementResult:
+    """Refine given poses of the images of a sequence.
 
-    poses:     as read, or what `read_poses` reads; the camera is that of the sequence
-    radial:    how many coefficients of the distortion may be fitted beside the focal length, where the images ask
-    extractor: front end, the configured one if None
-    told:      of every step, in words
+    Frames without a pose and poses without an image are ignored. `Run.failure` has the reason if no map was built.
 
-    Frames without a pose are left out, so are poses without an image. A run without a map says why (`Run.failure`).
-    Raises TrajectoryError where no pose is that of an image, CalibrationError where there is no camera.
+    Args:
+        sequence: Images with a camera.
+        poses: Poses, or a path for `read_poses`.
+        config: The default if None.
+        choice: How the given camera is treated.
+        radial: Maximum number of distortion coefficients that may be estimated.
+        device: Of torch.
+        extractor: Front end; the configured one if None.
+        on_progress: Receives messages.
+
+    Raises:
+        TrajectoryError: No pose belongs to an image.
+        CalibrationError: The sequence has no camera.
     """
     config, log = config or Config(), on_progress or (lambda words: None)
     given = _as_given(poses)
@@ -109,13 +118,13 @@ def refine_poses(
     frames = torch.tensor([view.index for view in views], dtype=torch.int64)
     T_cw = given.T_cw[rows[frames]].to(camera.params)
     log(f"{len(views)} images with poses")
-    scaled = config.for_size(camera.size)  # what is told to the steps, as in a run
+    scaled = config.for_size(camera.size)  # for the image size, as in a run
     chosen, pairs, failure = _connected(views, T_cw, camera, scaled)
     if failure:
-        return Refined(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
+        return RefinementResult(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
     log(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
     keyframes = [views[row] for row in chosen]
-    slam_map, camera, refined, rounds = _rounds(
+    slam_map, camera, estimate, rounds = _rounds(
         keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, log
     )
     submap = Submap.empty(0, camera.params)
@@ -123,29 +132,29 @@ def refine_poses(
     results = FramePoser(camera, scaled).pose(submap, views, T_cw)
     _finalize(submap, camera, frames, T_cw)
     run = _run((submap,), camera, config, views, results, skipped, "")
-    return Refined(run, given, rows, refined, rounds)
+    return RefinementResult(run, given, rows, estimate, rounds)
 
 
 def _connected(
     views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config
 ) -> tuple[list[int], list[Pair], str]:
-    """The rows of the keyframes, the pairs of these that see the same, and why there are none, in words."""
+    """The rows of the keyframes, their verified pairs, and the reason if there are none."""
     if len(views) < MIN_KEYFRAMES:
-        return [], [], f"no map: {len(views)} images with a pose are too few"
+        return [], [], f"no map: {len(views)} images with a pose are not enough"
     chosen = choose_keyframes(views, camera.width, config)
     if len(chosen) < MIN_KEYFRAMES:
-        return [], [], f"no map: nothing moves in the {len(views)} images"
+        return [], [], f"no map: no motion in the {len(views)} images"
     pairs = find_pairs([views[row] for row in chosen], T_cw[chosen], camera, config)
     if not pairs:
-        return [], [], f"no map: no two of {len(chosen)} keyframes see the same"
+        return [], [], f"no map: no two of {len(chosen)} keyframes overlap"
     connected = largest_connected_part(pairs, len(chosen))
     return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
 
 
 def _finalize(submap: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
-    """Everything once more as one graph, with covariances, and back to where the given poses T_cw of the frames are."""
+    """Solve one graph of all frames, with covariances, and align it to the given poses T_cw of the frames."""
     graph = submap.posed_frames.graph(submap.map, camera)
-    submap.posed_frames.take(solve(graph, backward="detached"), graph, submap.map)
+    submap.posed_frames.apply_solution(solve_graph(graph, backward="detached"), graph, submap.map)
     row_of = {index: row for row, index in enumerate(frames.tolist())}
     posed = [row_of[index] for index in submap.posed_frames.frames["frame_index"].tolist()]
     submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), T_cw[posed]))
@@ -154,7 +163,7 @@ def _finalize(submap: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> N
 def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
     if isinstance(poses, Trajectory):
         if len(poses) == 0:
-            raise TrajectoryError("a trajectory without poses")
+            raise TrajectoryError("the trajectory has no poses")
         return GivenPoses(TUM, Path(), se3_inverse(poses.T_wc), poses.timestamps)
     return poses if isinstance(poses, GivenPoses) else read_poses(poses)
 
@@ -162,7 +171,7 @@ def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
 def _extract_features(
     sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor | None
 ) -> tuple[list[FrameFeatures], list[str]]:
-    """The views of the frames that have a pose, and those that could not be read, in words."""
+    """Features of the frames that have a pose, and messages for the unreadable ones."""
     views, skipped = [], []
     for index in torch.nonzero(rows >= 0)[:, 0].tolist():
         try:
@@ -188,11 +197,11 @@ def _rounds(
     choice: CameraChoice,
     radial: int,
     log: Callable[[str], None],
-) -> tuple[Map, Camera, Refinement | None, int]:
-    """A map with the camera as known, the camera from the map, and again: a wrong one chooses its matches wrongly."""
+) -> tuple[Map, Camera, IntrinsicsEstimate | None, int]:
+    """Alternate building the map and estimating the camera, since a wrong camera leads to wrong matches."""
     given, T_cw = camera, align_rotations(T_cw, pairs)
     tracks = join_matches(pairs, len(keyframes), len(keyframes[0].mask))
-    rounds, refined = 0, None
+    rounds, estimate = 0, None
     while True:
         is_free = choice is not CameraChoice.FIXED and camera is not given
         slam_map, camera = build_map(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
@@ -201,19 +210,19 @@ def _rounds(
         log(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
         if choice is CameraChoice.FIXED:
             return slam_map, camera, None, rounds
-        refined = estimate_intrinsics(graph_of(slam_map, camera), given, radial)
-        if not refined.is_determined or rounds == MAX_ROUNDS:
-            return slam_map, camera, refined, rounds
-        if choice is CameraChoice.IF_CONTRADICTED and not is_free and not contradiction(given, refined):
-            return slam_map, camera, refined, rounds
-        change = abs(math.log(float(refined.camera.focal) / float(camera.focal)))
-        if is_free and change < max(MIN_CHANGE, MIN_CHANGE_IN_STD * refined.std):
-            return slam_map, camera, refined, rounds
-        camera = refined.camera
+        estimate = estimate_intrinsics(graph_of(slam_map, camera), given, radial)
+        if not estimate.is_determined or rounds == MAX_ROUNDS:
+            return slam_map, camera, estimate, rounds
+        if choice is CameraChoice.IF_CONTRADICTED and not is_free and not contradiction(given, estimate):
+            return slam_map, camera, estimate, rounds
+        change = abs(math.log(float(estimate.camera.focal) / float(camera.focal)))
+        if is_free and change < max(MIN_CHANGE, MIN_CHANGE_IN_STD * estimate.focal_std):
+            return slam_map, camera, estimate, rounds
+        camera = estimate.camera
 
 
 def largest_connected_part(pairs: list[Pair], count: int) -> list[int]:
-    """The largest set of keyframes, ascending, that pairs connect; of equals the one with the first keyframe."""
+    """The largest connected set of keyframes, ascending; among equal ones the one with the lowest keyframe."""
     label = list(range(count))
     for _ in range(count):
         before = list(label)
@@ -225,9 +234,9 @@ def largest_connected_part(pairs: list[Pair], count: int) -> list[int]:
     return [row for row, part in enumerate(label) if part == best]
 
 
-def _renumbered(pairs: list[Pair], kept: list[int]) -> list[Pair]:
-    """The pairs among the keyframes that are kept, by their new rows."""
-    row_of = {old: new for new, old in enumerate(kept)}
+def _renumbered(pairs: list[Pair], connected: list[int]) -> list[Pair]:
+    """The pairs among the connected keyframes, with new rows."""
+    row_of = {old: new for new, old in enumerate(connected)}
     return [
         replace(pair, first=row_of[pair.first], second=row_of[pair.second])
         for pair in pairs
@@ -249,14 +258,14 @@ def _run(
     return Run(submaps, camera, config, results, skipped, False, failure)
 
 
-MAX_OUTLIER_RATIO = 4.0  # times the median: a given position so far off does not count
+MAX_OUTLIER_RATIO = 4.0  # times the median error: given positions further off are ignored
 
 
 def align_to_input(T_cw: Tensor, given_cw: Tensor) -> Tensor:
-    """S (4, 4) that leads from the world of poses T_cw (N, 4, 4) to that of the given ones (N, 4, 4).
+    """Similarity S (4, 4) from the world of poses T_cw (N, 4, 4) to that of the given ones (N, 4, 4).
 
-    Centres and orientations count alike: centres on a line say nothing of the turn about it, and orientations nothing
-    of the rest. Where the centres have no extent, the unit stays.
+    Centers and orientations count equally: centers on a line do not determine the rotation about it. Without any extent
+    of the centers the scale is one.
     """
     T_wc, given = se3_inverse(T_cw), se3_inverse(given_cw)
     counts = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)

@@ -16,13 +16,12 @@ from torchslam.errors import FrameError, InitializationError, TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
-from torchslam.map.atlas import main_of
+from torchslam.map.atlas import Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
-from torchslam.map.submap import Submap
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.optim.core.levenberg_marquardt import Progress
-from torchslam.optim.run_graph import join, solve
+from torchslam.optim.run_graph import concatenate_graphs, solve_graph
 from torchslam.system.front_end import source
 from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult, Trajectory
@@ -34,7 +33,7 @@ class System(Protocol):
     camera: Camera
     config: Config
     session: Session
-    memory: LoopCloser
+    loop_closer: LoopCloser
     last_frame: tuple[int, float] | None
 
     def step(self, frame: Frame) -> StepResult: ...
@@ -52,74 +51,74 @@ class Frames(Protocol):
 class Run:
     """The result of a run.
 
-    worlds:      what was built, in the order in which it began; mostly one
+    submaps:      what was built, in the order in which it began; mostly one
     results:     one per processed frame
     skipped:     the frames that could not be read, in words
     interrupted: whether the run was stopped by the user
     failure:     why no frame has a pose; empty when some have
-    recalls:     the places that were recognised, which may have joined worlds
+    recalls:     the places that were recognised, which may have joined submaps
     session:     number of the run among those over the same map; frames and trajectories are those of this session
     sessions:    how many sessions the map has; one that was only localised is none of them
     """
 
-    worlds: tuple[Submap, ...]
+    submaps: tuple[Submap, ...]
     camera: Camera
     config: Config
     results: list[StepResult]
     skipped: list[str]
     interrupted: bool
     failure: str
-    recalls: tuple[LoopClosureRecord, ...] = ()
+    loop_closures: tuple[LoopClosureRecord, ...] = ()
     session: int = 0
     sessions: int = 1
 
     @property
     def main(self) -> Submap | None:
-        """The world in which most frames of the run are posed; None where there is no map."""
-        return main_of(self.worlds, self.session)
+        """The submap in which most frames of the run are posed; None where there is no map."""
+        return main_submap(self.submaps, self.session)
 
     @property
     def map(self) -> Map:
-        """Of the main world; empty where there is none."""
+        """Of the main submap; empty where there is none."""
         return Map() if self.main is None else self.main.map
 
     @property
-    def history(self) -> PosedFrames:
-        """Poses and observations of the frames of the main world."""
-        return PosedFrames() if self.main is None else self.main.history
+    def posed_frames(self) -> PosedFrames:
+        """Poses and observations of the frames of the main submap."""
+        return PosedFrames() if self.main is None else self.main.posed_frames
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every posed frame of the main world, after everything that was learned later."""
+        """Every posed frame of the main submap, after everything that was learned later."""
         return Trajectory.empty() if self.main is None else self.main.trajectory(self.session)
 
     @property
     def keyframes(self) -> Trajectory:
-        """The keyframes of the main world alone."""
+        """The keyframes of the main submap alone."""
         return keyframe_trajectory(self.map, self.session)
 
     @property
     def online(self) -> Trajectory:
-        """The poses as they were given, frame by frame, in the main world."""
+        """The poses as they were given, frame by frame, in the main submap."""
         return Trajectory.empty() if self.main is None else self._given_in(self.main.number)
 
     @property
     def online_parts(self) -> list[Trajectory]:
-        """The poses as they were given: in the main world, and in each world that became a part of it, each in its own.
+        """The poses as they were given: in the main submap, and in each submap that became a part of it, each in its own.
 
-        What was given in worlds that were taken back, or that are still beside the main one, is not among them.
+        What was given in submaps that were taken back, or that are still beside the main one, is not among them.
         """
         if self.main is None:
             return []
         numbers = [self.main.number]
-        joined = {frozenset((recall.world, recall.other)) for recall in self.recalls}
+        joined = {frozenset((closure.submap, closure.other)) for closure in self.loop_closures}
         for number in numbers:
             numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
         return [part for number in numbers if len(part := self._given_in(number))]
 
     def _given_in(self, number: int) -> Trajectory:
-        """The poses as they were given in the world of a number."""
-        given = [result for result in self.results if result.T_cw is not None and result.world == number]
+        """The poses as they were given in the submap of a number."""
+        given = [result for result in self.results if result.T_cw is not None and result.submap == number]
         if not given:
             return Trajectory.empty()
         T_cw = torch.stack([result.T_cw for result in given if result.T_cw is not None])
@@ -128,15 +127,17 @@ class Run:
 
     @property
     def graph(self) -> RunGraph:
-        """Everything the worlds know, as one differentiable problem: `torchslam.solve(run.graph)` gives all poses.
+        """All observations as one differentiable problem: `torchslam.solve_graph(run.graph)` gives all poses.
 
-        Where there are several worlds, `graph.world` says whose poses can be compared with each other.
+        Where there are several submaps, `graph.submap` says whose poses can be compared with each other.
 
         Raises InitializationError where there is no map.
         """
-        if not self.worlds:
+        if not self.submaps:
             raise InitializationError(self.failure)
-        return join([world.history.graph(world.map, self.camera, world.number) for world in self.worlds])
+        return concatenate_graphs(
+            [submap.posed_frames.graph(submap.map, self.camera, submap.number) for submap in self.submaps]
+        )
 
 
 @dataclass
@@ -174,7 +175,7 @@ def run_sequence(
     if slam.last_frame is not None and (so_far is None or not so_far.next):
         raise TorchslamError(
             "this SLAM has processed frames already: call reset() to begin anew, "
-            "or save() its worlds and SLAM.load() them to go on there"
+            "or save() its submaps and SLAM.load() them to go on there"
         )
     so_far = RunProgress() if so_far is None else so_far
     sequence = source(sequence, slam.config, slam.camera)
@@ -210,27 +211,29 @@ def finish(
     with torch.inference_mode():
         slam.finalize()
     try:
-        for world in slam.session.worlds:
+        for submap in slam.session.atlas:
             if (
                 slam.session.mapping
                 and slam.config.bundle_adjustment.local
                 and slam.config.bundle_adjustment.global_at_end
             ):
-                adjust_all(world.map, slam.camera, slam.config.bundle_adjustment, adjusting)
-                world.history.forget_strays(world.map, slam.camera)
-                graph = world.history.graph(world.map, slam.camera)
-                world.history.take(solve(graph, backward="detached", progress=adjusting), graph, world.map)
+                adjust_all(submap.map, slam.camera, slam.config.bundle_adjustment, adjusting)
+                submap.posed_frames.remove_outliers(submap.map, slam.camera)
+                graph = submap.posed_frames.graph(submap.map, slam.camera)
+                submap.posed_frames.apply_solution(
+                    solve_graph(graph, backward="detached", progress=adjusting), graph, submap.map
+                )
     except KeyboardInterrupt:
         interrupted = True
     return Run(
-        tuple(slam.session.worlds),
+        tuple(slam.session.atlas),
         slam.camera,
         slam.config,
         results,
         skipped,
         interrupted,
         why_no_pose(slam, results, skipped),
-        tuple(slam.memory.recalls),
+        tuple(slam.loop_closer.loop_closures),
         slam.session.number,
         slam.session.count,
     )
@@ -254,9 +257,9 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
 
 def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> str:
     """Why no frame of the session has a pose, in one sentence; empty where some have."""
-    if len(slam.session.worlds) == 0:
+    if len(slam.session.atlas) == 0:
         return why_no_map(results, skipped)
-    if any(world.history.count(slam.session.number) for world in slam.session.worlds):
+    if any(submap.posed_frames.count(slam.session.number) for submap in slam.session.atlas):
         return ""
     return f"none of {len(results)} frames was recognised in the map"
 
@@ -275,7 +278,7 @@ def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
         if result.state is State.INITIALIZING and result.reason != Reason.NEW_REFERENCE
     ]
     if not attempts:
-        return f"no map was initialised: {len(results)} frames are too few, two with parallax are needed"
+        return f"no map was initialized: {len(results)} frames are too few, two with parallax are needed"
     kind, _ = Counter(reason.split(":")[0] for reason in attempts).most_common(1)[0]
     last = next(reason for reason in reversed(attempts) if reason.split(":")[0] == kind)
-    return f"no map was initialised in {len(results)} frames: {last}"
+    return f"no map was initialized in {len(results)} frames: {last}"

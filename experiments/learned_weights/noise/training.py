@@ -14,10 +14,10 @@ from experiments.learned_weights.noise.model import NoiseModel
 from torchslam.evaluation import ate
 from torchslam.geometry import transform
 from torchslam.geometry.robust import robustify
-from torchslam.optim.run_graph import GraphSolution, solve
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 BEND = 2.45
-"""Of the Huber kernel, in standard deviations: that of `solve`."""
+"""Of the Huber kernel, in standard deviations: that of `solve_graph`."""
 LEAST_VIEWS = 4
 """Keyframes of a point whose residuals are learned from: points that fewer see follow the noise of each."""
 USUAL = 8.0
@@ -75,7 +75,7 @@ def weighed(example: Example, model: NoiseModel) -> Example:
 
 def solved(example: Example) -> Example:
     """The run at the minimum of its graph."""
-    solution = solve(example.graph, scale=BEND, backward="detached")
+    solution = solve_graph(example.graph, scale=BEND, backward="detached")
     return replace(example, graph=replace(example.graph, T_cw=solution.T_cw, points_w=solution.points_w))
 
 
@@ -103,7 +103,7 @@ def residuals(example: Example, informed: Example) -> Residuals:
 
 
 def negative_log_likelihood(model: NoiseModel, found: Residuals) -> Tensor:
-    """Mean over observations, up to a constant; its density is that of which the kernel of `solve` is the logarithm.
+    """Mean over observations, up to a constant; the kernel of `solve_graph` is the logarithm of its density.
 
     Of models without a level of the image: these say nothing of how large errors are.
     """
@@ -142,7 +142,7 @@ def fit_likelihood(examples: Sequence[Example], kind: str, settings: Settings) -
 
 
 def at_level(model: NoiseModel, level: float) -> NoiseModel:
-    """The same model, but that it only says which keypoints of an image are known better than others."""
+    """The same model, restricted to the relative accuracy of keypoints within an image."""
     found = NoiseModel(model.kind)
     found.load_state_dict(model.state_dict())
     found.level_of_image.fill_(level)
@@ -150,7 +150,7 @@ def at_level(model: NoiseModel, level: float) -> NoiseModel:
 
 
 def position_error(example: Example, solution: GraphSolution) -> Tensor:
-    """ATE in metres of the frames whose truth is known, differentiable. Raises ValueError for too few."""
+    """ATE in meters of the frames whose truth is known, differentiable. Raises ValueError for too few."""
     if int(example.known.sum()) < LEAST_KNOWN:
         raise ValueError(f"{int(example.known.sum())} keyframes with true poses: they teach no trajectory")
     return ate(solution.T_cw[example.known], example.T_cw[example.known])
@@ -166,7 +166,7 @@ def fit_trajectories(model: NoiseModel, examples: Sequence[Example], settings: S
         optimizer.zero_grad()
         for row, example in enumerate(now):
             informed = weighed(example, found)
-            solution = solve(informed.graph, scale=BEND, iterations=10, tolerance=1e-8)
+            solution = solve_graph(informed.graph, scale=BEND, iterations=10, tolerance=1e-8)
             (position_error(example, solution).log() / len(now)).backward()
             # The next step starts where this one ended.
             graph = replace(example.graph, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())

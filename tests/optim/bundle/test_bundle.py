@@ -127,9 +127,9 @@ def test_structure_only_and_motion_only(bundle_scene):
 
 
 def shape(problem, **options):
-    """Distances between the camera centres, relative to the first: what no gauge changes."""
-    centres = se3_inverse(bundle_adjust(problem, "cauchy", 2.0, **CONVERGED, **options).T_cw)[:, :3, 3]
-    distances = (centres[1:] - centres[:1]).norm(dim=-1)
+    """Distances between the camera centers, relative to the first: what no gauge changes."""
+    centers = se3_inverse(bundle_adjust(problem, "cauchy", 2.0, **CONVERGED, **options).T_cw)[:, :3, 3]
+    distances = (centers[1:] - centers[:1]).norm(dim=-1)
     return distances / distances.sum()
 
 
@@ -282,7 +282,7 @@ def test_backward_modes_agree_where_they_should(bundle_scene):
 
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
 def test_covariance_is_calibrated(bundle_scene, kernel):
-    """The normalised error squared of poses and points averages to its degrees of freedom."""
+    """The normalized error squared of poses and points averages to its degrees of freedom."""
     frames, points = [], []
     for seed in range(50):
         scene = bundle_scene(frames=8, points=120, noise=0.7, perturbation=0.002, visible=1.0, seed=seed)

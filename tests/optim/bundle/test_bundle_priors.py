@@ -100,8 +100,8 @@ def test_priors_instead_of_fixed_frames(bundle_scene, batched, weights, is_open)
     if not is_open:
         torch.testing.assert_close(T_cw, scene.T_cw, atol=1e-6, rtol=0)
         return
-    centres = [se3_inverse(T)[:, :3, 3] - se3_inverse(T)[0, :3, 3] for T in (T_cw, scene.T_cw)]
-    shapes = [centre / centre.norm() for centre in centres]
+    centers = [se3_inverse(T)[:, :3, 3] - se3_inverse(T)[0, :3, 3] for T in (T_cw, scene.T_cw)]
+    shapes = [center / center.norm() for center in centers]
     torch.testing.assert_close(shapes[0], shapes[1], atol=1e-6, rtol=0)
 
 
@@ -118,8 +118,8 @@ def test_a_prior_weighs_against_pixels(bundle_scene):
     error = problem.camera.project(points_c)[0] - problem.pixels
     E = T_cw @ se3_inverse(off)
     R, t = E[:, :3, :3], E[:, :3, 3]
-    turned = se3_log(torch.cat((torch.cat((R, 0 * t[..., None]), -1), E[:, 3:]), -2))[:, 3:]
-    squared = t.square().sum(-1) + turned.square().sum(-1)
+    rotated = se3_log(torch.cat((torch.cat((R, 0 * t[..., None]), -1), E[:, 3:]), -2))[:, 3:]
+    squared = t.square().sum(-1) + rotated.square().sum(-1)
     costs = 0.5 * error.square().sum(), 0.5 * (torch.tensor(weights) * squared).sum()
     pulls = [torch.autograd.grad(cost, twist, retain_graph=True)[0][3:] for cost in costs]
     assert pulls[1].norm() > 1

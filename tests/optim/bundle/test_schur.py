@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from torchslam.optim.bundle import _schur as schur
-from torchslam.optim.bundle._schur import NormalEquations, Tangent, build_structure
+from torchslam.optim.bundle._schur import BundleTangent, NormalEquations, build_structure
 
 
 def random_system(generator, num_frames=5, num_points=12, num_camera=2):
@@ -35,7 +35,7 @@ def random_system(generator, num_frames=5, num_points=12, num_camera=2):
     gradient = normal(size)
     equations = NormalEquations(
         structure,
-        Tangent(
+        BundleTangent(
             gradient[:split].view(-1, 6), gradient[split:-num_camera].view(-1, 3), gradient[-num_camera:]
         ),
         diagonal.movedim(-1, 0),

@@ -22,7 +22,7 @@ class Rosenbrock:
     def residual(self, x: Tensor) -> Tensor:
         return torch.stack((1 - x[:, 0], 10 * (x[:, 1] - x[:, 0] ** 2)), -1)
 
-    def evaluate(self, estimate: Tensor, near: Tensor) -> Model:
+    def evaluate(self, estimate: Tensor, use_curvature: Tensor) -> Model:
         return Model(estimate, 0.5 * self.residual(estimate).square().sum(-1))
 
     def step(self, model: Model, damping: Tensor) -> tuple[Tensor, Tensor]:

@@ -68,10 +68,10 @@ def test_exact_expansion_against_autograd(make_observations, model, kernel, free
 
 
 def test_gauss_newton_expansion_is_semi_definite_and_exact_for_small_residuals(make_observations):
-    for near in (False, True):
+    for use_curvature in (False, True):
         observations, points_c = make_observations(noise=20.0)
         lin = linearize(observations, points_c)
-        expansion = gauss_newton_expansion(lin, lin.J.movedim(0, -1), torch.tensor(near))
+        expansion = gauss_newton_expansion(lin, lin.J.movedim(0, -1), torch.tensor(use_curvature))
         assert torch.linalg.eigvalsh(expansion.hessian.movedim(-1, 0)).min() > -1e-9
     observations, points_c = make_observations(noise=1e-7)
     lin = linearize(observations, points_c)
@@ -89,7 +89,7 @@ def test_a_point_behind_the_camera_costs_much_and_pulls_nowhere(make_observation
     observations = Observations(pixels, weights, camera, "none", torch.ones((), dtype=dtype, device=device))
     lin = linearize(observations, behind)
     torch.testing.assert_close(lin.cost, torch.full_like(lin.cost, 0.5 * (640**2 + 480**2)))
-    assert (lin.force == 0).all()
+    assert (lin.gradient_wrt_residual == 0).all()
     expansion = exact_expansion(observations, behind)
     assert (expansion.gradient == 0).all()
     assert (expansion.hessian == 0).all()

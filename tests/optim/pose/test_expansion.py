@@ -39,7 +39,7 @@ def test_gradient_is_that_of_the_cost(camera: Camera, generator: torch.Generator
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
 def test_curvature_is_that_of_linear_residuals(camera: Camera, generator: torch.Generator) -> None:
-    """Hessian and bend make the Hessian of the cost, with the residual in its place linear in xi."""
+    """Hessian and curvature term make the Hessian of the cost, with the residual in its place linear in xi."""
     T_cw, observations = scene(camera, generator)
     inputs = observations.observations
     points_w = observations.points_w.mT
@@ -58,18 +58,18 @@ def test_curvature_is_that_of_linear_residuals(camera: Camera, generator: torch.
     exact = torch.autograd.functional.hessian(cost, zero)
     found = observations.expand(T_cw, ALL)
     for row in range(2):
-        torch.testing.assert_close((found.hessian + found.bend)[row], exact[row, :, row])
+        torch.testing.assert_close((found.hessian + found.curvature_term)[row], exact[row, :, row])
     assert (torch.linalg.eigvalsh(found.hessian) > 0).all()
-    assert (torch.linalg.eigvalsh(found.bend) < 1e-6).all()
+    assert (torch.linalg.eigvalsh(found.curvature_term) < 1e-6).all()
 
 
-def test_bend_is_added_where_it_is_asked_for(generator: torch.Generator) -> None:
+def test_curvature_is_added_where_it_is_asked_for(generator: torch.Generator) -> None:
     T_cw, observations = scene(PINHOLE, generator)
     everywhere = observations.expand(T_cw, ALL)
     somewhere = observations.expand(T_cw, torch.tensor([True, False]))
-    assert torch.equal(somewhere.bend[0], everywhere.bend[0])
-    assert (somewhere.bend[1] == 0).all()
-    assert (observations.expand(T_cw, NONE).bend == 0).all()
+    assert torch.equal(somewhere.curvature_term[0], everywhere.curvature_term[0])
+    assert (somewhere.curvature_term[1] == 0).all()
+    assert (observations.expand(T_cw, NONE).curvature_term == 0).all()
 
 
 def test_the_short_way_for_pinhole_cameras_is_the_general_one(generator: torch.Generator) -> None:

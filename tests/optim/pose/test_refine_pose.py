@@ -90,8 +90,8 @@ def test_masked_and_broken_rows_do_not_count(pose_scene):
 def test_points_behind_the_camera_do_not_count(pose_scene):
     scene = pose_scene(count=40)
     points = scene.points_w.clone()
-    centre = se3_inverse(scene.T_cw)[:, None, :3, 3]
-    points[:, :5] = 2 * centre - points[:, :5]
+    center = se3_inverse(scene.T_cw)[:, None, :3, 3]
+    points[:, :5] = 2 * center - points[:, :5]
     refined = refine_pose(scene.start, points, scene.pixels, scene.camera, kernel="none")
     expected = refine_pose(
         scene.start, scene.points_w[:, 5:], scene.pixels[:, 5:], scene.camera, kernel="none"
@@ -198,7 +198,7 @@ def test_unroll_reaches_the_start(pose_scene):
 
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
 def test_covariance_is_calibrated(pose_scene, kernel):
-    """The normalised error squared, over many noisy views, averages to its six degrees of freedom."""
+    """The normalized error squared, over many noisy views, averages to its six degrees of freedom."""
     scene = pose_scene(batch=400, count=100, noise=1.3)
     refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel=kernel, scale=2.0)
     error = se3_log(scene.T_cw @ se3_inverse(refined.T_cw))

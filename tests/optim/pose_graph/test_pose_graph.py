@@ -17,7 +17,7 @@ from torchslam.geometry import (
     sim3_scale,
 )
 from torchslam.optim import PoseGraph, pose_graph_optimize
-from torchslam.optim.pose_graph._problem import PoseGraphProblem, build_layout
+from torchslam.optim.pose_graph._problem import PoseGraphProblem, build_pose_graph_layout
 from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, dissect, factorize_sparse
 from torchslam.optim.pose_graph.api import _sanitized
 
@@ -121,7 +121,7 @@ def test_derivatives_of_an_edge_are_those_of_autograd(angle: float, sigma: float
         with_scale=dims == 7,
     )
     counted, fixed, inputs = _sanitized(graph, 2.0)
-    problem = PoseGraphProblem(build_layout(graph.edges, counted, fixed, dims), inputs, "cauchy")
+    problem = PoseGraphProblem(build_pose_graph_layout(graph.edges, counted, fixed, dims), inputs, "cauchy")
 
     def cost(xi: Tensor) -> Tensor:
         moves = sim3_exp(torch.nn.functional.pad(xi.view(2, dims), (0, 7 - dims)))
@@ -403,13 +403,13 @@ def test_order_and_direction_of_edges_do_not_matter() -> None:
     shuffled = replace(scene.graph, edges=scene.graph.edges[order], S_ji=S_ji, information=information)
     # The error of the reversed edge is minus the adjoint of the reversed measurement times that of the edge.
     carry = sim3_adjoint(S_ji)
-    turned = replace(
+    transposed = replace(
         shuffled,
         edges=shuffled.edges.flip(-1),
         S_ji=sim3_inverse(S_ji),
         information=carry.mT @ information @ carry,
     )
-    for graph in (shuffled, turned):
+    for graph in (shuffled, transposed):
         other = pose_graph_optimize(graph, kernel="none", **CONVERGED)
         torch.testing.assert_close(other.S_cw, plain.S_cw, rtol=0, atol=1e-8)
         torch.testing.assert_close(other.cost, plain.cost)

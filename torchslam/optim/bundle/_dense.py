@@ -18,19 +18,19 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
 from torchslam.optim.bundle._problem import (
-    Estimate,
-    Given,
-    Inputs,
-    Moving,
+    BundleData,
+    BundleEstimate,
+    BundleInputs,
+    MovingParts,
     PriorTerms,
     block_diagonal,
     flat_rows,
     gauge_motions,
+    open_motions,
     prior_terms,
-    still_open,
 )
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.core.batching import Tensors, chosen, taken
+from torchslam.optim.core.batching import Tensors, index_tree, where_tree
 from torchslam.optim.core.linear import DefiniteFactor, factorize, inverse_root_3x3
 from torchslam.optim.core.residuals import (
     Expansion,
@@ -42,13 +42,13 @@ from torchslam.optim.core.residuals import (
     rounding_cost,
     variance_factor,
 )
-from torchslam.optim.core.tangent import cross_entries, retract, turned
+from torchslam.optim.core.tangent import cross_entries, retract, rotated
 
 # An observation of the sparse equations costs as much as so many cells of a grid.
-_SPARSEST = 8
+_MAX_CELLS_PER_OBSERVATION = 8
 
 
-class GridLayout(NamedTuple):
+class DenseLayout(NamedTuple):
     """The discrete part of the problems; every tensor leads with the batch.
 
     order:   (B, F) rows of T_cw, those that move first; rank: (B, F) its inverse
@@ -67,32 +67,32 @@ class GridLayout(NamedTuple):
     held_points: Tensor
 
 
-class GridData(NamedTuple):
+class DenseData(NamedTuple):
     """All that the problems are made of, in the layout's order.
 
-    inputs:    as `Inputs`, but pixels (B, F, 2, P) and weights (B, F, P), zero where nothing was seen
+    inputs:    as `BundleInputs`, but pixels (B, F, 2, P) and weights (B, F, P), zero where nothing was seen
     camera_of: (B, F) the camera of each frame
     """
 
-    layout: GridLayout
-    inputs: Inputs
+    layout: DenseLayout
+    inputs: BundleInputs
     camera_of: Tensor
 
 
-def fits_grids(given: Given, moving: Moving) -> bool:
+def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
     if given.weights.ndim > 2:
         return False  # whitening makes the grids' way of a pinhole camera a longer one
-    if not 0 < cells <= _SPARSEST * int(moving.counted.sum()):
+    if not 0 < cells <= _MAX_CELLS_PER_OBSERVATION * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
     return int(torch.bincount(places[moving.counted.flatten()], minlength=1).max()) <= 1
 
 
-def build_grid_layout(given: Given, moving: Moving) -> GridLayout:
-    """The grids of problems that `fits_grids`."""
+def build_dense_layout(given: BundleData, moving: MovingParts) -> DenseLayout:
+    """The grids of problems that `suits_dense`."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     order = torch.argsort((~moving.frames).int(), dim=1, stable=True)
     rank = torch.argsort(order, dim=1)
@@ -101,7 +101,7 @@ def build_grid_layout(given: Given, moving: Moving) -> GridLayout:
     frames = rank.gather(1, given.frame_index)
     seeing = torch.zeros_like(rank).scatter_add(1, frames, moving.counted.long()) > 0
     held = moving.counted & ~moving.points.gather(1, given.point_index)
-    return GridLayout(
+    return DenseLayout(
         order,
         rank,
         torch.where(moving.counted, frames * num_points + given.point_index, num_frames * num_points),
@@ -112,28 +112,28 @@ def build_grid_layout(given: Given, moving: Moving) -> GridLayout:
     )
 
 
-def grid_data(layout: GridLayout, given: Given) -> GridData:
+def dense_data(layout: DenseLayout, given: BundleData) -> DenseData:
     """The grids, filled."""
     inputs = given.inputs._replace(
-        T_cw=take(given.T_cw, layout.order),
+        T_cw=take_rows(given.T_cw, layout.order),
         pixels=_spread(layout, given.pixels.mT),
         weights=_spread(layout, given.weights[:, None])[:, :, 0],
     )
     if inputs.pose_prior is not None:
         inputs = inputs._replace(
-            prior_T_cw=take(given.prior_T_cw, layout.order),
-            prior_information=take(given.prior_information, layout.order),
+            prior_T_cw=take_rows(given.prior_T_cw, layout.order),
+            prior_information=take_rows(given.prior_information, layout.order),
         )
-    return GridData(layout, inputs, given.camera_index.gather(1, layout.order))
+    return DenseData(layout, inputs, given.camera_index.gather(1, layout.order))
 
 
-def take(tensor: Tensor, rows: Tensor) -> Tensor:
+def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
     """Rows (B, N) of (B, F, ...)."""
     index = rows.view(*rows.shape, *(1,) * (tensor.ndim - 2))
     return tensor.gather(1, index.expand(*rows.shape, *tensor.shape[2:]))
 
 
-def _spread(layout: GridLayout, values: Tensor) -> Tensor:
+def _spread(layout: DenseLayout, values: Tensor) -> Tensor:
     """Values (B, D, O) of observations in their cells, (B, F, D, P)."""
     (batch, num_frames), num_points = layout.order.shape, layout.free_points.shape[1]
     grid = values.new_zeros(batch, values.shape[1], num_frames * num_points + 1)
@@ -146,14 +146,14 @@ _AXES = torch.eye(3, dtype=torch.float64)
 _CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3))
 
 
-class GridExpansion(NamedTuple):
+class DenseExpansion(NamedTuple):
     """`residuals.Expansion` of every frame and point: gradient (B, F, D, P), hessian (B, F, D, D, P), D = 3 + K."""
 
     gradient: Tensor
     hessian: Tensor
 
 
-class GridEquations(NamedTuple):
+class DenseEquations(NamedTuple):
     """Gradient and Hessian over F free frames, which move along the axes of the world as in `_sparse`, and the
     cameras, D = 6 F + K, and points.
 
@@ -167,9 +167,9 @@ class GridEquations(NamedTuple):
     coupling: Tensor
 
 
-def assemble_grid(
-    expansion: GridExpansion, rays_w: Tensor, R_cw: Tensor, free: Tensor, exact: bool
-) -> GridEquations:
+def assemble_dense(
+    expansion: DenseExpansion, rays_w: Tensor, R_cw: Tensor, free: Tensor, exact: bool
+) -> DenseEquations:
     """Normal equations over the first frames, of which those that are free (B, F') move, all points, and the cameras.
 
     expansion: in the points in the camera frames
@@ -189,8 +189,8 @@ def assemble_grid(
     sums = _sum_by_frame(slope, across, coupling, rays_w, exact)
     if exact:
         eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[None, None, ..., None]
-        bend = torch.stack(cross_entries(slope[:, :, :, None].unbind(2), eye.unbind(2)), dim=2)
-        coupling = coupling - torch.nn.functional.pad(bend, (0, 0, 0, 0, 3, 0))
+        curvature_term = torch.stack(cross_entries(slope[:, :, :, None].unbind(2), eye.unbind(2)), dim=2)
+        coupling = coupling - torch.nn.functional.pad(curvature_term, (0, 0, 0, 0, 3, 0))
     gradient, frames, frames_camera = sums
     if not free.all():  # what only fills up stays where it is
         gradient = torch.where(free[..., None], gradient, 0.0)
@@ -211,7 +211,7 @@ def assemble_grid(
             dim=1,
         )
     gradient = torch.cat((gradient.flatten(1), expansion.gradient[:, :, 3:].sum((1, -1))), dim=-1)
-    return GridEquations(gradient, points_gradient, reduced, points, coupling)
+    return DenseEquations(gradient, points_gradient, reduced, points, coupling)
 
 
 def _times(R: Tensor, columns: Tensor) -> Tensor:
@@ -236,14 +236,14 @@ def _sum_by_frame(
     if exact:
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
         trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        bend = 0.5 * (outer + outer.mT) - trace * eye
-        frames = frames + torch.nn.functional.pad(bend, (3, 0, 3, 0))
+        curvature_term = 0.5 * (outer + outer.mT) - trace * eye
+        frames = frames + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
     sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, F, 3, K, 4)
-    turned = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
-    return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], turned), dim=-2)
+    rotated = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
+    return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], rotated), dim=-2)
 
 
-class FactorizedGrid(NamedTuple):
+class FactorizedDense(NamedTuple):
     """Equations ready to be solved for any right side: the inverse roots (B, 3, 3, P) of the points' blocks, zero for
     points that do not move, the coupling times them (B, D, 3 P), and what is left for frames and cameras."""
 
@@ -271,15 +271,15 @@ class FactorizedGrid(NamedTuple):
         return inverse, root.mT @ inner @ root
 
 
-def factorized_grid(
-    equations: GridEquations,
+def factorize_dense(
+    equations: DenseEquations,
     free: Tensor,
     free_points: Tensor,
     num_camera: int,
     damping: Tensor | None = None,
     gauge: Tensor | None = None,
-) -> FactorizedGrid:
-    """Eliminate the points and factorise what is left, as `NormalEquations.factorized` does.
+) -> FactorizedDense:
+    """Eliminate the points and factorize what is left, as `NormalEquations.factorized` does.
 
     free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,)
     gauge: (B, 6 F, g)
@@ -305,7 +305,7 @@ def factorized_grid(
         c = gauge * _mean_of(reduced, free, num_camera).sqrt()[:, None, None]
         c = torch.nn.functional.pad(c, (0, 0, 0, num_camera))
         reduced = torch.baddbmm(reduced, c, c.mT)
-    return FactorizedGrid(root, whitened, factorize(reduced, strict=damping is None))
+    return FactorizedDense(root, whitened, factorize(reduced, strict=damping is None))
 
 
 def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
@@ -330,7 +330,7 @@ def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tenso
     return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=1).unflatten(1, (3, 3))
 
 
-class GridEstimate(NamedTuple):
+class DenseEstimate(NamedTuple):
     """Poses (B, F, 4, 4) in the layout's order, points (B, 3, P), camera parameters (B, C, K)."""
 
     T_cw: Tensor
@@ -338,22 +338,22 @@ class GridEstimate(NamedTuple):
     params: Tensor
 
 
-class GridModel(NamedTuple):
+class DenseModel(NamedTuple):
     """The local models of the costs (B,) at an estimate."""
 
-    estimate: GridEstimate
+    estimate: DenseEstimate
     cost: Tensor
-    equations: GridEquations
+    equations: DenseEquations
 
 
 @dataclass(frozen=True)
-class GridBundle:
+class DenseBundle:
     """Bundle adjustments for `levenberg_marquardt.minimize`, and what follows from their minima.
 
     directions: (K, n) in which the cameras' parameters move, None where they do not
     """
 
-    data: GridData
+    data: DenseData
     camera: Camera
     kernel: Kernel
     directions: Tensor | None
@@ -365,24 +365,24 @@ class GridBundle:
         return observed | layout.free.any(1) if has_prior else observed
 
     @property
-    def start(self) -> GridEstimate:
+    def start(self) -> DenseEstimate:
         inputs = self.data.inputs
-        return GridEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
+        return DenseEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
 
     def rounding(self) -> Tensor:
         return rounding_cost(self.data.inputs.weights, self.data.inputs.params)
 
-    def part(self, rows: Tensor) -> GridBundle:
+    def part(self, rows: Tensor) -> DenseBundle:
         """The problems of some elements of the batch."""
-        return replace(self, data=taken(self.data, rows))
+        return replace(self, data=index_tree(self.data, rows))
 
-    def evaluate(self, estimate: GridEstimate, near: Tensor) -> GridModel:
+    def evaluate(self, estimate: DenseEstimate, use_curvature: Tensor) -> DenseModel:
         points_c = self._points_c(estimate)
         lin = self._linearize(estimate, points_c)
-        equations, prior_cost = self._equations(estimate, _expanded(lin, near))
-        return GridModel(estimate, lin.cost.sum((1, 2)) + prior_cost, equations)
+        equations, prior_cost = self._equations(estimate, _expanded(lin, use_curvature))
+        return DenseModel(estimate, lin.cost.sum((1, 2)) + prior_cost, equations)
 
-    def step(self, model: GridModel, damping: Tensor) -> tuple[GridEstimate, Tensor]:
+    def step(self, model: DenseModel, damping: Tensor) -> tuple[DenseEstimate, Tensor]:
         equations, (T_cw, points_w, params) = model.equations, model.estimate
         factorized = self._factorized(model.estimate, equations, damping)
         step, points = factorized.solve(equations.gradient, equations.points_gradient)
@@ -390,20 +390,20 @@ class GridBundle:
         decrease = torch.where(factorized.reduced.definite, 0.5 * decrease, torch.inf)
         frames, camera = self._split(step)
         leading = frames.shape[1]
-        moved = retract(T_cw[:, :leading], -turned(T_cw[:, :leading, :3, :3], frames[..., None])[..., 0])
+        moved = retract(T_cw[:, :leading], -rotated(T_cw[:, :leading, :3, :3], frames[..., None])[..., 0])
         T_cw = torch.cat((moved, T_cw[:, leading:]), dim=1)
         if self.directions is not None:
             params = params - camera.unflatten(1, (params.shape[1], -1)) @ self.directions.mT
-        return GridEstimate(T_cw, points_w - points, params), decrease
+        return DenseEstimate(T_cw, points_w - points, params), decrease
 
-    def select(self, accept: Tensor, new: GridModel, old: GridModel) -> GridModel:
-        return new if accept.all() else chosen(accept, new, old)
+    def select(self, accept: Tensor, new: DenseModel, old: DenseModel) -> DenseModel:
+        return new if accept.all() else where_tree(accept, new, old)
 
-    def definite(self, model: GridModel) -> Tensor:
+    def definite(self, model: DenseModel) -> Tensor:
         """(B,) whether all that moves is determined, up to the gauge."""
         return self._factorized(model.estimate, model.equations).reduced.definite
 
-    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
         layout, ordered = self.data.layout, self.ordered(estimate)
         points_c = self._points_c(ordered)
@@ -417,16 +417,16 @@ class GridBundle:
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = right
-            frames = torch.where(layout.free[..., None], take(frames, layout.order)[:, :leading], 0.0)
-            frames = turned(R_cw.mT, frames[..., None])[..., 0]
+            frames = torch.where(layout.free[..., None], take_rows(frames, layout.order)[:, :leading], 0.0)
+            frames = rotated(R_cw.mT, frames[..., None])[..., 0]
             solved, points = factorized.solve(torch.cat((frames.flatten(1), camera), dim=1), points.mT)
             frames, camera = self._split(solved)
-            frames = torch.nn.functional.pad(turned(R_cw, frames[..., None])[..., 0], (0, 0, 0, padding))
-            return take(frames, layout.rank), points.mT, camera
+            frames = torch.nn.functional.pad(rotated(R_cw, frames[..., None])[..., 0], (0, 0, 0, padding))
+            return take_rows(frames, layout.rank), points.mT, camera
 
         return solve
 
-    def marginals(self, estimate: Estimate) -> Marginals:
+    def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (B, F, 6, 6), (B, P, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
         layout, ordered = self.data.layout, self.ordered(estimate)
         points_c = self._points_c(ordered)
@@ -445,32 +445,32 @@ class GridBundle:
         leading = layout.free.shape[1]
         size, R_cw = 6 * leading, ordered.T_cw[:, :leading, :3, :3]
         frames = inverse[:, :size, :size].unflatten(1, (-1, 6)).unflatten(3, (-1, 6)).diagonal(dim1=1, dim2=3)
-        frames = turned(R_cw, turned(R_cw, frames.movedim(-1, 1)).mT)
+        frames = rotated(R_cw, rotated(R_cw, frames.movedim(-1, 1)).mT)
         frames = torch.where(layout.free[..., None, None], frames, 0.0)
         padding = layout.order.shape[1] - leading
-        frames = take(torch.nn.functional.pad(frames, (0, 0, 0, 0, 0, padding)), layout.rank)
+        frames = take_rows(torch.nn.functional.pad(frames, (0, 0, 0, 0, 0, padding)), layout.rank)
         return Marginals(frames, points, inverse[:, size:, size:])
 
-    def ordered(self, estimate: Estimate) -> GridEstimate:
+    def ordered(self, estimate: BundleEstimate) -> DenseEstimate:
         """An estimate as the grids have it."""
-        T_cw = take(estimate.T_cw, self.data.layout.order)
-        return GridEstimate(T_cw, estimate.points_w.mT, estimate.params)
+        T_cw = take_rows(estimate.T_cw, self.data.layout.order)
+        return DenseEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
-    def in_order(self, estimate: GridEstimate) -> Estimate:
+    def in_order(self, estimate: DenseEstimate) -> BundleEstimate:
         """An estimate as the problems have it."""
-        T_cw = take(estimate.T_cw, self.data.layout.rank)
-        return Estimate(T_cw, estimate.points_w.mT, estimate.params)
+        T_cw = take_rows(estimate.T_cw, self.data.layout.rank)
+        return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
-    def _points_c(self, estimate: GridEstimate) -> Tensor:
+    def _points_c(self, estimate: DenseEstimate) -> Tensor:
         """(B, F, 3, P)"""
         T_cw = estimate.T_cw
         return T_cw[..., :3, :3] @ estimate.points_w[:, None] + T_cw[..., :3, 3:]
 
-    def _observations(self, estimate: GridEstimate) -> Observations:
+    def _observations(self, estimate: DenseEstimate) -> Observations:
         inputs = self.data.inputs
         params = estimate.params
         if params.shape[1] > 1:
-            params = take(params, self.data.camera_of)
+            params = take_rows(params, self.data.camera_of)
         camera, scale = self.camera.with_params(params), inputs.scale[:, None, None]
         return Observations(inputs.pixels.mT, inputs.weights, camera, self.kernel, scale)
 
@@ -482,22 +482,22 @@ class GridBundle:
         columns = camera_columns(self.directions, num_cameras)
         return columns[0] if num_cameras == 1 else columns[self.data.camera_of][:, :, None]
 
-    def _linearize(self, estimate: GridEstimate, points_c: Tensor) -> Linearization:
+    def _linearize(self, estimate: DenseEstimate, points_c: Tensor) -> Linearization:
         """Of every frame and point, (B, F, P, ...)."""
         lin = linearize(self._observations(estimate), points_c.mT, self.directions is not None)
         return lin if self.directions is None else lin._replace(J=lin.J @ self._columns)
 
     def _equations(
         self,
-        estimate: GridEstimate,
-        expansion: GridExpansion,
+        estimate: DenseEstimate,
+        expansion: DenseExpansion,
         exact: bool = False,
         share: Tensor | float = 1.0,
-    ) -> tuple[GridEquations, Tensor | float]:
+    ) -> tuple[DenseEquations, Tensor | float]:
         """The equations with a share of the priors, and the priors' cost (B,)."""
         R_cw, t_cw = estimate.T_cw[..., :3, :3], estimate.T_cw[..., :3, 3:]
         rays_w = estimate.points_w[:, None] + R_cw.mT @ t_cw
-        equations = assemble_grid(expansion, rays_w, R_cw, self.data.layout.free, exact)
+        equations = assemble_dense(expansion, rays_w, R_cw, self.data.layout.free, exact)
         terms = self._priors(estimate, exact)
         if terms is None:
             return equations, 0.0
@@ -513,7 +513,7 @@ class GridBundle:
             terms.cost,
         )
 
-    def _priors(self, estimate: GridEstimate, exact: bool = False) -> PriorTerms | None:
+    def _priors(self, estimate: DenseEstimate, exact: bool = False) -> PriorTerms | None:
         inputs, free = self.data.inputs, self.data.layout.free
         if inputs.pose_prior is not None:
             leading = free.shape[1]
@@ -531,15 +531,15 @@ class GridBundle:
         return vector[:, : 6 * leading].unflatten(1, (leading, 6)), vector[:, 6 * leading :]
 
     def _factorized(
-        self, estimate: GridEstimate, equations: GridEquations, damping: Tensor | None = None
-    ) -> FactorizedGrid:
+        self, estimate: DenseEstimate, equations: DenseEquations, damping: Tensor | None = None
+    ) -> FactorizedDense:
         layout = self.data.layout
         more = equations.reduced.shape[-1] - 6 * layout.free.shape[1]
-        return factorized_grid(
+        return factorize_dense(
             equations, layout.free, layout.free_points, more, damping, self._gauge(estimate)
         )
 
-    def _gauge(self, estimate: GridEstimate) -> Tensor | None:
+    def _gauge(self, estimate: DenseEstimate) -> Tensor | None:
         """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None
         where nowhere."""
         layout = self.data.layout
@@ -549,7 +549,7 @@ class GridBundle:
             return None
         T_free = estimate.T_cw[:, : free.shape[1]]
         first = torch.where(anchors > 0, layout.anchors.int().argmax(1), 0)[:, None]
-        similarity = gauge_motions(T_free, se3_inverse(take(estimate.T_cw, first))[..., :3, 3])
+        similarity = gauge_motions(T_free, se3_inverse(take_rows(estimate.T_cw, first))[..., :3, 3])
         scaling = similarity[..., 0]
         scaling = torch.where((free & is_open[:, None])[..., None], scaling, 0.0)
         length = scaling.square().sum((1, 2), keepdim=True)
@@ -564,20 +564,20 @@ class GridBundle:
             motions = torch.cat((motions, rest), dim=-1)
         with torch.no_grad():
             priors = self._priors(estimate)
-            motions = motions if priors is None else still_open(motions, priors.frames)
+            motions = motions if priors is None else open_motions(motions, priors.frames)
         return motions.flatten(1, 2)
 
 
-def _expanded(lin: Linearization, near: Tensor) -> GridExpansion:
-    """Without the bend of the projection; near: (B,)."""
+def _expanded(lin: Linearization, use_curvature: Tensor) -> DenseExpansion:
+    """Without the curvature of the projection; use_curvature: (B,)."""
     J = lin.J.movedim((-2, -1), (0, 1))
-    gradient, hessian = gauss_newton_expansion(lin, J, near[:, None, None])
-    return GridExpansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())
+    gradient, hessian = gauss_newton_expansion(lin, J, use_curvature[:, None, None])
+    return DenseExpansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())
 
 
-def _as_grid(expansion: Expansion) -> GridExpansion:
+def _as_grid(expansion: Expansion) -> DenseExpansion:
     """(B, F, P, D) and (B, F, P, D, D) with the points last."""
-    return GridExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
+    return DenseExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
 
 
 def camera_columns(directions: Tensor, num_cameras: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Bundle adjustments as `implicit.minimum` takes them: a batch, in the order of the problem, whatever solves it."""
+"""Bundle adjustments as `implicit_minimum` takes them: batches in the order of the problem, whatever solves them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,23 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle._dense import GridBundle, GridLayout, build_grid_layout, fits_grids, grid_data
-from torchslam.optim.bundle._problem import Estimate, Given, Moving, flat_rows, prior_terms, what_moves
+from torchslam.optim.bundle._dense import (
+    DenseBundle,
+    DenseLayout,
+    build_dense_layout,
+    dense_data,
+    suits_dense,
+)
+from torchslam.optim.bundle._problem import (
+    BundleData,
+    BundleEstimate,
+    MovingParts,
+    flat_rows,
+    prior_terms,
+    select_moving,
+)
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.bundle._sparse import Bundle, Layout, build_layout
+from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
 from torchslam.optim.core.batching import Tensors
 from torchslam.optim.core.implicit import Ndims
 from torchslam.optim.core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize
@@ -24,7 +37,7 @@ from torchslam.optim.core.tangent import move, pull_back, push, retract
 _CELLS_AT_ONCE, _CELLS_ON_DEVICE = 1 << 14, 1 << 20
 
 
-class Found(NamedTuple):
+class BundleMinimum(NamedTuple):
     """The estimates, what moved (B, F), (B, P), what counted (B, O), and how it went (B,)."""
 
     T_cw: Tensor
@@ -40,19 +53,19 @@ class Found(NamedTuple):
     initial_cost: Tensor
 
     @property
-    def estimate(self) -> Estimate:
-        return Estimate(self.T_cw, self.points_w, self.params)
+    def estimate(self) -> BundleEstimate:
+        return BundleEstimate(self.T_cw, self.points_w, self.params)
 
 
-class Part(NamedTuple):
+class BatchPart(NamedTuple):
     """Elements that are solved together, and their layout: that of one problem, or grids of several."""
 
     rows: slice
-    layout: Layout | GridLayout
+    layout: SparseLayout | DenseLayout
 
 
-class Bundles(LeastSquares[X, M], Protocol[X, M]):
-    """What solves elements, `Bundle` one and `GridBundle` many, in a way and an order of its own."""
+class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
+    """What solves elements, `SparseBundle` one and `DenseBundle` many, in a way and an order of its own."""
 
     @property
     def start(self) -> X: ...
@@ -61,26 +74,29 @@ class Bundles(LeastSquares[X, M], Protocol[X, M]):
         """(B,) whether all that moves is determined, up to the gauge."""
         ...
 
-    def ordered(self, estimate: Estimate) -> X:
+    def ordered(self, estimate: BundleEstimate) -> X:
         """The estimate (B, ...) in the order of the problems as this one has it."""
         ...
 
-    def in_order(self, estimate: X) -> Estimate:
+    def in_order(self, estimate: X) -> BundleEstimate:
         """The way back."""
         ...
 
-    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
         ...
 
-    def marginals(self, estimate: Estimate) -> Marginals:
+    def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances in the order of the problems."""
         ...
 
 
 class BundleMinimization:
-    """Bundle adjustments of inputs `Given`; vectors are frames (B, F, 6), points (B, P, 3) and cameras (B, C n): along
-    the directions (K, n) in which each may move, none where they are fixed."""
+    """Bundle adjustments of inputs `BundleData`.
+
+    Vectors are frames (B, F, 6), points (B, P, 3) and cameras (B, C n): along the directions (K, n) in which each may
+    move, none where they are fixed.
+    """
 
     num_unknowns = 3
     num_vectors = 3
@@ -106,15 +122,15 @@ class BundleMinimization:
         self.free_camera = free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
         self.check = check
-        self._last: tuple[Tensor, Moving, list[Part]] | None = None
+        self._last: tuple[Tensor, MovingParts, list[BatchPart]] | None = None
 
-    def minimize(self, inputs: Tensors) -> Found:
-        given = Given(*inputs)
+    def minimize(self, inputs: Tensors) -> BundleMinimum:
+        given = BundleData(*inputs)
         moving, parts = self._laid_out(given)
-        return Found(*_joined([self._minimize(given, moving, part) for part in parts]))
+        return BundleMinimum(*_joined([self._minimize(given, moving, part) for part in parts]))
 
-    def _minimize(self, given: Given, moving: Moving, part: Part) -> Found:
-        bundle, moving = self._bundle(given, part), Moving(*(mask[part.rows] for mask in moving))
+    def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
+        bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
         model, convergence = minimize(
             bundle, bundle.start, self.iterations, self.tolerance, self._progress(given, part)
         )
@@ -122,7 +138,7 @@ class BundleMinimization:
             success = bundle.solvable & given.finite[part.rows]
             if self.check:
                 success = success & bundle.definite(model)
-        return Found(
+        return BundleMinimum(
             *bundle.in_order(model.estimate),
             success,
             moving.frames,
@@ -135,7 +151,7 @@ class BundleMinimization:
         )
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
-        found, given = Found(*found), Given(*inputs)
+        found, given = BundleMinimum(*found), BundleData(*inputs)
         with torch.no_grad():
             solvers = [
                 (part.rows, bundle.exact_solver(_part(found.estimate, part)))
@@ -151,7 +167,7 @@ class BundleMinimization:
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
         frames, points, camera = direction
-        found, given = Found(*found), Given(*inputs)
+        found, given = BundleMinimum(*found), BundleData(*inputs)
         at = self.at_minimum(found, given)
         in_frames = flat_rows(given.frame_index, given.T_cw.shape[1])
         in_points = flat_rows(given.point_index, given.points_w.shape[1])
@@ -177,7 +193,7 @@ class BundleMinimization:
             turning = self._along(camera, at.params).flatten(0, 1)
             turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
             velocity = torch.cat((velocity, turning), dim=-1)
-        slope = (lin.force[:, None, :] @ lin.J @ velocity[..., None]).sum()
+        slope = (lin.gradient_wrt_residual[:, None, :] @ lin.J @ velocity[..., None]).sum()
         terms = prior_terms(
             given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
         )
@@ -185,7 +201,7 @@ class BundleMinimization:
             return slope
         return slope + (terms.frames_gradient * frames).sum() + (terms.camera_gradient * camera).sum()
 
-    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+    def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
         T_cw, points_w, params, *rest = found
         params = params + self._along(camera, params)
@@ -215,64 +231,64 @@ class BundleMinimization:
             return torch.zeros_like(params)
         return step.unflatten(1, (params.shape[1], directions.shape[1])) @ directions.mT
 
-    def at_minimum(self, found: Found, given: Given) -> Estimate:
+    def at_minimum(self, found: BundleMinimum, given: BundleData) -> BundleEstimate:
         """The minima where things moved, the inputs, with their derivatives, where they did not."""
         params = given.params if self.free_camera is False else found.params
         if isinstance(
             self.free_camera, Tensor
         ):  # what does not move of the parameters reaches them unchanged
             params = params + (given.params - given.params.detach())
-        return Estimate(
+        return BundleEstimate(
             torch.where(found.moved_frames[..., None, None], found.T_cw, given.T_cw),
             torch.where(found.moved_points[..., None], found.points_w, given.points_w),
             params,
         )
 
-    def last_step(self, found: Found, inputs: Tensors) -> Estimate:
+    def last_step(self, found: BundleMinimum, inputs: Tensors) -> BundleEstimate:
         """The estimates after one more step from the minima, with the gradient of that step."""
-        given = Given(*inputs)
+        given = BundleData(*inputs)
         at, steps = self.at_minimum(found, given), []
         for part, bundle in self._bundles(given):
             model = bundle.evaluate(bundle.ordered(_part(at, part)), ~bundle.solvable)
             solution, _ = bundle.step(model, torch.zeros_like(model.cost))
             steps.append(bundle.in_order(solution))
-        return Estimate(*_joined(steps))
+        return BundleEstimate(*_joined(steps))
 
-    def marginals(self, found: Found, inputs: Sequence[Tensor]) -> Marginals:
+    def marginals(self, found: BundleMinimum, inputs: Sequence[Tensor]) -> Marginals:
         with torch.no_grad():
-            bundles = self._bundles(Given(*inputs))
+            bundles = self._bundles(BundleData(*inputs))
             return Marginals(
                 *_joined([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
             )
 
-    def _progress(self, given: Given, part: Part) -> Progress | None:
+    def _progress(self, given: BundleData, part: BatchPart) -> Progress | None:
         """Told of the iterations of all elements, as if one came after the other."""
         told, before = self.progress, self.iterations * part.rows.start
         return None if told is None else lambda now, most: told(before + now, most * len(given.T_cw))
 
-    def _bundles(self, given: Given) -> list[tuple[Part, Bundles[Any, Any]]]:
+    def _bundles(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any, Any]]]:
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
-    def _bundle(self, given: Given, part: Part) -> Bundles[Any, Any]:
+    def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any, Any]:
         given, layout = given.part(part.rows), part.layout
         directions = self._directions(given.params)
-        if isinstance(layout, GridLayout):
-            return GridBundle(grid_data(layout, given), self.camera, self.kernel, directions)
-        one = Given(*(tensor[0] for tensor in given))
-        return Bundle(layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0])
+        if isinstance(layout, DenseLayout):
+            return DenseBundle(dense_data(layout, given), self.camera, self.kernel, directions)
+        one = BundleData(*(tensor[0] for tensor in given))
+        return SparseBundle(layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0])
 
-    def _laid_out(self, given: Given) -> tuple[Moving, list[Part]]:
+    def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
         if self._last is None or not torch.equal(self._last[0], given.counted):
-            moving = what_moves(given)
+            moving = select_moving(given)
             self._last = given.counted, moving, _parts(given, moving)
         return self._last[1:]
 
 
-def _parts(given: Given, moving: Moving) -> list[Part]:
+def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
     """How a batch is solved: on grids, as many at once as fit, or one after the other."""
     batch = len(given.T_cw)
-    use_grids = batch > 1 and fits_grids(given, moving)
+    use_grids = batch > 1 and suits_dense(given, moving)
     size = 1
     if use_grids:
         cells = _CELLS_AT_ONCE if given.T_cw.device.type == "cpu" else _CELLS_ON_DEVICE
@@ -280,18 +296,18 @@ def _parts(given: Given, moving: Moving) -> list[Part]:
     parts = []
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))
-        of_part = Moving(*(mask[rows] for mask in moving))
+        of_part = MovingParts(*(mask[rows] for mask in moving))
         if use_grids:
-            parts.append(Part(rows, build_grid_layout(given.part(rows), of_part)))
+            parts.append(BatchPart(rows, build_dense_layout(given.part(rows), of_part)))
             continue
         counted, frames, points = (mask[0] for mask in of_part)
         index = given.frame_index[start], given.point_index[start]
-        parts.append(Part(rows, build_layout(*index, counted, frames, points)))
+        parts.append(BatchPart(rows, build_sparse_layout(*index, counted, frames, points)))
     return parts
 
 
-def _part(estimate: Estimate, part: Part) -> Estimate:
-    return Estimate(*(tensor[part.rows] for tensor in estimate))
+def _part(estimate: BundleEstimate, part: BatchPart) -> BundleEstimate:
+    return BundleEstimate(*(tensor[part.rows] for tensor in estimate))
 
 
 def _joined(parts: Sequence[Tensors]) -> Tensors:

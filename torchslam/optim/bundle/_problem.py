@@ -14,30 +14,32 @@ from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
 from torchslam.optim.core.priors import CameraPrior, PosePrior, prior_expansion, prior_hessian
 from torchslam.optim.core.residuals import only, usable
-from torchslam.optim.core.tangent import turned
+from torchslam.optim.core.tangent import rotated
 
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Who saw what where: O observations of P points by F frames; or B such problems at once.
+    """O observations of P points by F frames; or a batch of B such problems.
 
-    T_cw:         (F, 4, 4) start, world to camera; (B, F, 4, 4) makes it a batch. What else of a batch has no leading
-                  dimension is the same for all.
-    points_w:     (P, 3) start
-    frame_index:  (O,) int64 rows of T_cw; point_index: (O,) int64 rows of points_w
-    pixels:       (O, 2)
-    camera:       one for all frames, params (K,); with `camera_index` C of them, all of one model and size, (C, K)
-    weights:      (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
-                  definite; one if None
-    fixed_frames: rows of T_cw, or an (F,) bool mask, that stay as they are. One frame fixes all but the scale, which
-                  then is that of the start; with none the answer keeps the position and the orientation, too.
-                  Whatever more is fixed, or held by priors, constrains the shape.
-    fixed_points: rows of points_w, or a (P,) bool mask, likewise
-    mask:         (O,) bool, observations that count, all if None: what fills up the smaller problems of a batch may
-                  hold anything, its indices being in range
-    camera_index: (F,) int64 the camera of each frame
-    pose_prior:   where frames are expected: (F, 4, 4) with information (F, 6, 6), zero for frames without
-    camera_prior: where the parameters of a free camera are expected
+    `T_cw` (B, F, 4, 4) makes it a batch. Everything else may lead with B, too; without, it is shared by all problems.
+
+    Attributes:
+        T_cw: (F, 4, 4) world to camera, the start.
+        points_w: (P, 3) start.
+        frame_index: (O,) int64 rows of T_cw.
+        point_index: (O,) int64 rows of points_w.
+        pixels: (O, 2)
+        camera: one for all frames, params (K,); with `camera_index` C cameras of one model and size, (C, K).
+        weights: (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
+            definite; one if None.
+        fixed_frames: rows of T_cw, or an (F,) bool mask. One fixed frame leaves the scale open, which then stays that
+            of the start; without any, position and orientation stay as well.
+        fixed_points: rows of points_w, or a (P,) bool mask.
+        mask: (O,) bool, observations that count, all if None. Padding of smaller problems in a batch may hold any
+            values, with indices in range.
+        camera_index: (F,) int64 camera of each frame.
+        pose_prior: T_cw (F, 4, 4) and information (F, 6, 6), zero for frames without a prior.
+        camera_prior: prior on the parameters of free cameras.
     """
 
     T_cw: Tensor
@@ -59,7 +61,7 @@ class BundleProblem:
         return self.T_cw.ndim == 4
 
 
-class Inputs(NamedTuple):
+class BundleInputs(NamedTuple):
     """All that gradients may flow to, in the order of the problem; every tensor of a batch of B leads with it.
 
     params (C, K), scale (); priors have no rows where there are none.
@@ -87,8 +89,8 @@ class Inputs(NamedTuple):
         return CameraPrior(self.prior_params, self.prior_params_information)
 
 
-class Given(NamedTuple):
-    """All that bundle adjustments are made of, batched: the tensors of `Inputs`, which observations count (B, O),
+class BundleData(NamedTuple):
+    """All that bundle adjustments are made of, batched: the tensors of `BundleInputs`, which observations count (B, O),
     whether all frames that anything counts of are finite (B,), the rows of `BundleProblem`, and what may move, (B, F)
     and (B, P)."""
 
@@ -111,20 +113,20 @@ class Given(NamedTuple):
     free_points: Tensor
 
     @property
-    def inputs(self) -> Inputs:
-        return Inputs(*self[: len(Inputs._fields)])
+    def inputs(self) -> BundleInputs:
+        return BundleInputs(*self[: len(BundleInputs._fields)])
 
     @property
     def camera_of(self) -> Tensor:
         """(B, O) the camera of each observation."""
         return self.camera_index.gather(1, self.frame_index)
 
-    def part(self, rows: slice) -> Given:
+    def part(self, rows: slice) -> BundleData:
         """Some elements of the batch."""
-        return Given(*(tensor[rows] for tensor in self))
+        return BundleData(*(tensor[rows] for tensor in self))
 
 
-class Estimate(NamedTuple):
+class BundleEstimate(NamedTuple):
     """(F, 4, 4) poses, (P, 3) points in the layout's order, (C, K) camera parameters."""
 
     T_cw: Tensor
@@ -136,7 +138,7 @@ _MIN_POINTS_PER_FRAME = 3
 _MIN_FRAMES_PER_POINT = 2
 
 
-class Moving(NamedTuple):
+class MovingParts(NamedTuple):
     """(B, O) bool, the observations that count; (B, F), (B, P) bool, the frames and points that move."""
 
     counted: Tensor
@@ -144,7 +146,7 @@ class Moving(NamedTuple):
     points: Tensor
 
 
-def what_moves(given: Given) -> Moving:
+def select_moving(given: BundleData) -> MovingParts:
     """Of what may move, points seen less than twice and frames that see less than three points and have no prior stay,
     and are not observed."""
     frame_index, point_index, counted = given.frame_index, given.point_index, given.counted
@@ -154,7 +156,7 @@ def what_moves(given: Given) -> Moving:
     if given.inputs.pose_prior is not None:
         seeing = seeing | (given.prior_information != 0).flatten(2).any(-1)
     counted = counted & (seeing | ~given.free_frames).gather(1, frame_index)
-    return Moving(counted, given.free_frames & seeing, given.free_points & seen)
+    return MovingParts(counted, given.free_frames & seeing, given.free_points & seen)
 
 
 def _counts(index: Tensor, counted: Tensor, of: Tensor) -> Tensor:
@@ -168,7 +170,7 @@ def flat_rows(index: Tensor, size: int) -> Tensor:
     return (index + size * torch.arange(len(index), device=index.device)[:, None]).flatten()
 
 
-def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
+def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
     """The problem as a batch, with zero or the identity for what is not finite.
 
     Raises ValueError for shapes, dtypes and indices that do not fit.
@@ -201,7 +203,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> Given:
     wanted = frame_index.new_zeros(batch, num_frames)
     wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
-    return Given(
+    return BundleData(
         torch.where(is_finite[..., None, None], T_cw, eye),
         torch.where(torch.isfinite(points_w), points_w, 0.0),
         torch.where(counted[..., None], pixels, 0.0),
@@ -314,13 +316,13 @@ class PriorTerms(NamedTuple):
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., F, 3, 3) that move along the axes of the world."""
-        frames = turned(R_cw.mT, turned(R_cw.mT, self.frames).mT)
-        gradient = turned(R_cw.mT, self.frames_gradient[..., None])[..., 0]
+        frames = rotated(R_cw.mT, rotated(R_cw.mT, self.frames).mT)
+        gradient = rotated(R_cw.mT, self.frames_gradient[..., None])[..., 0]
         return self._replace(frames_gradient=gradient, frames=frames)
 
 
 def prior_terms(
-    inputs: Inputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
+    inputs: BundleInputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
 ) -> PriorTerms | None:
     """The terms at poses (..., F, 4, 4) and parameters (..., C, K); None where there are no priors.
 
@@ -360,10 +362,10 @@ def gauge_motions(T_cw: Tensor, origin_w: Tensor) -> Tensor:
     """How frames (..., F, 4, 4) move along the axes of the world, (..., F, 6, 7): with the scale about a point
     (..., 3) or (..., 1, 3), and with each of the six rigid motions of the world."""
     scaling = torch.nn.functional.pad(transform(T_cw, origin_w[..., None, :]).squeeze(-2), (0, 3))[..., None]
-    return turned(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
+    return rotated(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
 
 
-def still_open(motions: Tensor, H_frames: Tensor) -> Tensor:
+def open_motions(motions: Tensor, H_frames: Tensor) -> Tensor:
     """Of orthonormal motions (..., F, 6, g) of all frames those that priors (..., F, 6, 6) do not hinder; else zero."""
     held = torch.einsum("...fag,...fab,...fbh->...gh", motions, H_frames, motions)
     stiffness, mixtures = torch.linalg.eigh(held)

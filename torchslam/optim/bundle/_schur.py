@@ -123,14 +123,14 @@ def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, n
     )
 
 
-class Tangent(NamedTuple):
+class BundleTangent(NamedTuple):
     """A vector over all unknowns: frames (F, 6), points (P, 3), camera (K,); K = 0 where the camera is fixed."""
 
     frames: Tensor
     points: Tensor
     camera: Tensor
 
-    def dot(self, other: Tangent) -> Tensor:
+    def dot(self, other: BundleTangent) -> Tensor:
         products = (mine * others for mine, others in zip(self, other, strict=True))
         return torch.stack([product.sum() for product in products]).sum()
 
@@ -145,7 +145,7 @@ class NormalEquations:
     """
 
     structure: Structure
-    gradient: Tangent
+    gradient: BundleTangent
     frames: Tensor
     points: Tensor
     camera: Tensor
@@ -155,7 +155,7 @@ class NormalEquations:
     free_points: Tensor
 
     def factorized(self, damping: Tensor | None = None, gauge: Tensor | None = None) -> FactorizedEquations:
-        """Eliminate the points and factorise what is left, after the diagonals grew by the share `damping`.
+        """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
 
         Points that their observations do not determine are left out, as if fixed.
         gauge: (F, 6, g) directions of the frames along which the solution is to be zero. Where these fix what the
@@ -221,7 +221,7 @@ class FactorizedEquations:
     whitened: list[Tensor]
     reduced: DefiniteFactor
 
-    def solve(self, right: Tangent) -> Tangent:
+    def solve(self, right: BundleTangent) -> BundleTangent:
         """H^-1 right; all zero where the reduced system is not definite."""
         equations, tiles = self.equations, self.equations.structure.tiles
         reduced_right = torch.cat((right.frames.flatten(), right.camera))
@@ -238,7 +238,7 @@ class FactorizedEquations:
         points = (self.points_root.mT @ halves[..., None]).squeeze(-1)
         split = 6 * equations.structure.num_frames
         points = torch.where(self.reduced.definite, points, 0.0)
-        return Tangent(solution[:split].view(-1, 6), points, solution[split:])
+        return BundleTangent(solution[:split].view(-1, 6), points, solution[split:])
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
@@ -262,7 +262,13 @@ class FactorizedEquations:
 
 
 class Marginals(NamedTuple):
-    """Covariance blocks: frames (F, 6, 6), points (P, 3, 3), camera (K, K)."""
+    """Marginal covariances.
+
+    Attributes:
+        frames: (F, 6, 6) of the left perturbations (translation, rotation).
+        points: (P, 3, 3)
+        camera: (K, K)
+    """
 
     frames: Tensor
     points: Tensor

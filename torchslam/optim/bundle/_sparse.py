@@ -20,18 +20,18 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
 from torchslam.optim.bundle._problem import (
-    Estimate,
-    Inputs,
+    BundleEstimate,
+    BundleInputs,
     PriorTerms,
     gauge_motions,
+    open_motions,
     prior_terms,
-    still_open,
 )
 from torchslam.optim.bundle._schur import (
+    BundleTangent,
     Marginals,
     NormalEquations,
     Structure,
-    Tangent,
     build_structure,
 )
 from torchslam.optim.core.batching import Tensors
@@ -45,11 +45,11 @@ from torchslam.optim.core.residuals import (
     rounding_cost,
     variance_factor,
 )
-from torchslam.optim.core.tangent import cross_entries, retract, turned
+from torchslam.optim.core.tangent import cross_entries, retract, rotated
 
 
 @dataclass(frozen=True)
-class Layout:
+class SparseLayout:
     """The order in which one bundle adjustment is processed, and what of it moves.
 
     observations: (O',) rows of the problem's observations that count, ordered as `Structure` asks
@@ -68,10 +68,10 @@ class Layout:
     structure: Structure
 
 
-def build_layout(
+def build_sparse_layout(
     frame_index: Tensor, point_index: Tensor, counted: Tensor, free_frames: Tensor, free_points: Tensor
-) -> Layout:
-    """Order the observations (O,) that count of free and fixed frames (F,) and points (P,), as `Moving` has them."""
+) -> SparseLayout:
+    """Order the observations (O,) that count; frames (F,) and points (P,) are free or fixed as in `MovingParts`."""
     num_points = len(free_points)
     count = int(free_frames.sum())
     slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
@@ -83,7 +83,7 @@ def build_layout(
     point_rank = torch.argsort(point_order)
     points = point_rank[point_index[rows]]
     structure = build_structure(slots[frame_index[rows]], points, count, num_points)
-    return Layout(
+    return SparseLayout(
         rows,
         frame_index[rows],
         points,
@@ -95,7 +95,7 @@ def build_layout(
     )
 
 
-def assemble(
+def assemble_sparse(
     structure: Structure, expansion: Expansion, rays_w: Tensor, free_points: Tensor, exact: bool
 ) -> NormalEquations:
     """Normal equations of observations ordered as `structure` asks, for frames that move along the world's axes.
@@ -110,9 +110,9 @@ def assemble(
     moved = torch.cat((hessian[:3, :3], slope[:, None], hessian[:3, 3:]), dim=1)
     points = structure.sum_by_point(moved.flatten(0, 1).mT).unflatten(-1, (3, -1))
     slope, rays_w, moved = slope[:, :linked], rays_w[:, :linked], moved[..., :linked]
-    turned = torch.stack(cross_entries(rays_w, moved))
-    twice = torch.stack(cross_entries(rays_w, turned[:, :3].transpose(0, 1)))
-    against_points = turned[:, :3]
+    rotated = torch.stack(cross_entries(rays_w, moved))
+    twice = torch.stack(cross_entries(rays_w, rotated[:, :3].transpose(0, 1)))
+    against_points = rotated[:, :3]
     if exact:
         eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
         against_points = against_points - torch.stack(cross_entries(slope, eye))
@@ -120,13 +120,13 @@ def assemble(
         twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
     blocks = torch.cat((moved[:, :3], against_points)).permute(2, 1, 0).reshape(-1, 6)
     coupling = blocks.new_zeros(structure.storage_rows, 6).index_add_(0, structure.coupling, blocks)
-    moved, turned, twice = (structure.sum_by_frame(values) for values in (moved, turned, twice))
-    upper = torch.cat((moved[..., :3], turned[..., :3].mT), dim=-1)
-    lower = torch.cat((turned[..., :3], twice), dim=-1)
-    rest = torch.cat((moved[..., 3:], turned[..., 3:]), dim=1)
+    moved, rotated, twice = (structure.sum_by_frame(values) for values in (moved, rotated, twice))
+    upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
+    lower = torch.cat((rotated[..., :3], twice), dim=-1)
+    rest = torch.cat((moved[..., 3:], rotated[..., 3:]), dim=1)
     return NormalEquations(
         structure,
-        Tangent(rest[..., 0], points[..., 3], gradient[3:].sum(-1)),
+        BundleTangent(rest[..., 0], points[..., 3], gradient[3:].sum(-1)),
         torch.cat((upper, lower), dim=1),
         points[..., :3],
         hessian[3:, 3:].sum(-1),
@@ -144,13 +144,13 @@ def product(A: Tensor, B: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class BundleModel:
+class SparseModel:
     """The local model of the cost (1,) at an estimate; its equations are made when they are asked for.
 
-    Where a minimisation ends nobody asks, and they are most of the work.
+    Where a minimization ends nobody asks, and they are most of the work.
     """
 
-    estimate: Estimate
+    estimate: BundleEstimate
     cost: Tensor
     assembled: Callable[[], NormalEquations]
 
@@ -168,13 +168,13 @@ class Seen(NamedTuple):
     points_c: Tensor
 
 
-class Bundle:
+class SparseBundle:
     """A bundle adjustment for `levenberg_marquardt.minimize` (a batch of one), and what follows from its minimum."""
 
     def __init__(
         self,
-        layout: Layout,
-        inputs: Inputs,
+        layout: SparseLayout,
+        inputs: BundleInputs,
         camera: Camera,
         kernel: Kernel,
         directions: Tensor | None,
@@ -191,7 +191,9 @@ class Bundle:
             inputs.weights.index_select(0, layout.observations),
             inputs.params,
         )
-        self.start = Estimate(inputs.T_cw, inputs.points_w.index_select(0, layout.point_order), inputs.params)
+        self.start = BundleEstimate(
+            inputs.T_cw, inputs.points_w.index_select(0, layout.point_order), inputs.params
+        )
         has_prior = inputs.pose_prior is not None and len(layout.free_frames) > 0
         solvable = len(layout.observations) > 0 or has_prior
         self.solvable = torch.tensor([solvable], device=inputs.pixels.device)
@@ -202,48 +204,50 @@ class Bundle:
             weights = weights.diagonal(dim1=-2, dim2=-1)
         return rounding_cost(weights[None], self.inputs.params[None])
 
-    def evaluate(self, estimate: Estimate, near: Tensor) -> BundleModel:
+    def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> SparseModel:
         seen, terms = self._seen(estimate), self._priors(estimate)
         lin = self._linearize(estimate, seen)
         cost = lin.cost.sum() if terms is None else lin.cost.sum() + terms.cost
-        return BundleModel(
-            estimate, cost[None], lambda: _with_priors(self._equations(seen, lin, near), terms)
+        return SparseModel(
+            estimate, cost[None], lambda: _with_priors(self._equations(seen, lin, use_curvature), terms)
         )
 
-    def step(self, model: BundleModel, damping: Tensor) -> tuple[Estimate, Tensor]:
+    def step(self, model: SparseModel, damping: Tensor) -> tuple[BundleEstimate, Tensor]:
         equations, estimate = model.equations, model.estimate
         factorized = equations.factorized(damping, self._gauge(estimate))
         step = factorized.solve(equations.gradient)
         decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
         T_free = estimate.T_cw.index_select(0, frames)
-        moved = retract(T_free, -turned(T_free[:, :3, :3], step.frames[..., None])[..., 0])
+        moved = retract(T_free, -rotated(T_free[:, :3, :3], step.frames[..., None])[..., 0])
         params = estimate.params
         if self.directions is not None:
             params = params - step.camera.view(len(params), -1) @ self.directions.mT
         return (
-            Estimate(estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params),
+            BundleEstimate(
+                estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params
+            ),
             decrease[None],
         )
 
-    def select(self, accept: Tensor, new: BundleModel, old: BundleModel) -> BundleModel:
+    def select(self, accept: Tensor, new: SparseModel, old: SparseModel) -> SparseModel:
         return new if bool(accept) else old
 
-    def definite(self, model: BundleModel) -> Tensor:
+    def definite(self, model: SparseModel) -> Tensor:
         """(1,) whether all that moves is determined, up to the gauge."""
         return model.equations.factorized(gauge=self._gauge(model.estimate)).reduced.definite[None]
 
-    def ordered(self, estimate: Estimate) -> Estimate:
+    def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """The estimate of a batch of one in the layout's order."""
         T_cw, points_w, params = (part[0] for part in estimate)
-        return Estimate(T_cw, points_w.index_select(0, self.layout.point_order), params)
+        return BundleEstimate(T_cw, points_w.index_select(0, self.layout.point_order), params)
 
-    def in_order(self, estimate: Estimate) -> Estimate:
+    def in_order(self, estimate: BundleEstimate) -> BundleEstimate:
         """The estimate of the layout's order as that of a batch of one, in the order of the problem."""
         points_w = estimate.points_w.index_select(0, self.layout.point_rank)
-        return Estimate(estimate.T_cw[None], points_w[None], estimate.params[None])
+        return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
-    def _gauge(self, estimate: Estimate) -> Tensor | None:
+    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
         """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is.
 
         In the axes of the world, as are all vectors of the equations.
@@ -263,9 +267,9 @@ class Bundle:
         motions = torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
-            return motions if priors is None else still_open(motions, priors.frames)
+            return motions if priors is None else open_motions(motions, priors.frames)
 
-    def _priors(self, estimate: Estimate, exact: bool = False) -> PriorTerms | None:
+    def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
         """What the priors on free frames (F') and the cameras add, in the axes of the world."""
         frames, inputs = self.layout.free_frames, self.inputs
         poses = inputs.pose_prior
@@ -279,7 +283,7 @@ class Bundle:
         terms = prior_terms(inputs, T_cw, estimate.params, moving, self.directions, exact)
         return None if terms is None else terms.in_world(T_cw[:, :3, :3])
 
-    def marginals(self, estimate: Estimate) -> Marginals:
+    def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (1, F, 6, 6), (1, P, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
         estimate = self.ordered(estimate)
         seen = self._seen(estimate)
@@ -292,12 +296,12 @@ class Bundle:
         equations = _with_priors(equations, self._priors(estimate), share=factor)
         free, points, camera = equations.factorized(gauge=self._gauge(estimate)).marginals()
         R_cw = estimate.T_cw[layout.free_frames, :3, :3]
-        free = turned(R_cw, turned(R_cw, free).mT)
+        free = rotated(R_cw, rotated(R_cw, free).mT)
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         blocks = factor * frames, factor * points[layout.point_rank], factor * camera
         return Marginals(*(block[None] for block in blocks))
 
-    def exact_solver(self, estimate: Estimate) -> Callable[[Tensors], Tensors]:
+    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessian at a minimum, for a batch of one in the order of the problem."""
         layout, ordered = self.layout, self.ordered(estimate)
         exact = self._exact_equations(ordered).factorized(gauge=self._gauge(ordered))
@@ -305,16 +309,16 @@ class Bundle:
 
         def solve(right: Tensors) -> Tensors:
             frames, points, camera = (part[0] for part in right)
-            free = turned(R_cw.mT, frames.index_select(0, layout.free_frames)[..., None])[..., 0]
-            solved = exact.solve(Tangent(free, points.index_select(0, layout.point_order), camera))
-            free = turned(R_cw, solved.frames[..., None])[..., 0]
+            free = rotated(R_cw.mT, frames.index_select(0, layout.free_frames)[..., None])[..., 0]
+            solved = exact.solve(BundleTangent(free, points.index_select(0, layout.point_order), camera))
+            free = rotated(R_cw, solved.frames[..., None])[..., 0]
             spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, free)
             vector = spread, solved.points.index_select(0, layout.point_rank), solved.camera
             return tuple(part[None] for part in vector)
 
         return solve
 
-    def _seen(self, estimate: Estimate) -> Seen:
+    def _seen(self, estimate: BundleEstimate) -> Seen:
         R_cw = estimate.T_cw[:, :3, :3]
         centers_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
         frames = torch.cat((R_cw.flatten(1), centers_w[..., 0]), dim=-1)
@@ -323,7 +327,7 @@ class Bundle:
         rays_w = estimate.points_w.index_select(0, self.layout.point_index).mT - rows[9:]
         return Seen(R_cw, rays_w, product(R_cw, rays_w[:, None])[:, 0].mT)
 
-    def _linearize(self, estimate: Estimate, seen: Seen) -> Linearization:
+    def _linearize(self, estimate: BundleEstimate, seen: Seen) -> Linearization:
         return linearize_each(self._observations(estimate), seen.points_c, self.directions is not None)
 
     def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
@@ -342,24 +346,28 @@ class Bundle:
         camera = camera[0] if self.camera_of is None else camera[self.camera_of]
         return Observations(pixels, weights, camera, self.kernel, self.inputs.scale)
 
-    def _observations(self, estimate: Estimate) -> Observations:
+    def _observations(self, estimate: BundleEstimate) -> Observations:
         if self.directions is None:
             return self.observations
         return self._observed(self.observations.pixels, self.observations.weights, estimate.params)
 
-    def _equations(self, seen: Seen, lin: Linearization, near: Tensor) -> NormalEquations:
-        """Without the bend of the projection, and without priors."""
-        expansion = gauss_newton_expansion(lin, self._in_world(lin.J.movedim(0, -1), seen.R_cw), near)
-        return assemble(self.layout.structure, expansion, seen.rays_w, self.layout.free_points, exact=False)
+    def _equations(self, seen: Seen, lin: Linearization, use_curvature: Tensor) -> NormalEquations:
+        """Without the curvature of the projection, and without priors."""
+        expansion = gauss_newton_expansion(
+            lin, self._in_world(lin.J.movedim(0, -1), seen.R_cw), use_curvature
+        )
+        return assemble_sparse(
+            self.layout.structure, expansion, seen.rays_w, self.layout.free_points, exact=False
+        )
 
-    def _exact_equations(self, estimate: Estimate) -> NormalEquations:
+    def _exact_equations(self, estimate: BundleEstimate) -> NormalEquations:
         R_cw, rays_w, points_c = self._seen(estimate)
         observations, is_free = self._observations(estimate), self.directions is not None
         gradient, hessian = exact_expansion_of_each(observations, points_c, is_free)
         half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
         expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
         layout = self.layout
-        equations = assemble(layout.structure, expansion, rays_w, layout.free_points, exact=True)
+        equations = assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=True)
         return _with_priors(equations, self._priors(estimate, exact=True))
 
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle._minimization import BundleMinimization, Found
+from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.core.implicit import Backward, check_backward, minimum
+from torchslam.optim.core.implicit import Backward, check_backward, implicit_minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence, Progress
 
 __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
@@ -23,17 +23,19 @@ __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
 
 @dataclass(frozen=True)
 class BundleSolution:
-    """The minimum of a bundle adjustment; of a batch, everything leads with B.
+    """The minimum of a bundle adjustment; for a batch, everything leads with B.
 
-    T_cw:       (F, 4, 4); points_w: (P, 3)
-    camera:     one or many, as the problem had them, with other parameters where they were free
-    cost:       () half the sum of robustified squared whitened residuals, and priors of what moves, detached
-    success:    () bool, all frames that anything counts of start finite, and all that moves is determined, up to the
-                gauge. If not, the estimate is still the best that was found, but it has no gradient.
-    moved_frames, moved_points: (F,), (P,) bool. What is fixed, or seen too little (points by two frames, frames with
-                three points at least, or a prior), stayed at its start; in the latter case its observations did not
-                count.
-    convergence: per element of the batch, which a problem alone has one of
+    Attributes:
+        T_cw: (F, 4, 4) world to camera.
+        points_w: (P, 3)
+        camera: the cameras of the problem, with refined parameters where they were free.
+        cost: () half the sum of robustified squared whitened residuals and priors, detached.
+        success: () bool, all observing frames start finite, and all free unknowns are determined, up to the gauge. If
+            False, the estimate is the best one found, but it has no gradient.
+        moved_frames: (F,) bool. Fixed frames, and frames with fewer than three points and no prior, stayed at their
+            start; observations of the latter did not count.
+        moved_points: (P,) bool. Fixed points, and points seen by fewer than two frames, likewise.
+        convergence: iterations and convergence per element of the batch.
     """
 
     T_cw: Tensor
@@ -53,11 +55,17 @@ class BundleSolution:
     def covariance(
         self, frames: Tensor | Sequence[int] | None = None, points: Tensor | Sequence[int] | None = None
     ) -> Marginals:
-        """Marginal covariances, detached, of the frames and points asked for (all if None) and of the cameras.
+        """Marginal covariances, detached, zero for what did not move; computed on the first call.
 
-        Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), camera (K, K), one after
-        the other where there are several, zero for what did not move. Calibrated by the residuals, so the weights need
-        to be right only up to a factor; priors count as they are. Computed on the first call.
+        Calibrated by the residuals, so the weights need to be right only up to a factor; priors count as they are.
+
+        Args:
+            frames: indices (n,) of frames, all if None.
+            points: indices (m,) of points, all if None.
+
+        Returns:
+            Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), and camera (K, K), or
+            (C K, C K) of several cameras.
         """
         marginals = self._covariance
         rows = [
@@ -102,23 +110,33 @@ def bundle_adjust(
     progress: Progress | None = None,
     check: bool = True,
 ) -> BundleSolution:
-    """Minimise robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
+    """Minimize robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
 
-    free_camera: True: all K of every camera; a tensor (K, n): along its n columns alone, and covariances are of the
-              steps along these. Every problem of a batch finds its own.
-    scale:    of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
-    backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
-              points, see `implicit.Backward`. The gradient ends at the start values of what moves.
-    tolerance: stop where a step promises to lower the cost by less than this share of it
-    progress: called with the number of each iteration and the most there are; what it raises is raised here
-    check:    find out whether all that moves is determined; else `success` is for the start alone, a tenth is saved
+    Observations that are not finite, or of points behind the camera, do not count. The implicit gradient is zero where
+    the exact Hessian is not positive definite; a point whose own block is not positive definite counts as fixed. With
+    an open gauge the gradient is right for losses that do not depend on it.
 
-    Observations that are not finite, or of points behind the camera, do not count. Where the exact Hessian is not
-    positive definite, that is, not at a strict minimum, the implicit gradient is zero; a point for which its own block
-    is not counts as fixed. With an open gauge the gradient is right for losses that do not depend on it.
-    A batch gives what its problems alone would give, by dense algebra over many of them at once; where a frame sees
+    A batch gives what its problems alone would give, by dense algebra over many of them at once. Where a frame sees
     less than an eighth of the points, or one of them twice, they are solved one after the other.
-    Raises ValueError for shapes and indices that do not fit and for unknown names.
+
+    Args:
+        problem: one bundle adjustment, or a batch.
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
+        free_camera: True frees all K parameters of every camera. A tensor (K, n) frees steps along its n columns, of
+            which the covariances then are. Every problem of a batch finds its own parameters.
+        backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
+            points. There is none to the start of what moves.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
+        progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
+        check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
+
+    Returns:
+        The minimum, differentiable, with covariances on demand.
+
+    Raises:
+        ValueError: a shape or an index does not fit, or a name is unknown.
     """
     check_backward(backward)
     given = sanitized(problem, scale)
@@ -129,7 +147,9 @@ def bundle_adjust(
         found = minimization.minimize(given)
     else:
         attached = backward == "implicit"
-        found = Found(*minimum(minimization, given if attached else [x.detach() for x in given]))
+        found = BundleMinimum(
+            *implicit_minimum(minimization, given if attached else [x.detach() for x in given])
+        )
     detached = [x.detach() for x in given]
     solution = minimization.at_minimum(found, given) if backward == "implicit" else found.estimate
     if backward == "truncated":

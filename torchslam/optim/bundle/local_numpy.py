@@ -222,7 +222,7 @@ class _Model:
 
     def _equations(self, use_curvature: bool) -> _Equations:
         """Gauss-Newton normal equations, optionally with the kernel's curvature, as in
-        `residuals.gauss_newton_expansion` and `bundle._sparse.assemble`."""
+        `residuals.gauss_newton_expansion` and `bundle._sparse.assemble_sparse`."""
         window, (R_cw, rays_w, image, inverse, errors, squared, weight) = self.window, self.linearization
         in_image = (R_cw[:2] - image[:, None] * R_cw[2]) * inverse  # (2, 3, O)
         J = window.along[0][:, None] * in_image[0] + window.along[1][:, None] * in_image[1]

@@ -19,12 +19,12 @@ Tree = TypeVar("Tree")
 """Named tuples of batched tensors, also within one another."""
 
 
-def taken(tree: Tree, rows: Tensor) -> Tree:
+def index_tree(tree: Tree, rows: Tensor) -> Tree:
     """Some elements of a batch."""
     return tree_map(lambda tensor: tensor.index_select(0, rows), tree)
 
 
-def chosen(first: Tensor, one: Tree, other: Tree) -> Tree:
+def where_tree(first: Tensor, one: Tree, other: Tree) -> Tree:
     """Per element, `one` where `first` (B,) and `other` elsewhere."""
 
     def choose(a: Tensor, b: Tensor) -> Tensor:
@@ -33,13 +33,13 @@ def chosen(first: Tensor, one: Tree, other: Tree) -> Tree:
     return tree_map(choose, one, other)
 
 
-def joined(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
+def concat_tree(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
     """The batch of which each tree has the elements in its rows (b,)."""
     order = torch.argsort(torch.cat(list(rows)))
     return tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *trees)
 
 
-def many_times(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
+def nested_vmap(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
     """A function of tensors, over `many` more leading dimensions of them."""
     for _ in range(many):
         function = vmap(function)
@@ -51,7 +51,9 @@ def leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
     return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
 
 
-def looped(function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]) -> Tensors:
+def vmap_by_loop(
+    function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]
+) -> Tensors:
     """One element after the other."""
     elements = [
         function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
@@ -60,7 +62,7 @@ def looped(function: Callable[..., Tensors], size: int, dims: InDims, tensors: S
     return tuple(torch.stack(parts) for parts in zip(*elements, strict=True))
 
 
-def folded(
+def vmap_by_fold(
     function: Callable[..., Tensors],
     size: int,
     dims: InDims,

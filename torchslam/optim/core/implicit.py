@@ -1,4 +1,4 @@
-"""Gradients of a minimiser by the implicit function theorem, of any order and in both directions.
+"""Gradients of a minimizer by the implicit function theorem, of any order and in both directions.
 
 At a minimum theta* of a cost with inputs x the gradient g(theta*, x) is zero, so d theta* = -H^-1 (dg/dx) dx with the
 exact Hessian H = dg/dtheta. For a loss with gradient v at theta* the gradient to the inputs is therefore
@@ -20,10 +20,10 @@ from torch._C._functorch import TransformType, get_interpreter_stack
 from torch.func import grad, vjp
 
 from torchslam.geometry.precision import full_precision
-from torchslam.optim.core.batching import InDims, Tensors, folded, leading, looped, many_times
+from torchslam.optim.core.batching import InDims, Tensors, leading, nested_vmap, vmap_by_fold, vmap_by_loop
 
 Backward = Literal["implicit", "unroll", "truncated", "detached"]
-"""How gradients pass a minimisation.
+"""How gradients pass a minimization.
 
 "implicit":  the exact gradient at the minimum; memory does not depend on the iterations
 "unroll":    through every iteration, also to the start; memory grows with the iterations
@@ -41,7 +41,7 @@ def check_backward(backward: str) -> None:
 
 
 class Minimization(Protocol):
-    """A cost over unknowns theta and inputs x, and how it is minimised.
+    """A cost over unknowns theta and inputs x, and how it is minimized.
 
     inputs: the tensors x. found: what `minimize` returns, first the `num_unknowns` tensors of theta. A vector, such as
     a direction, is `num_vectors` tensors in the tangent space of theta. All but `minimize` and `factorized` must be
@@ -66,7 +66,7 @@ class Minimization(Protocol):
         """() the derivative g . direction of the cost."""
         ...
 
-    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+    def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         """`found` with theta moved along a direction."""
         ...
 
@@ -79,7 +79,7 @@ class Minimization(Protocol):
         ...
 
 
-def minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
+def implicit_minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
     """What `problem.minimize` finds: theta with its implicit derivatives to the inputs, the rest detached.
 
     Raises RuntimeError for forward mode within forward mode, in which torch would drop a part without a word.
@@ -141,9 +141,11 @@ class _Minimum(torch.autograd.Function):
             return _Minimum.apply(problem, *tensors)
 
         if problem.ndims is None:
-            found = looped(apply, info.batch_size, in_dims[1:], inputs)
+            found = vmap_by_loop(apply, info.batch_size, in_dims[1:], inputs)
         else:
-            found = folded(apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs))
+            found = vmap_by_fold(
+                apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs)
+            )
         return found, (0,) * len(found)
 
 
@@ -154,7 +156,7 @@ class _Solve(torch.autograd.Function):
     @full_precision
     def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
         right, found, inputs = _parts(problem, num_found, tensors)
-        return tuple(many_times(problem.factorized(found, inputs), many)(right))
+        return tuple(nested_vmap(problem.factorized(found, inputs), many)(right))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
@@ -172,7 +174,9 @@ class _Solve(torch.autograd.Function):
 
         def curvature(tensors: Tensors) -> Tensor:
             at = _split(tensors, len(found))
-            return -many_times(lambda ends: _curvature(problem, *at, *ends), many)((direction, adjoint)).sum()
+            return -nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
+                (direction, adjoint)
+            ).sum()
 
         needed = ctx.needs_input_grad[3 + problem.num_vectors :]
         return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
@@ -187,16 +191,16 @@ class _Solve(torch.autograd.Function):
         def change_of_curvature(probe: Tensors) -> Tensor:
             def curvature(tensors: Tensors) -> Tensor:
                 at = _split(tensors, len(found))
-                return many_times(lambda ends: _curvature(problem, *at, *ends), many)(
+                return nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
                     (direction, probe)
                 ).sum()
 
             return _along(curvature, (*found, *inputs), changes[len(right) :])
 
-        turned = grad(change_of_curvature)(_zeros(right))
+        hessian_product = grad(change_of_curvature)(_zeros(right))
         left = tuple(
             -part if change is None else change - part
-            for change, part in zip(changes[: len(right)], turned, strict=True)
+            for change, part in zip(changes[: len(right)], hessian_product, strict=True)
         )
         return _solve(problem, left, found, inputs, many)
 
@@ -214,9 +218,9 @@ class _Solve(torch.autograd.Function):
             return _Solve.apply(problem, many, num_found, *tensors)
 
         if problem.ndims is None:
-            return looped(apply, info.batch_size, dims, tensors), (0,) * count
+            return vmap_by_loop(apply, info.batch_size, dims, tensors), (0,) * count
         before = (many,) * count + (0,) * (len(tensors) - count)
-        solved = folded(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
+        solved = vmap_by_fold(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
         return tuple(part.movedim(many, 0) for part in solved), (0,) * count
 
 
@@ -249,10 +253,10 @@ def _curvature(
     """() probe . H direction, differentiable."""
 
     def slope(step: Tensors) -> Tensor:
-        return problem.slope(problem.moved(found, step), inputs, probe)
+        return problem.slope(problem.retracted(found, step), inputs, probe)
 
-    turned = grad(slope)(_zeros(direction))
-    return torch.stack([(x * y).sum() for x, y in zip(turned, direction, strict=True)]).sum()
+    hessian_product = grad(slope)(_zeros(direction))
+    return torch.stack([(x * y).sum() for x, y in zip(hessian_product, direction, strict=True)]).sum()
 
 
 def _last_gradient(

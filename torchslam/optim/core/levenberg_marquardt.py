@@ -16,7 +16,7 @@ from typing import Protocol, Self, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchslam.optim.core.batching import joined, taken
+from torchslam.optim.core.batching import concat_tree, index_tree
 
 _INITIAL_DAMPING = 1e-4
 _DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
@@ -45,15 +45,15 @@ class LeastSquares(Protocol[X, M]):
 
     @property
     def solvable(self) -> Tensor:
-        """(B,) bool, which elements to minimise; the others stay at their start."""
+        """(B,) bool, which elements to minimize; the others stay at their start."""
         ...
 
-    def evaluate(self, estimate: X, near: Tensor) -> M:
-        """The cost and its quadratic model at an estimate. near: (B,) bool, the optimum is close."""
+    def evaluate(self, estimate: X, use_curvature: Tensor) -> M:
+        """The cost and its quadratic model at an estimate. use_curvature: (B,) bool, the optimum is close."""
         ...
 
     def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
-        """The estimate that minimises the damped model, and the decrease (B,) of the cost that the model predicts.
+        """The estimate that minimizes the damped model, and the decrease (B,) of the cost that the model predicts.
 
         damping: (B,), relative to the diagonal of the Hessian. The decrease is infinite where there is no solution.
         """
@@ -84,7 +84,7 @@ class Rounded(Protocol):
 
 @dataclass(frozen=True)
 class Convergence:
-    """How a minimisation went, per element.
+    """How a minimization went, per element.
 
     iterations: (B,) int64 steps tried
     converged:  (B,) bool, the last step promised less than the tolerance
@@ -109,10 +109,10 @@ def minimize(
     tolerance: float,
     progress: Progress | None = None,
 ) -> tuple[M, Convergence]:
-    """Minimise from `start`; returns the model at the last accepted estimate.
+    """Minimize from `start`; returns the model at the last accepted estimate.
 
     An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, or
-    when the residuals have vanished; it rests from then on. What `progress` raises ends the minimisation.
+    when the residuals have vanished; it rests from then on. What `progress` raises ends the minimization.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
@@ -141,11 +141,11 @@ def minimize(
             break
         if isinstance(problem, Divisible) and not active.all():
             rest, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
-            resting.append((rows[rest], taken(model, rest)))
-            problem, model = problem.part(stay), taken(model, stay)
-            rows, active, damping, vanished = taken((rows, active, damping, vanished), stay)
+            resting.append((rows[rest], index_tree(model, rest)))
+            problem, model = problem.part(stay), index_tree(model, stay)
+            rows, active, damping, vanished = index_tree((rows, active, damping, vanished), stay)
     converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
     if resting:
         where, models = zip(*resting, (rows, model), strict=True)
-        model = joined(models, where)
+        model = concat_tree(models, where)
     return model, Convergence(steps, converged, initial_cost, model.cost.detach())

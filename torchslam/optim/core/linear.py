@@ -37,7 +37,7 @@ class DefiniteFactor:
 
 
 def factorize(matrix: Tensor, strict: bool = True) -> DefiniteFactor:
-    """Cholesky factorisation of symmetric (..., D, D) matrices that never raises.
+    """Cholesky factorization of symmetric (..., D, D) matrices that never raises.
 
     strict: count a matrix as definite only if it is clearly so, beyond rounding.
     """

@@ -13,10 +13,11 @@ from torchslam.optim.core.tangent import retract
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Where poses are expected, and how surely.
+    """Gaussian prior on poses.
 
-    T_cw:        (B, 4, 4)
-    information: (B, 6, 6) inverse covariance of the left perturbation (translation, rotation), symmetric
+    Attributes:
+        T_cw: (B, 4, 4) mean, world to camera.
+        information: (B, 6, 6) inverse covariance of the left perturbation (translation, rotation), symmetric.
     """
 
     T_cw: Tensor
@@ -25,10 +26,11 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Where the parameters of a camera are expected, and how surely.
+    """Gaussian prior on the parameters of one or several cameras.
 
-    params:      (K,) as `Camera.params`; (C, K) of several cameras
-    information: (K, K) inverse covariance, symmetric; (C, K, K) of several cameras
+    Attributes:
+        params: (K,) or (C, K) mean, as `Camera.params`.
+        information: (K, K) or (C, K, K) inverse covariance, symmetric.
     """
 
     params: Tensor

@@ -81,17 +81,17 @@ class Linearization(NamedTuple):
     J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
     cost:         (..., N) the share in the objective, half of rho
     weight:       (..., N) weights * rho', zero where the point cannot be projected
-    bend:         (..., N) 2 * weights^2 * rho''; weight * I + bend * r r^T is the Hessian of the cost in the residual
+    curvature_term: (..., N) c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in the residual
     """
 
     residual: Tensor
     J: Tensor
     cost: Tensor
     weight: Tensor
-    bend: Tensor
+    curvature_term: Tensor
 
     @property
-    def force(self) -> Tensor:
+    def gradient_wrt_residual(self) -> Tensor:
         """(..., N, 2) the gradient of the cost with respect to the residual."""
         return self.weight[..., None] * self.residual
 
@@ -144,11 +144,11 @@ def _apart(observations: Observations) -> Observations:
 
 
 class Weighed(NamedTuple):
-    """`cost`, `weight` and `bend` of a `Linearization`, all (..., N)."""
+    """`cost`, `weight` and `curvature_term` of a `Linearization`, all (..., N)."""
 
     cost: Tensor
     weight: Tensor
-    bend: Tensor
+    curvature_term: Tensor
 
 
 def weigh(observations: Observations, squared_px: Tensor, valid: Tensor) -> Weighed:
@@ -177,20 +177,20 @@ def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, 
     """Pixels, validity and d pixels / d points_c without distortion: a third of the general path's operations."""
     depth = points_c[..., 2:]
     valid = depth > torch.finfo(depth.dtype).eps
-    focal, centre = camera.params[..., None, :2], camera.params[..., None, 2:4]
+    focal, center = camera.params[..., None, :2], camera.params[..., None, 2:4]
     normalized = points_c[..., :2] / torch.where(valid, depth, 1.0)
     stretch = focal / torch.where(valid, depth, 1.0)
     (fx, fy), (x, y) = stretch.unbind(-1), (-stretch * normalized).unbind(-1)
     zero = torch.zeros_like(x)
     # Entry by entry in memory, as `gauss_newton_expansion` reads them.
     J_points = torch.stack((fx, zero, x, zero, fy, y)).unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
-    return normalized * focal + centre, valid[..., 0], J_points
+    return normalized * focal + center, valid[..., 0], J_points
 
 
-def flat_along(weight: Tensor, bend: Tensor, squared: Tensor, near: Tensor) -> Tensor:
-    """The bend (..., N) that `gauss_newton_expansion` takes for residuals of these squares, px^2."""
+def flat_along(weight: Tensor, curvature_term: Tensor, squared: Tensor, use_curvature: Tensor) -> Tensor:
+    """The curvature term (..., N) that `gauss_newton_expansion` takes for residuals of these squares, px^2."""
     flat = -weight / torch.where(squared > 0, squared, 1.0)
-    return torch.maximum(bend, flat) * near
+    return torch.maximum(curvature_term, flat) * use_curvature
 
 
 class Expansion(NamedTuple):
@@ -208,35 +208,41 @@ class Expansion(NamedTuple):
         return Expansion(gradient, columns.mT @ self.hessian @ columns)
 
 
-def gauss_newton_expansion(lin: Linearization, J: Tensor, near: Tensor) -> Expansion:
-    """Gradient (D, ..., N) and Hessian (D, D, ..., N) in what moves pixels by J (2, D, ..., N), without the bend of the
-    projection.
+def gauss_newton_expansion(lin: Linearization, J: Tensor, use_curvature: Tensor) -> Expansion:
+    """Gradient (D, ..., N) and Hessian (D, D, ..., N) of the cost, for pixels with Jacobians J (2, D, ..., N).
 
-    `near`, broadcastable to (..., N), says where the kernel's curvature counts. Across the residual of an outlier the
-    Hessian is positive, along it negative: the negative part then counts as flat, which keeps the matrix positive
-    semi-definite and converges several times faster close to the optimum. Elsewhere the curvature counts as zero
-    (iteratively reweighted least squares), which descends from afar.
+    The curvature of the projection is left out.
+
+    `use_curvature`, broadcastable to (..., N), says where the kernel's curvature counts. Across the residual of an
+    outlier the Hessian is positive, along it negative: the negative part then counts as flat, which keeps the matrix
+    positive semi-definite and converges several times faster close to the optimum. Elsewhere the curvature counts as
+    zero (iteratively reweighted least squares), which descends from afar.
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
     """
-    bend = flat_along(lin.weight, lin.bend, lin.residual.square().sum(-1), near)
+    curvature_term = flat_along(lin.weight, lin.curvature_term, lin.residual.square().sum(-1), use_curvature)
     pulled = (J[0] * lin.residual[..., 0]).addcmul(J[1], lin.residual[..., 1])  # J^T r
     weighted = lin.weight * J
     hessian = (weighted[0][:, None] * J[0]).addcmul(weighted[1][:, None], J[1])
-    return Expansion(lin.weight * pulled, hessian.addcmul((bend * pulled)[:, None], pulled))
+    return Expansion(lin.weight * pulled, hessian.addcmul((curvature_term * pulled)[:, None], pulled))
 
 
 def exact_expansion(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Expansion:
-    """Exact gradient and Hessian of the cost per observation, with the bend of kernel and projection.
+    """Exact gradient and Hessian of the cost per observation, with the curvature of kernel and projection.
 
-    The projection's own second derivative is that of J^T force with the force fixed: autograd of the analytic Jacobian.
+    The projection's own second derivative is that of J^T g with the gradient g in the residual fixed: autograd of the
+    analytic Jacobian.
     """
     lin = linearize(observations, points_c, free_camera)
-    force = lin.force[..., None]
-    along = (lin.residual[..., None, :] @ lin.J) * (lin.bend[..., None] * lin.residual)[..., None]
+    gradient_wrt_residual = lin.gradient_wrt_residual[..., None]
+    along = (lin.residual[..., None, :] @ lin.J) * (lin.curvature_term[..., None] * lin.residual)[..., None]
     hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
-    pull = whitening(observations.weights).mT @ force if observations.has_matrices else force
-    hessian = hessian + _bend_of_projection(observations.camera, points_c, pull.detach(), free_camera)
-    return Expansion((lin.J.mT @ force).squeeze(-1), hessian)
+    pull = (
+        whitening(observations.weights).mT @ gradient_wrt_residual
+        if observations.has_matrices
+        else gradient_wrt_residual
+    )
+    hessian = hessian + _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
+    return Expansion((lin.J.mT @ gradient_wrt_residual).squeeze(-1), hessian)
 
 
 def exact_expansion_of_each(
@@ -249,7 +255,9 @@ def exact_expansion_of_each(
     return Expansion(*(part.squeeze(1) for part in expansion))
 
 
-def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_camera: bool) -> Tensor:
+def _projection_curvature(
+    camera: Camera, points_c: Tensor, gradient_wrt_residual: Tensor, free_camera: bool
+) -> Tensor:
     """sum_k force_k * Hessian of pixel_k in (points_c, camera.params). (..., N, 2, 1) force -> (..., N, D, D)."""
     dims = 3 + (camera.params.shape[-1] if free_camera else 0)
     with torch.enable_grad():
@@ -263,7 +271,7 @@ def _bend_of_projection(camera: Camera, points_c: Tensor, force: Tensor, free_ca
         else:
             J = _project(camera, points, free_camera)[2]
             variables = [points]
-        gradient = (J.mT @ force).squeeze(-1)
+        gradient = (J.mT @ gradient_wrt_residual).squeeze(-1)
         rows = torch.autograd.grad(gradient.movedim(-1, 0).diagonal().sum(), variables)
     return torch.cat(rows, dim=-1).movedim(0, -2)
 
@@ -282,7 +290,7 @@ def variance_factor(
     variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
     squared = linearization.residual.square().sum(-1)
     across = linearization.weight * variance  # the slope of psi across the residual and along it
-    along = across + linearization.bend * squared * variance
+    along = across + linearization.curvature_term * squared * variance
     components = 2 * counted.sum(-1)
     mean_slope = (across + along).sum(-1) / components
     redundant = (components > num_parameters) & (mean_slope > 0)

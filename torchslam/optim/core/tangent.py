@@ -19,8 +19,8 @@ def retract(T: Tensor, xi: Tensor) -> Tensor:
     half, columns = 0.5 * xi[..., 3:, None], T[..., :3, :]
     twice = 2 / (1 + half.square().sum((-2, -1), keepdim=True))
     once = torch.linalg.cross(half.expand_as(columns), columns, dim=-2)
-    turned = columns + twice * (once + torch.linalg.cross(half.expand_as(columns), once, dim=-2))
-    moved = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    rotated = columns + twice * (once + torch.linalg.cross(half.expand_as(columns), once, dim=-2))
+    moved = torch.cat((rotated[..., :3], rotated[..., 3:] + xi[..., :3, None]), dim=-1)
     return torch.cat((moved, T[..., 3:, :]), dim=-2)
 
 
@@ -37,17 +37,17 @@ def pull_back(T: Tensor, grad_T: Tensor) -> Tensor:
 def push(T: Tensor, xi: Tensor) -> Tensor:
     """The change of T, to first order, when it moves along xi. (..., 4, 4), (..., 6) -> (..., 4, 4)."""
     columns = T[..., :3, :]
-    turned = torch.linalg.cross(xi[..., 3:, None].expand_as(columns), columns, dim=-2)
-    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+    rotated = torch.linalg.cross(xi[..., 3:, None].expand_as(columns), columns, dim=-2)
+    changed = torch.cat((rotated[..., :3], rotated[..., 3:] + xi[..., :3, None]), dim=-1)
     return torch.nn.functional.pad(changed, (0, 0, 0, 1))
 
 
-def turned(R: Tensor, values: Tensor) -> Tensor:
+def rotated(R: Tensor, values: Tensor) -> Tensor:
     """Both halves of tangent vectors (..., 6, n) turned by R (..., 3, 3)."""
     return (R[..., None, :, :] @ values.unflatten(-2, (2, 3))).flatten(-3, -2)
 
 
-def cross_entries(u: Sequence[Tensor], columns: Sequence[Tensor]) -> list[Tensor]:
+def cross_entries(u: Tensor | Sequence[Tensor], columns: Tensor | Sequence[Tensor]) -> list[Tensor]:
     """The three entries of u x columns, of the three of either, each of any shape that broadcasts."""
     pairs = ((1, 2), (2, 0), (0, 1))
     return [(u[i] * columns[j]).addcmul(u[j], columns[i], value=-1) for i, j in pairs]
@@ -82,8 +82,8 @@ def pull_back_sim3(S: Tensor, grad_S: Tensor) -> Tensor:
 def push_sim3(S: Tensor, xi: Tensor) -> Tensor:
     """The change of S, to first order, when it moves along xi. (..., 4, 4), (..., 6 or 7) -> (..., 4, 4)."""
     columns = S[..., :3, :]
-    turned = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
+    rotated = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
     if xi.shape[-1] == 7:
-        turned = turned + xi[..., 6:, None] * columns
-    changed = torch.cat((turned[..., :3], turned[..., 3:] + xi[..., :3, None]), dim=-1)
+        rotated = rotated + xi[..., 6:, None] * columns
+    changed = torch.cat((rotated[..., :3], rotated[..., 3:] + xi[..., :3, None]), dim=-1)
     return torch.nn.functional.pad(changed, (0, 0, 0, 1))

@@ -19,7 +19,7 @@ from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.implicit import Backward, Ndims, check_backward, minimum
+from torchslam.optim.core.implicit import Backward, Ndims, check_backward, implicit_minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence, minimize
 from torchslam.optim.core.linear import factorize
 from torchslam.optim.core.priors import PosePrior, prior_expansion, prior_hessian
@@ -40,7 +40,7 @@ class PoseModel(NamedTuple):
     """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6) in xi.
 
     hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
-    bend:    (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
+    curvature_term: (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
              Newton's, several times as effective; zero elsewhere
     """
 
@@ -48,7 +48,7 @@ class PoseModel(NamedTuple):
     cost: Tensor
     gradient: Tensor
     hessian: Tensor
-    bend: Tensor
+    curvature_term: Tensor
 
 
 class PoseObservations:
@@ -62,19 +62,21 @@ class PoseObservations:
         self.pinhole = camera.model == "pinhole" and not observations.has_matrices
         self.metric = camera.params.new_ones(1, 1)  # what turns products of rows into those of pixels
         if self.pinhole:
-            focal, centre = camera.params[..., :2, None], camera.params[..., 2:4, None]
-            self.normalized = ((observations.pixels.mT - centre) / focal).contiguous()
+            focal, center = camera.params[..., :2, None], camera.params[..., 2:4, None]
+            self.normalized = ((observations.pixels.mT - center) / focal).contiguous()
             self.metric = focal.square()  # (2, 1) or (B, 2, 1)
 
-    def expand(self, T_cw: Tensor, near: Tensor) -> PoseModel:
-        """The model at T_cw (B, 4, 4); `near` (B,) says where to add the bend."""
+    def expand(self, T_cw: Tensor, use_curvature: Tensor) -> PoseModel:
+        """The model at T_cw (B, 4, 4); `use_curvature` (B,) says where to add the curvature term."""
         points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
-        rows, (cost, weight, bend) = self._pinhole(points_c) if self.pinhole else self._general(points_c)
+        rows, (cost, weight, curvature_term) = (
+            self._pinhole(points_c) if self.pinhole else self._general(points_c)
+        )
         moments = (rows * (weight[:, None] * self.metric)[:, None]).flatten(2) @ rows.flatten(2).mT
         hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
-        if near.any():
+        if use_curvature.any():
             pulls = (rows[:, :6] * (self.metric[..., None, :, :] * rows[:, 6:])).sum(2)
-            added = (pulls * (bend * near[:, None])[:, None]) @ pulls.mT
+            added = (pulls * (curvature_term * use_curvature[:, None])[:, None]) @ pulls.mT
         else:
             added = torch.zeros_like(hessian)
         return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added)
@@ -110,7 +112,7 @@ class PoseObservations:
         lin = linearize(self.observations, points_c)
         J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
         rows = torch.cat((lin.J, J_rotation, lin.residual[..., None]), dim=-1)
-        return rows.permute(0, 3, 2, 1), Weighed(lin.cost, lin.weight, lin.bend)
+        return rows.permute(0, 3, 2, 1), Weighed(lin.cost, lin.weight, lin.curvature_term)
 
 
 _MIN_POINTS = 3
@@ -193,8 +195,8 @@ class PoseProblem:
         counted = (self.observations.factors > 0).sum(-1)
         self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
 
-    def evaluate(self, T_cw: Tensor, near: Tensor) -> PoseModel:
-        model = self.laid_out.expand(T_cw, near)
+    def evaluate(self, T_cw: Tensor, use_curvature: Tensor) -> PoseModel:
+        model = self.laid_out.expand(T_cw, use_curvature)
         if self.prior is None:
             return model
         cost, gradient, hessian = prior_expansion(self.prior, T_cw)
@@ -205,7 +207,7 @@ class PoseProblem:
     def step(self, model: PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
         # Elements without any weight stay solvable: their step is zero.
         grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
-        damped = (model.hessian + model.bend) * grow + floor
+        damped = (model.hessian + model.curvature_term) * grow + floor
         factor, failed = torch.linalg.cholesky_ex(damped)
         if failed.any():
             damped = torch.where((failed > 0)[:, None, None], model.hessian * grow + floor, damped)
@@ -222,7 +224,7 @@ class PoseProblem:
             torch.where(accept, new.cost, old.cost),
             torch.where(vector, new.gradient, old.gradient),
             torch.where(matrix, new.hessian, old.hessian),
-            torch.where(matrix, new.bend, 0.0),
+            torch.where(matrix, new.curvature_term, 0.0),
         )
 
     def covariance(self, T_cw: Tensor) -> Tensor:
@@ -240,18 +242,18 @@ class PoseProblem:
         gradient, hessian = exact_expansion(self.observations, points_c)
         G = point_jacobian(points_c)
         result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
-        # The bend of the rotation itself: half of gradient . (omega x (omega x p)).
+        # The curvature of the rotation itself: half of gradient . (omega x (omega x p)).
         outer = gradient.mT @ points_c
-        bend = (
+        curvature_term = (
             0.5 * (outer + outer.mT)
             - outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * self.eye[:3, :3]
         )
-        result = result + torch.nn.functional.pad(bend, (3, 0, 3, 0))
+        result = result + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
         return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
 
 
 class PoseMinimization:
-    """`refine_pose` for `implicit.minimum`: found are the poses, and `success`, `cost` and how it went."""
+    """`refine_pose` for `implicit_minimum`: found are the poses, and `success`, `cost` and how it went."""
 
     num_unknowns = 1
     num_vectors = 1
@@ -294,12 +296,12 @@ class PoseMinimization:
         points_c = transform(T_cw, problem.points_w)
         lin = linearize(problem.observations, points_c)
         velocity = lin.J @ move(points_c, xi[:, None])[..., None]
-        slope = (lin.force[..., None, :] @ velocity).sum()
+        slope = (lin.gradient_wrt_residual[..., None, :] @ velocity).sum()
         if problem.prior is not None:
             slope = slope + (prior_expansion(problem.prior, T_cw)[1] * xi).sum()
         return slope
 
-    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+    def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         return retract(found[0], direction[0]), *found[1:]
 
     def push(self, found: Tensors, direction: Tensors) -> Tensors:
@@ -313,10 +315,11 @@ class PoseMinimization:
 class RefinedPose:
     """Poses at the minimum of their robust reprojection error.
 
-    T_cw:        (B, 4, 4) world to camera; the start, without gradient, where `success` is False
-    cost:        (B,) half the sum of robustified squared whitened residuals, detached
-    success:     (B,) bool, the start is finite, and the usable points (at least three) or the prior determine the pose
-    convergence: iterations and convergence per element
+    Attributes:
+        T_cw: (B, 4, 4) world to camera; the start, without gradient, where `success` is False.
+        cost: (B,) half the sum of robustified squared whitened residuals, detached.
+        success: (B,) bool, the start is finite, and the usable points (at least three) or the prior determine the pose.
+        convergence: iterations and convergence per element.
     """
 
     T_cw: Tensor
@@ -351,21 +354,29 @@ def refine_pose(
     iterations: int = 20,
     tolerance: float = 1e-10,
 ) -> RefinedPose:
-    """Minimise robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
+    """Minimize robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
 
-    T_cw:      (B, 4, 4) start
-    points_w:  (B, N, 3), pixels: (B, N, 2); points or pixels of a batch of one broadcast
-    weights:   (B, N) inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
-               positive definite; one if None
-    mask:      (B, N) bool, all if None; rows that are not finite are left out in any case
-    scale:     of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,)
-    prior:     a Gaussian on the poses, in the same units
-    backward:  how gradients reach points, pixels, weights, camera.params, scale and prior, see `implicit.Backward`
-    tolerance: stop where a step promises to lower the cost by less than this share of it
+    Args:
+        T_cw: (B, 4, 4) world to camera, the start.
+        points_w: (B, N, 3) or (1, N, 3).
+        pixels: (B, N, 2) or (1, N, 2).
+        camera: of all problems, params (K,), or of one each, (B, K).
+        weights: (B, N) inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
+            positive definite; one if None.
+        mask: (B, N) bool, the observations that count, all if None. Observations that are not finite never count.
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
+        prior: Gaussian prior on the poses, in the same units.
+        backward: how gradients reach points, pixels, weights, camera.params, scale and prior.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
 
-    An element that fails (too few points, pose not determined) has `success` False and a zero gradient. The implicit
-    gradient is zero as well where the exact Hessian is not positive definite, that is, not at a strict minimum.
-    Raises ValueError for shapes that do not fit and for unknown names.
+    Returns:
+        The poses. Where `success` is False (too few points, or a pose that they do not determine), the gradient is
+        zero. The implicit gradient is also zero where the exact Hessian is not positive definite.
+
+    Raises:
+        ValueError: a shape does not fit, or a name is unknown.
     """
     check_backward(backward)
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
@@ -375,7 +386,9 @@ def refine_pose(
         found = minimization.minimize(tensors)
     else:
         attached = backward == "implicit"
-        found = minimum(minimization, tensors if attached else [tensor.detach() for tensor in tensors])
+        found = implicit_minimum(
+            minimization, tensors if attached else [tensor.detach() for tensor in tensors]
+        )
     refined, success, cost, steps, converged, initial_cost = found
     if backward == "truncated":
         problem = PoseProblem(inputs)

@@ -55,7 +55,7 @@ class Groups:
 
 
 @dataclass(frozen=True)
-class Layout:
+class PoseGraphLayout:
     """The discrete part of a pose graph: what counts, what moves, and in which order it is processed.
 
     i, j:     (E,) int64 nodes of the edges
@@ -70,13 +70,13 @@ class Layout:
     counted: Tensor
     moving: Tensor
     linking: Tensor
-    turned: Tensor
+    transposed: Tensor
     by_pair: Groups
     by_node: Groups
     structure: BlockStructure
 
 
-def build_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> Layout:
+def build_pose_graph_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> PoseGraphLayout:
     """Decide what moves, and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
@@ -85,7 +85,7 @@ def build_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> La
     low, high = edges[linking].amin(-1), edges[linking].amax(-1)
     keys, positions = torch.unique(low * num_nodes + high, return_inverse=True)
     pairs = torch.stack((keys // num_nodes, keys % num_nodes), dim=-1)
-    return Layout(
+    return PoseGraphLayout(
         i,
         j,
         counted,
@@ -121,11 +121,11 @@ def _reached(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
     return has_fixed.gather(1, label) > 0
 
 
-# A long loop resists a bend as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
+# A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
 
 
-class Inputs(NamedTuple):
+class PoseGraphInputs(NamedTuple):
     """All that gradients may flow to: S_cw (B, K, 4, 4), S_ji (B, E, 4, 4), information (B, E, D, D), scale."""
 
     S_cw: Tensor
@@ -134,7 +134,7 @@ class Inputs(NamedTuple):
     scale: Tensor
 
 
-class Linearization(NamedTuple):
+class EdgeLinearization(NamedTuple):
     """Errors of the edges and how they change.
 
     error:   (B, E, D); J: (B, E, D, D) d error / d eta; carry: (B, E, D, D) Ad(X), so that eta = xi_j - carry xi_i
@@ -146,15 +146,15 @@ class Linearization(NamedTuple):
     error: Tensor
     J: Tensor
     carry: Tensor
-    pull: Tensor
+    weighted_residual: Tensor
     squared: Tensor
     kernel: Robustified
     sigma: Tensor
 
     @property
-    def force(self) -> Tensor:
+    def gradient_wrt_eta(self) -> Tensor:
         """(B, E, D) the gradient of the cost in eta."""
-        return (self.J.mT @ (self.kernel.weight[..., None] * self.pull)[..., None]).squeeze(-1)
+        return (self.J.mT @ (self.kernel.weight[..., None] * self.weighted_residual)[..., None]).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -174,18 +174,21 @@ class PoseGraphModel:
 class PoseGraphProblem:
     """A pose graph for `levenberg_marquardt.minimize`, and what follows from its minimum."""
 
-    def __init__(self, layout: Layout, inputs: Inputs, kernel: Kernel) -> None:
+    def __init__(self, layout: PoseGraphLayout, inputs: PoseGraphInputs, kernel: Kernel) -> None:
         self.layout, self.inputs, self.kernel = layout, inputs, kernel
         self.dims = inputs.information.shape[-1]
         self.solvable = layout.moving.any(-1)
 
-    def evaluate(self, S_cw: Tensor, near: Tensor) -> PoseGraphModel:
+    def evaluate(self, S_cw: Tensor, use_curvature: Tensor) -> PoseGraphModel:
         lin = self._linearize(S_cw)
-        # As in `residuals.pull`: the negative curvature along an outlier's error counts as flat close to the optimum.
+        # As in `residuals.flat_along`: the negative curvature along an outlier's error counts as flat.
         flat = -lin.kernel.weight / torch.where(lin.squared > 0, lin.squared, 1.0)
-        bend = torch.maximum(2 * lin.kernel.curvature, flat) * near[:, None]
-        outer = lin.pull[..., :, None] * lin.pull[..., None, :]
-        curve = lin.kernel.weight[..., None, None] * self.inputs.information + bend[..., None, None] * outer
+        curvature_term = torch.maximum(2 * lin.kernel.curvature, flat) * use_curvature[:, None]
+        outer = lin.weighted_residual[..., :, None] * lin.weighted_residual[..., None, :]
+        curve = (
+            lin.kernel.weight[..., None, None] * self.inputs.information
+            + curvature_term[..., None, None] * outer
+        )
         return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, twist=None)
 
     def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,20 +213,20 @@ class PoseGraphProblem:
     def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
         """The model with the exact Hessian of the cost in the left perturbations."""
         lin = self._linearize(S_cw)
-        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.force))
+        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.gradient_wrt_eta))
 
-    def _linearize(self, S_cw: Tensor) -> Linearization:
+    def _linearize(self, S_cw: Tensor) -> EdgeLinearization:
         layout = self.layout
-        return linearize(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.kernel)
+        return linearize_edges(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.kernel)
 
     def _assemble(
-        self, S_cw: Tensor, lin: Linearization, hessian: Tensor, twist: Tensor | None
+        self, S_cw: Tensor, lin: EdgeLinearization, hessian: Tensor, twist: Tensor | None
     ) -> PoseGraphModel:
         """The normal equations from edges' Hessians (B, E, D, D) in eta, and half the bracket's part of the Hessian."""
         layout, carry = self.layout, lin.carry
-        force = lin.force
-        at_i = torch.cat((carry.mT @ hessian @ carry, -carry.mT @ force[..., None]), dim=-1)
-        ends = torch.cat((at_i, torch.cat((hessian, force[..., None]), dim=-1)), dim=1)
+        gradient_wrt_eta = lin.gradient_wrt_eta
+        at_i = torch.cat((carry.mT @ hessian @ carry, -carry.mT @ gradient_wrt_eta[..., None]), dim=-1)
+        ends = torch.cat((at_i, torch.cat((hessian, gradient_wrt_eta[..., None]), dim=-1)), dim=1)
         moving = layout.moving[..., None]
         nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
         eye = torch.eye(self.dims, dtype=S_cw.dtype, device=S_cw.device)
@@ -234,7 +237,7 @@ class PoseGraphProblem:
         both = (layout.moving[:, layout.i] & layout.moving[:, layout.j])[:, linking, None, None]
         between = hessian if twist is None else hessian + twist
         across = torch.where(both, -(between[:, linking] @ carry[:, linking]), 0.0)
-        across = torch.where(layout.turned[:, None, None], across.mT, across)
+        across = torch.where(layout.transposed[:, None, None], across.mT, across)
         return PoseGraphModel(
             S_cw,
             0.5 * lin.kernel.rho.sum(-1),
@@ -243,7 +246,7 @@ class PoseGraphProblem:
             layout.by_pair.sum(across),
         )
 
-    def _exact_hessian(self, lin: Linearization) -> Tensor:
+    def _exact_hessian(self, lin: EdgeLinearization) -> Tensor:
         """Exact Hessians (B, E, D, D) of the edges' costs in eta, in the chart of the exponential.
 
         The derivative of the force J^T (rho' information error) by autograd, through the analytic Jacobian; its
@@ -255,44 +258,46 @@ class PoseGraphProblem:
             error = lin.error.detach().expand(dims, *lin.error.shape).clone().requires_grad_()
             sigma = lin.sigma.detach().expand(dims, *lin.sigma.shape)[..., None]
             full = error if dims == 7 else torch.cat((error, sigma), dim=-1)
-            pull = (information @ error[..., None]).squeeze(-1)
-            slope = robustify((error * pull).sum(-1), self.kernel, self.inputs.scale.detach()).weight
+            weighted_residual = (information @ error[..., None]).squeeze(-1)
+            slope = robustify(
+                (error * weighted_residual).sum(-1), self.kernel, self.inputs.scale.detach()
+            ).weight
             J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
-            force = (J.mT @ (slope[..., None] * pull)[..., None]).squeeze(-1)
-            (rows,) = torch.autograd.grad(force.movedim(-1, 0).diagonal().sum(), error)
+            gradient_wrt_eta = (J.mT @ (slope[..., None] * weighted_residual)[..., None]).squeeze(-1)
+            (rows,) = torch.autograd.grad(gradient_wrt_eta.movedim(-1, 0).diagonal().sum(), error)
         hessian = rows.movedim(0, -2) @ lin.J
         return torch.where(self.layout.counted[..., None, None], 0.5 * (hessian + hessian.mT), 0.0)
 
 
-def linearize(
-    S_cw: Tensor, i: Tensor, j: Tensor, counted: Tensor, inputs: Inputs, kernel: Kernel
-) -> Linearization:
+def linearize_edges(
+    S_cw: Tensor, i: Tensor, j: Tensor, counted: Tensor, inputs: PoseGraphInputs, kernel: Kernel
+) -> EdgeLinearization:
     """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
     dims = inputs.information.shape[-1]
     relative = S_cw.index_select(1, j) @ sim3_inverse(S_cw).index_select(1, i)
     full = sim3_log(relative @ sim3_inverse(inputs.S_ji))
     error, sigma = full[..., :dims], full[..., 6]
-    pull = (inputs.information @ error[..., None]).squeeze(-1)
-    squared = (error * pull).sum(-1)
+    weighted_residual = (inputs.information @ error[..., None]).squeeze(-1)
+    squared = (error * weighted_residual).sum(-1)
     robust = robustify(squared, kernel, inputs.scale)
     robust = Robustified(*(torch.where(counted, x, 0.0) for x in robust))
     J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
     carry = sim3_adjoint(relative)[..., :dims, :dims]
-    return Linearization(error, J, carry, pull, squared, robust, sigma)
+    return EdgeLinearization(error, J, carry, weighted_residual, squared, robust, sigma)
 
 
-def _bracket(force: Tensor) -> Tensor:
+def _bracket(gradient_wrt_eta: Tensor) -> Tensor:
     """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors. (..., D) -> (..., D, D)."""
-    v, omega = skew(force[..., :3]), skew(force[..., 3:6])
+    v, omega = skew(gradient_wrt_eta[..., :3]), skew(gradient_wrt_eta[..., 3:6])
     M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
-    if force.shape[-1] == 7:
+    if gradient_wrt_eta.shape[-1] == 7:
         M = torch.nn.functional.pad(M, (0, 1, 0, 1))
-        M[..., 6, :3], M[..., :3, 6] = force[..., :3], -force[..., :3]
+        M[..., 6, :3], M[..., :3, 6] = gradient_wrt_eta[..., :3], -gradient_wrt_eta[..., :3]
     return 0.5 * M
 
 
 class PoseGraphMinimization:
-    """A pose graph; its inputs are those of `Inputs`, edges that count (B, E), fixed nodes (B, K), and
+    """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and
     the edges (E, 2).
 
     Found are the nodes (B, K, 4, 4), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
@@ -305,7 +310,7 @@ class PoseGraphMinimization:
     def __init__(self, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
         self.dims, self.kernel = dims, kernel
         self.iterations, self.tolerance = iterations, tolerance
-        self._last: tuple[tuple[Tensor, Tensor], Layout] | None = None
+        self._last: tuple[tuple[Tensor, Tensor], PoseGraphLayout] | None = None
 
     def minimize(self, inputs: Tensors) -> Tensors:
         problem = self._problem(inputs)
@@ -327,14 +332,14 @@ class PoseGraphMinimization:
         return solve
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
-        given, (xi,), (i, j) = Inputs(*inputs[:4]), direction, inputs[6].unbind(-1)
+        given, (xi,), (i, j) = PoseGraphInputs(*inputs[:4]), direction, inputs[6].unbind(-1)
         S_cw = torch.where(found[2][..., None, None], found[0], given.S_cw)
-        lin = linearize(S_cw, i, j, inputs[4], given, self.kernel)
+        lin = linearize_edges(S_cw, i, j, inputs[4], given, self.kernel)
         xi_i, xi_j = xi.index_select(1, i)[..., None], xi.index_select(1, j)[..., None]
         velocity = (lin.J @ (xi_j - lin.carry @ xi_i)).squeeze(-1)
-        return (lin.kernel.weight * (lin.pull * velocity).sum(-1)).sum()
+        return (lin.kernel.weight * (lin.weighted_residual * velocity).sum(-1)).sum()
 
-    def moved(self, found: Tensors, direction: Tensors) -> Tensors:
+    def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         return retract_sim3(found[0], direction[0]), *found[1:]
 
     def push(self, found: Tensors, direction: Tensors) -> Tensors:
@@ -350,11 +355,11 @@ class PoseGraphMinimization:
         return problem.step(last, torch.zeros_like(last.cost))[0]
 
     def _problem(self, inputs: Tensors) -> PoseGraphProblem:
-        return PoseGraphProblem(self._layout(*inputs[4:]), Inputs(*inputs[:4]), self.kernel)
+        return PoseGraphProblem(self._layout(*inputs[4:]), PoseGraphInputs(*inputs[:4]), self.kernel)
 
-    def _layout(self, counted: Tensor, fixed: Tensor, edges: Tensor) -> Layout:
+    def _layout(self, counted: Tensor, fixed: Tensor, edges: Tensor) -> PoseGraphLayout:
         """The layout for what counts and is fixed; the last one is kept, which mostly is the next one."""
         key = counted, fixed
         if self._last is None or not all(map(torch.equal, self._last[0], key)):
-            self._last = key, build_layout(edges, counted, fixed, self.dims)
+            self._last = key, build_pose_graph_layout(edges, counted, fixed, self.dims)
         return self._last[1]

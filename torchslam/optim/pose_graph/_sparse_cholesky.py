@@ -35,26 +35,26 @@ class FrontNodes:
 
 def dissect(num_nodes: int, pairs: Iterable[tuple[int, int]]) -> list[FrontNodes]:
     """Fronts that eliminate all nodes, children before their parents. pairs: the joined nodes, each pair once."""
-    neighbours: list[list[int]] = [[] for _ in range(num_nodes)]
+    neighbors: list[list[int]] = [[] for _ in range(num_nodes)]
     for a, b in pairs:
-        neighbours[a].append(b)
-        neighbours[b].append(a)
+        neighbors[a].append(b)
+        neighbors[b].append(a)
     fronts: list[FrontNodes] = []
-    _split(list(range(num_nodes)), neighbours, fronts)
+    _split(list(range(num_nodes)), neighbors, fronts)
 
     front_of = [0] * num_nodes
     for index, front in enumerate(fronts):
         for node in front.eliminated:
             front_of[node] = index
     for index, front in enumerate(fronts):
-        touched = {other for node in front.eliminated for other in neighbours[node]}
+        touched = {other for node in front.eliminated for other in neighbors[node]}
         touched.update(*(fronts[child].boundary for child in front.children))
         later = (node for node in touched if front_of[node] > index)
         front.boundary = sorted(later, key=lambda node: (front_of[node], node))
     return fronts
 
 
-def _split(part: list[int], neighbours: list[list[int]], fronts: list[FrontNodes]) -> list[int]:
+def _split(part: list[int], neighbors: list[list[int]], fronts: list[FrontNodes]) -> list[int]:
     """Append the fronts of a part of the graph; returns those that no other one of the part follows."""
     roots: list[int] = []
     pool: list[int] = []
@@ -62,11 +62,11 @@ def _split(part: list[int], neighbours: list[list[int]], fronts: list[FrontNodes
     for start in part:
         if start not in inside:
             continue
-        levels = _levels(start, neighbours, inside)
+        levels = _levels(start, neighbors, inside)
         component = [node for level in levels for node in level]
         if len(component) > _LEAF_NODES:
-            separator, halves = _separator(_levels(component[-1], neighbours, inside))
-            children = [root for half in halves if half for root in _split(half, neighbours, fronts)]
+            separator, halves = _separator(_levels(component[-1], neighbors, inside))
+            children = [root for half in halves if half for root in _split(half, neighbors, fronts)]
             fronts.append(FrontNodes(separator, children))
             roots.append(len(fronts) - 1)
         else:
@@ -85,13 +85,13 @@ def _append_leaf(nodes: list[int], fronts: list[FrontNodes], roots: list[int]) -
     return []
 
 
-def _levels(start: int, neighbours: list[list[int]], inside: set[int]) -> list[list[int]]:
+def _levels(start: int, neighbors: list[list[int]], inside: set[int]) -> list[list[int]]:
     """The nodes reached from `start` inside a part, by their distance from it."""
     levels, seen = [[start]], {start}
     while levels[-1]:
         following = []
         for node in levels[-1]:
-            for other in neighbours[node]:
+            for other in neighbors[node]:
                 if other not in seen and other in inside:
                     seen.add(other)
                     following.append(other)
@@ -223,7 +223,7 @@ def factorize_sparse(
     damping: Tensor | None = None,
     strict: bool = True,
 ) -> SparseFactor:
-    """Cholesky factorisation of symmetric block systems that never raises.
+    """Cholesky factorization of symmetric block systems that never raises.
 
     diagonal: (B, K, D, D) blocks of the nodes; across: (B, P, D, D) blocks at (pairs[p, 0], pairs[p, 1])
     damping:  (B,) share by which the diagonal grows

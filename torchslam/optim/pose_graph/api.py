@@ -1,4 +1,4 @@
-"""Pose graph optimisation over similarities, or rigid poses: sparse, robust, batched, differentiable."""
+"""Pose graph optimization over similarities, or rigid poses: sparse, robust, batched, differentiable."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.core.implicit import Backward, check_backward, minimum
+from torchslam.optim.core.implicit import Backward, check_backward, implicit_minimum
 from torchslam.optim.core.levenberg_marquardt import Convergence
-from torchslam.optim.pose_graph._problem import Inputs, PoseGraphMinimization
+from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 
 # 95 % of the norms of seven standard normal numbers lie below.
 _SCALE = 3.75
@@ -21,17 +21,18 @@ _SCALE = 3.75
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Nodes, and how some of them lie relative to others, as measured. A batch shares nodes and edges.
+    """Nodes with measured relative similarities, or rigid poses; a batch shares the edges.
 
-    S_cw:        (B, K, 4, 4) or (K, 4, 4) start, world to node, similarities
-    edges:       (E, 2) int64 nodes (i, j)
-    S_ji:        (B, E, 4, 4) or (E, 4, 4) measured, from node i to node j
-    information: inverse covariances (B, E, D, D) or (E, D, D) of log(S_j S_i^-1 S_ji^-1), symmetric; D = 7:
-                 translation, rotation, log scale, or, without scale, 6; or weights (B, E) or (E,) of the identity; one
-                 if None
-    fixed:       rows of nodes, or a (B, K) or (K,) bool mask, that stay as they are
-    mask:        (B, E) or (E,) bool, edges that count, all if None
-    with_scale:  whether the scales of the nodes move; if not, the log scale is no part of the error either
+    Attributes:
+        S_cw: (B, K, 4, 4) or (K, 4, 4) similarities from the world to the nodes, the start.
+        edges: (E, 2) int64 nodes (i, j).
+        S_ji: (B, E, 4, 4) or (E, 4, 4) measurements, from node i to node j.
+        information: (B, E, D, D) or (E, D, D) inverse covariances of log(S_j S_i^-1 S_ji^-1), symmetric, with D = 7:
+            translation, rotation, log scale; D = 6 without scale. Or (B, E) or (E,) weights of the identity; one if
+            None.
+        fixed: rows of nodes, or a (B, K) or (K,) bool mask.
+        mask: (B, E) or (E,) bool, edges that count, all if None.
+        with_scale: free the scales of the nodes. If False, the log scale is not part of the error either.
     """
 
     S_cw: Tensor
@@ -47,13 +48,14 @@ class PoseGraph:
 class PoseGraphSolution:
     """The minimum of a pose graph; without the B where the graph had none.
 
-    S_cw:        (B, K, 4, 4)
-    cost:        (B,) half the sum of robustified squared whitened errors, detached
-    success:     (B,) bool, something moves, and all that moves is determined. If not, the estimate is the best that was
-                 found, but it has no gradient.
-    moved:       (B, K) bool. What is fixed, not finite, or not joined with a fixed node by edges that count, stayed at
-                 its start (the identity, where that is no similarity), without gradient but to that start.
-    convergence: per element of the batch
+    Attributes:
+        S_cw: (B, K, 4, 4)
+        cost: (B,) half the sum of robustified squared whitened errors, detached.
+        success: (B,) bool, some node is free, and all free nodes are determined. If False, the estimate is the best
+            one found, but it has no gradient.
+        moved: (B, K) bool. Nodes that are fixed, not finite, or not connected with a fixed node by counted edges stayed
+            at their start (the identity where that is not a similarity), with a gradient to that start only.
+        convergence: iterations and convergence per element of the batch.
     """
 
     S_cw: Tensor
@@ -72,18 +74,26 @@ def pose_graph_optimize(
     iterations: int = 30,
     tolerance: float = 1e-8,
 ) -> PoseGraphSolution:
-    """Minimise the robust errors log(S_j S_i^-1 S_ji^-1) of the edges over the nodes by Levenberg-Marquardt.
+    """Minimize the robust errors log(S_j S_i^-1 S_ji^-1) of the edges over the nodes by Levenberg-Marquardt.
 
-    scale:    of the kernel, in units of the whitened error: a number, a scalar tensor or (B,)
-    backward: how gradients reach S_ji, information, scale and fixed nodes, see `implicit.Backward`. The gradient ends
-              at the start of what moves.
-    tolerance: stop where a step promises to lower the cost by less than this share of it
+    Edges that are not finite, have no weight or touch a node that is not finite do not count. The implicit gradient is
+    zero where the exact Hessian is not positive definite. Memory and time grow with the fill-in of the graph, for
+    trajectories about linearly in the nodes.
+    Source: Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010.
 
-    Edges that are not finite, have no weight or touch a node that is not finite do not count. Where the exact Hessian
-    is not positive definite, that is, not at a strict minimum, the implicit gradient is zero. Memory and time grow with
-    the fill-in of the graph, for trajectories about linearly in the nodes. Raises ValueError for shapes and indices
-    that do not fit and for unknown names. Source: Strasdat, Montiel and Davison, "Scale drift-aware large scale
-    monocular SLAM", 2010.
+    Args:
+        graph: the pose graph, or a batch.
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened error: a number, a scalar tensor or (B,).
+        backward: how gradients reach S_ji, information, scale and fixed nodes, but not the start of free ones.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
+
+    Returns:
+        The nodes at the minimum, differentiable.
+
+    Raises:
+        ValueError: a shape or an index does not fit, or a name is unknown.
     """
     check_backward(backward)
     counted, fixed, inputs = _sanitized(graph, scale)
@@ -93,7 +103,7 @@ def pose_graph_optimize(
         found = minimization.minimize(tensors)
     else:
         attached = backward == "implicit"
-        found = minimum(minimization, tensors if attached else [x.detach() for x in tensors])
+        found = implicit_minimum(minimization, tensors if attached else [x.detach() for x in tensors])
     solution, success, moving, cost, steps, converged, initial_cost = found
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
     if backward == "implicit":
@@ -109,7 +119,7 @@ def pose_graph_optimize(
     )
 
 
-def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor, Inputs]:
+def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor, PoseGraphInputs]:
     """Edges that count (B, E), fixed nodes (B, K), and the tensors, all batched and finite."""
     S_cw, S_ji, edges = graph.S_cw, graph.S_ji, graph.edges
     if S_cw.ndim not in (3, 4) or S_cw.shape[-2:] != (4, 4) or edges.ndim != 2 or edges.shape[1] != 2:
@@ -146,7 +156,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
     return (
         counted,
         fixed,
-        Inputs(
+        PoseGraphInputs(
             torch.where(nodes[..., None, None], S_cw, eye),
             torch.where(rows, S_ji, eye),
             torch.where(rows, information, 0.0),

@@ -1,0 +1,340 @@
+"""SLAM of short clips as a trainable module: images in, poses out, gradients back into the front end.
+
+The system makes the discrete decisions (which keypoints match, which frames are keyframes) once, without gradient. The
+result is a graph: a least-squares problem whose pixels are read from the features, with their gradients, in every step.
+The poses are its minimizer, differentiated by the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchslam.config import Config
+from torchslam.errors import ClipError
+from torchslam.evaluation import MIN_POSES, ate
+from torchslam.features.contract import check_features
+from torchslam.geometry import Camera, KeypointNoise
+from torchslam.geometry.gating import times
+from torchslam.map.posed_frames import RunGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graphs
+from torchslam.system.run import finish
+from torchslam.system.slam import SLAM
+from torchslam.types import Features, Frame
+
+OnFailure = Literal["raise", "skip"] | float
+
+# Clips whose keypoints moved by 0.5 px need 5 to 70, by 1.5 px mostly below 200; 30 are too few for a third of them.
+_ITERATIONS = 300
+# Relative cost decrease that the last step predicts: gradients are then right to 1e-6; with 1e-10 to 1e-4.
+_TOLERANCE = 1e-14
+
+
+@dataclass(frozen=True)
+class ClipGraph:
+    """The discrete decisions of the system for a clip of T frames, or for B clips, without gradient.
+
+    Attributes:
+        runs: One per clip: keyframes, points and the observing keypoints; None where no map was initialized.
+        cameras: One per clip, float64.
+        frames: T.
+        batched: Whether this holds B clips (B may be 1).
+        reasons: One per clip: why no map was initialized, or empty.
+    """
+
+    runs: tuple[RunGraph | None, ...]
+    cameras: tuple[Camera, ...]
+    frames: int
+    batched: bool
+    reasons: tuple[str, ...]
+
+    @staticmethod
+    def stack(graphs: Sequence[ClipGraph]) -> ClipGraph:
+        """Combine graphs of one clip each, with the same number of frames. Raises ValueError otherwise."""
+        if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
+            raise ValueError("stack needs graphs of one clip each with the same number of frames")
+        clips = ((graph.runs[0], graph.cameras[0], graph.reasons[0]) for graph in graphs)
+        runs, cameras, reasons = zip(*clips, strict=True)
+        return ClipGraph(runs, cameras, graphs[0].frames, True, reasons)
+
+
+@dataclass(frozen=True)
+class ClipPoses:
+    """The poses of a clip of T frames, or of B clips.
+
+    Attributes:
+        T_cw: (T, 4, 4) or (B, T, 4, 4) world to camera, float64, the identity where there is no pose. The world is the
+            camera of the clip's first keyframe, its unit of length the median depth of the first map.
+        posed: (T,) or (B, T) bool; only the frames of the main submap where a clip has several.
+        success: () or (B,) bool: a map was initialized, enough frames are posed, and the solve converged, without which
+            the gradient would be wrong.
+        reasons: One per clip: why it failed, or empty.
+        graphs: One per clip, with differentiable pixels and weights; None where no map was initialized.
+        solutions: One per clip: minimum of the graph, with points and covariances; None where no map was initialized.
+    """
+
+    T_cw: Tensor
+    posed: Tensor
+    success: Tensor
+    reasons: tuple[str, ...]
+    graphs: tuple[RunGraph | None, ...]
+    solutions: tuple[GraphSolution | None, ...]
+
+    @property
+    def failure_rate(self) -> float:
+        """The fraction of clips that failed."""
+        return float((~self.success).double().mean())
+
+
+class ClipLoss(NamedTuple):
+    """The differentiable loss () over the clips, and the fraction of clips that failed."""
+
+    loss: Tensor
+    failure_rate: float
+
+
+def clip_loss(
+    poses: ClipPoses,
+    T_cw_groundtruth: Tensor,
+    error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
+    on_failure: OnFailure = "raise",
+) -> ClipLoss:
+    """Average an error against the true poses over the clips.
+
+    Args:
+        poses: Of T frames, or of B clips.
+        T_cw_groundtruth: (T, 4, 4) or (B, T, 4, 4).
+        error: Maps poses, true poses and mask, shaped like those of `poses`, to () or (B,).
+        on_failure: See `clip_mean`.
+    """
+    return clip_mean(poses, error(poses.T_cw, T_cw_groundtruth, poses.posed), on_failure)
+
+
+def clip_mean(poses: ClipPoses, errors: Tensor, on_failure: OnFailure = "raise") -> ClipLoss:
+    """Average errors over the clips; a failed clip never counts as error zero, since a front end could learn to fail.
+
+    Args:
+        poses: Of T frames, or of B clips.
+        errors: () or (B,).
+        on_failure: "raise" raises ClipError with the reasons. "skip" omits failed clips, and raises ClipError if none
+            is left. A number is the cost of each failed clip, without gradient.
+    """
+    if isinstance(on_failure, str) and on_failure not in ("raise", "skip"):
+        raise ValueError(f"on_failure must be 'raise', 'skip' or a number, not {on_failure!r}")
+    reasons = [f"clip {index}: {reason}" for index, reason in enumerate(poses.reasons) if reason]
+    if reasons and (on_failure == "raise" or (on_failure == "skip" and len(reasons) == len(poses.reasons))):
+        raise ClipError(f"{len(reasons)} of {len(poses.reasons)} clips failed; {'; '.join(reasons)}")
+    cost = 0.0 if isinstance(on_failure, str) else float(on_failure)
+    errors = torch.where(poses.success, errors, cost)
+    counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success
+    return ClipLoss(errors.sum() / counted.sum(), poses.failure_rate)
+
+
+class ClipSLAM(nn.Module):
+    """Poses of clips, differentiable with respect to images, camera and the parameters of the front end:
+
+        clip_slam = ClipSLAM(XFeat("xfeat.safetensors"))
+        optimizer = torch.optim.Adam(clip_slam.parameters(), 1e-4)
+        for images, T_cw_groundtruth in clips:
+            optimizer.zero_grad()
+            poses = clip_slam(images, camera)
+            clip_loss(poses, T_cw_groundtruth, on_failure=1.0).loss.backward()
+            optimizer.step()
+
+    A call builds the graph and solves it for the poses. If training only moves or reweights keypoints, build the graph
+    once and reuse it; a step then takes about 0.1 s plus the front end:
+
+        graph = clip_slam.build_graph(images, camera)
+        ...
+        poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, features)
+
+    Args:
+        extractor: Module from images (B, 1, H, W) to Features with differentiable keypoints, such as
+            ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; in `train` mode their
+            normalization statistics would follow the clip.
+        keypoint_weight: Module or function from Features to weights (B, N) >= 0 that multiply the information of each
+            keypoint (for example its score); 1 if None.
+        config: Of the system; its features section is not read.
+    """
+
+    def __init__(
+        self,
+        extractor: nn.Module,
+        keypoint_weight: Callable[[Features], Tensor] | None = None,
+        config: Config | None = None,
+    ) -> None:
+        super().__init__()
+        self.extractor = extractor
+        self.keypoint_weight = keypoint_weight
+        self.config = config or Config()
+
+    def forward(self, images: Tensor, camera: Camera, graph: ClipGraph | None = None) -> ClipPoses:
+        """Estimate the poses of a clip, or of each of several clips.
+
+        The front end runs on the device of the images, the rest on that of the camera. World frame and unit are
+        arbitrary and have no gradient: use a loss that does not depend on them, such as `clip_loss`. A failed clip has
+        no posed frame and a gradient of zero; see `success` and `reasons`.
+
+        Args:
+            images: (T, 1, H, W) or (B, T, 1, H, W), floats in [0, 1].
+            camera: Of all clips, or with params (B, K) one for each.
+            graph: Of these images, by `build_graph`; built anew if None.
+
+        Raises:
+            ValueError: Images of another shape.
+            FrameError: Images of another size than the camera.
+        """
+        features = self.extract(images)
+        graph = self.build_graph(images, camera, features) if graph is None else graph
+        return self.pose(graph, features, camera)
+
+    def extract(self, images: Tensor) -> Features | list[Features]:
+        """Extract the features of a clip (T, 1, H, W), or of each of several (B, T, 1, H, W)."""
+        if images.ndim not in (4, 5):
+            raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
+        return [self.extractor(clip) for clip in images] if images.ndim == 5 else self.extractor(images)
+
+    @torch.no_grad()
+    def build_graph(
+        self, images: Tensor, camera: Camera, features: Features | Sequence[Features] | None = None
+    ) -> ClipGraph:
+        """Run the system on a clip or on several, without gradient: matches, keyframes, correspondences.
+
+        Args:
+            images: As in `forward`.
+            camera: As in `forward`.
+            features: Results of `extract`, if already computed.
+
+        Raises:
+            ConfigError: Invalid features of the front end, see `features.contract`.
+        """
+        seen = _per_clip(self.extract(images) if features is None else features)
+        clips, batched = (images, True) if images.ndim == 5 else (images[None], False)
+        # A copy: parameters may move in place while they learn.
+        camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
+        cameras = _cameras(camera, len(clips))
+        found = (self._build_graph(*one) for one in zip(clips, seen, cameras, strict=True))
+        runs, reasons = zip(*found, strict=True)
+        return ClipGraph(runs, cameras, clips.shape[1], batched, reasons)
+
+    def pose(
+        self, graph: ClipGraph, features: Features | Sequence[Features], camera: Camera | None = None
+    ) -> ClipPoses:
+        """Solve a graph for the poses, differentiable with respect to features and camera.
+
+        Args:
+            graph: Of `build_graph`.
+            features: Of the clip, or one per clip: the same keypoints in the same rows as when the graph was built,
+                possibly moved. Rows with a False mask do not count.
+            camera: As in `forward`; that of the graph, without gradient, if None.
+        """
+        seen = _per_clip(features)
+        cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
+        if len(seen) != len(graph.runs) or any(len(each.mask) != graph.frames for each in seen):
+            shapes = [tuple(each.mask.shape) for each in seen]
+            raise ValueError(
+                f"features of shapes {shapes} for {len(graph.runs)} clips of {graph.frames} frames"
+            )
+        cameras = tuple(camera.to(torch.float64) for camera in cameras)
+        seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
+        keypoint_weights = [
+            torch.ones_like(each.scores) if self.keypoint_weight is None else self.keypoint_weight(each)
+            for each in seen
+        ]
+        graphs = tuple(
+            None if run is None else _as_seen(run, each, weights_of, own)
+            for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
+        )
+        solvable = [each for each in graphs if each is not None]
+        found = iter(solve_graphs(solvable, iterations=_ITERATIONS, tolerance=_TOLERANCE))
+        solutions = tuple(None if each is None else next(found) for each in graphs)
+        clips = [_posed(*one) for one in zip(graphs, solutions, seen, keypoint_weights, cameras, strict=True)]
+        T_cw, posed = (torch.stack(each) for each in zip(*clips, strict=True))
+        settled = [each is not None and bool((each.converged | ~each.success).all()) for each in solutions]
+        success = (posed.sum(-1) >= MIN_POSES) & torch.tensor(settled, device=posed.device)
+        reasons = (
+            "" if good else _reason(*one)
+            for good, *one in zip(success.tolist(), graph.reasons, solutions, posed, strict=True)
+        )
+        row = slice(None) if graph.batched else 0
+        return ClipPoses(T_cw[row], posed[row], success[row], tuple(reasons), graphs, solutions)
+
+    def _build_graph(self, images: Tensor, features: Features, camera: Camera) -> tuple[RunGraph | None, str]:
+        """The graph of one clip, or None and the reason why no map was initialized."""
+        check_features(features, images, type(self.extractor).__name__)
+        features = features.to(camera.params.device)
+        slam = SLAM(camera, self.config, self.extractor)
+        frames = [
+            Frame(index, float(index), image[None], features=features[index : index + 1])
+            for index, image in enumerate(images)
+        ]
+        run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
+        return None if run.main is None else run.main.posed_frames.graph(run.map, run.camera), run.failure
+
+
+def _per_clip(features: Features | Sequence[Features]) -> Sequence[Features]:
+    return [features] if isinstance(features, Features) else features
+
+
+def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
+    """One camera per clip, of one for all or of one with params (B, K)."""
+    if camera.params.ndim == 1:
+        return (camera,) * clips
+    if camera.params.shape[:-1] != (clips,):
+        raise ValueError(
+            f"params of the camera must be (K,) or ({clips}, K), not {tuple(camera.params.shape)}"
+        )
+    return tuple(camera[row] for row in range(clips))
+
+
+def _as_seen(run: RunGraph, features: Features, keypoint_weights: Tensor, camera: Camera) -> RunGraph:
+    """The graph of a clip with the current pixels of its features, weighted by keypoint_weights (T, N)."""
+    run = _still_seen(run, features.mask)
+    rows = (run.frame_ids[run.frame_index], run.keypoint_index)
+    weights = run.weights
+    if features.information is not None:
+        weights = KeypointNoise.of(features.scales[rows], features.information[rows]).weights.double()
+    weights = times(weights, keypoint_weights[rows])
+    return replace(run, pixels=features.keypoints[rows].double(), weights=weights, camera=camera)
+
+
+def _posed(
+    graph: RunGraph | None,
+    solution: GraphSolution | None,
+    features: Features,
+    keypoint_weights: Tensor,
+    camera: Camera,
+) -> tuple[Tensor, Tensor]:
+    """The poses (T, 4, 4) of a clip, and which frames have one (T,)."""
+    # Zero times everything that poses depend on, so that the gradient exists without any pose.
+    nothing = features.keypoints.sum() + keypoint_weights.sum() + camera.params.sum()
+    nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
+    frames, device = len(features.mask), nothing.device
+    T_cw = torch.eye(4, dtype=torch.float64, device=device) + nothing.expand(frames, 1, 1)
+    posed = torch.zeros(frames, dtype=torch.bool, device=device)
+    if graph is None or solution is None:
+        return T_cw, posed
+    T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
+    return T_cw, posed.index_copy(0, graph.frame_ids, solution.success)
+
+
+def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
+    """The graph without the observations of keypoints that mask (T, N) excludes."""
+    kept = mask[graph.frame_ids[graph.frame_index], graph.keypoint_index]
+    columns = ("frame_index", "point_index", "pixels", "weights", "keypoint_index")
+    return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
+
+
+def _reason(no_map: str, solution: GraphSolution | None, posed: Tensor) -> str:
+    """Why a clip failed."""
+    if solution is None:
+        return no_map
+    if not any(bundle.success for bundle in solution.keyframes):
+        return "its keyframes and points are not determined"
+    if int(posed.sum()) < MIN_POSES:
+        return f"{int(posed.sum())} of {len(posed)} frames have a pose, {MIN_POSES} are needed"
+    return f"its poses did not converge in {_ITERATIONS} iterations: their gradient would be wrong"
