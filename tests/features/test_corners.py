@@ -111,7 +111,7 @@ def test_patch_scores_gradcheck() -> None:
 
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_peaks_exceed_their_neighbours(seed: int) -> None:
+def test_peaks_exceed_their_neighbors(seed: int) -> None:
     scores = torch.from_numpy(noise(12, 14, seed) // 64)  # many ties
     floor = torch.zeros(12 * 14, dtype=torch.uint8)
     peaks = torch.zeros(12, 14, dtype=torch.bool)
@@ -149,7 +149,7 @@ def test_elsewhere_than_on_the_host_there_is_one_chunk() -> None:
 
 
 def paraboloid(x: float, y: float, side: int = 3) -> torch.Tensor:
-    """A peak at (x, y) from the centre, turned and longer in one direction than in the other."""
+    """A peak at (x, y) from the center, turned and longer in one direction than in the other."""
     axis = torch.arange(side, dtype=torch.float64) - side // 2
     dy, dx = torch.meshgrid(axis - y, axis - x, indexing="ij")
     return 100 - 3 * dx**2 - 2 * dy**2 + dx * dy
@@ -200,7 +200,7 @@ def test_soft_peak_leans_towards_the_maximum(x: float, y: float) -> None:
     assert torch.equal(offset.sign(), torch.tensor([x, y], dtype=torch.float64).sign()) or x == 0
 
 
-def test_soft_peak_of_nothing_is_the_centre() -> None:
+def test_soft_peak_of_nothing_is_the_center() -> None:
     assert soft_peak(torch.zeros(2, 3, 3)).abs().max() < 1e-6
 
 

@@ -20,16 +20,16 @@ EXTRACTORS = pytest.mark.parametrize("kind", [ORB, OpenCVORB])
 
 
 def scene(height: int, width: int, seed: int = 0) -> Tensor:
-    """(1, 1, H, W): overlapping rectangles and discs of random grey, slightly blurred."""
+    """(1, 1, H, W): overlapping rectangles and discs of random gray, slightly blurred."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width), 128, dtype=np.uint8)
     for _ in range(height * width // 400):
         x, y = (int(v) for v in rng.integers(0, (width, height)))
-        size, grey = int(rng.integers(4, 24)), int(rng.integers(0, 256))
+        size, gray = int(rng.integers(4, 24)), int(rng.integers(0, 256))
         if rng.random() < 0.7:
-            cv2.rectangle(image, (x, y), (x + size, y + size), grey, -1)
+            cv2.rectangle(image, (x, y), (x + size, y + size), gray, -1)
         else:
-            cv2.circle(image, (x, y), size // 2, grey, -1)
+            cv2.circle(image, (x, y), size // 2, gray, -1)
     return to_tensor(cv2.GaussianBlur(image, (0, 0), 0.8))
 
 
@@ -149,8 +149,8 @@ def test_corners_of_a_square_are_found_at_their_place(kind: type[nn.Module], sca
     # FAST-9 fires inside the corner, a pixel of the level or two from its tip, alike at all four.
     apart = distances(found, corners)
     assert apart.amin(0).max() < 2.5 * scale
-    centre = torch.stack([found[apart[:, k].argmin()] for k in range(4)]).mean(0)
-    assert (centre - edge.mean()).abs().max() < (0.5 if kind is ORB else scale)
+    center = torch.stack([found[apart[:, k].argmin()] for k in range(4)]).mean(0)
+    assert (center - edge.mean()).abs().max() < (0.5 if kind is ORB else scale)
 
 
 def test_subpixel_positions_follow_the_image() -> None:
@@ -177,7 +177,7 @@ def test_subpixel_positions_follow_the_image() -> None:
 def test_turning_the_image_turns_the_keypoints(kind: type[nn.Module], degrees: float) -> None:
     image = (scene(300, 300, 3)[0, 0].numpy() * 255).astype(np.uint8)
     turn = math.radians(degrees)
-    # From x towards y, about the centre.
+    # From x towards y, about the center.
     warp = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     warp = np.c_[warp, 149.5 - warp @ [149.5, 149.5]]
     turned = cv2.warpAffine(image, warp, (300, 300), borderMode=cv2.BORDER_REFLECT)
@@ -218,7 +218,7 @@ def test_an_image_of_weak_texture_has_as_many_keypoints(ranking: str) -> None:
 
 def test_faint_corners_count_where_there_are_hardly_others() -> None:
     bright = scene(240, 320)
-    faint = (bright - 0.5) * 0.06 + 0.5  # fifteen grey values from black to white
+    faint = (bright - 0.5) * 0.06 + 0.5  # fifteen gray values from black to white
     orb = ORB(num_keypoints=300)
     features = orb(torch.cat([faint, bright]))
     assert features.mask.sum(1).tolist() == [300, 300]

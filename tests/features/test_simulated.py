@@ -126,15 +126,15 @@ def test_a_point_twice_as_far_is_half_as_large_and_gone_beyond_the_pyramid(camer
 
 def test_noise_grows_with_the_scale(camera: Camera, T_cw: Tensor) -> None:
     simulated = SimulatedFeatures(T_cw, camera, noise_px=0.5, **SIZED)
-    normalised, scales = [], []
+    normalized, scales = [], []
     for index, pose in enumerate(T_cw):
         features = simulated(pose, index)
         found = features.mask[0]
         ids = ids_of(simulated, features.descriptors[0][found])
         pixels = camera.project(transform(pose, simulated.points_w[ids]))[0]
         scales.append(features.scales[0][found])
-        normalised.append((features.keypoints[0][found] - pixels) / scales[-1][:, None])
-    error, scale = torch.cat(normalised), torch.cat(scales)
+        normalized.append((features.keypoints[0][found] - pixels) / scales[-1][:, None])
+    error, scale = torch.cat(normalized), torch.cat(scales)
     for part in (error[scale < 1.5], error[scale > 2.5]):
         assert len(part) > 300
         assert 0.46 < float((part**2).mean()) ** 0.5 < 0.54

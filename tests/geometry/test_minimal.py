@@ -158,8 +158,8 @@ def test_offsets_are_finite_and_differentiable() -> None:
         g.se3_exp(torch.tensor([0, 0, 1.0, 0, 0, 0]).double()),
     ):
         T_21 = T_21.clone().requires_grad_()
-        centre = torch.tensor([[159.5, 119.5]], dtype=torch.float64)
-        across, along = offsets(T_21, centre, centre)
+        center = torch.tensor([[159.5, 119.5]], dtype=torch.float64)
+        across, along = offsets(T_21, center, center)
         assert float((across.abs() + along.abs()).detach()) == 0
         (across.sum() + along.sum()).backward()
         assert torch.isfinite(T_21.grad).all()

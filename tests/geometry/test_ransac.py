@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchslam.geometry.estimate_gradients import implicit_step
-from torchslam.geometry.lie import so3_exp
-from torchslam.geometry.local_optimization import minimize, small_rotation
+from torchslam.geometry.lie import cayley_rotation, so3_exp
 from torchslam.geometry.ransac import (
     is_significant,
     is_unlikely,
+    levenberg_marquardt,
     pad_groups,
     sample_minimal,
     sample_minimal_of_all,
@@ -112,7 +112,7 @@ def test_minimize_reaches_the_minimum_of_each_problem_and_survives_nan() -> None
         rows = torch.stack((J, residual), dim=-1)
         return rows.mT @ rows, residual.squeeze(-1).square()
 
-    (x,), cost = minimize(
+    (x,), cost = levenberg_marquardt(
         (torch.ones(3, 1, dtype=torch.float64),), evaluate, lambda x, step: (x[0] + step,), 60
     )
     torch.testing.assert_close(x[:2, 0], torch.tensor((2 ** (1 / 3), 2.0), dtype=torch.float64))
@@ -120,22 +120,22 @@ def test_minimize_reaches_the_minimum_of_each_problem_and_survives_nan() -> None
     assert float(x[2]) == 1.0
 
 
-def test_small_rotation_is_a_rotation_close_to_exp() -> None:
+def test_cayley_rotation_is_a_rotation_close_to_exp() -> None:
     omega = 0.01 * torch.randn(10, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    R = small_rotation(omega)
+    R = cayley_rotation(omega)
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand(10, 3, 3))
     torch.testing.assert_close(R, so3_exp(omega), atol=1e-5, rtol=0)
 
 
-def test_implicit_step_has_the_gradient_of_the_minimiser() -> None:
+def test_implicit_step_has_the_gradient_of_the_minimizer() -> None:
     data = torch.tensor((0.3, -0.7), dtype=torch.float64, requires_grad=True)
-    minimiser = torch.stack((data, data.exp()), dim=-1).detach()  # of the function below
+    minimizer = torch.stack((data, data.exp()), dim=-1).detach()  # of the function below
 
     def objective(step: torch.Tensor) -> torch.Tensor:
-        x = minimiser + step
+        x = minimizer + step
         return (x[:, 0] - data).square() + (x[:, 1] - x[:, 0].exp()).square()
 
-    step = implicit_step(objective, minimiser)
+    step = implicit_step(objective, minimizer)
     assert float(step.detach().abs().max()) == 0
     (gradient,) = torch.autograd.grad(step[:, 1].sum(), data)
     torch.testing.assert_close(gradient, data.detach().exp())

@@ -128,7 +128,7 @@ def test_carried_points_are_seen_as_before_in_the_new_unit() -> None:
     torch.testing.assert_close(turned_w.norm(dim=-1), torch.ones(5, dtype=torch.float64))
 
 
-def test_the_pose_of_a_similarity_is_rigid_and_keeps_the_centre() -> None:
+def test_the_pose_of_a_similarity_is_rigid_and_keeps_the_center() -> None:
     S_cw = problem()[4]
     T_cw = without_scale(S_cw)
     gram = T_cw[:, :3, :3] @ T_cw[:, :3, :3].mT

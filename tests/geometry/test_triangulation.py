@@ -46,8 +46,8 @@ def test_exact_matches_give_the_points_back(camera: Camera) -> None:
     T_cw, pixels, points_w = views(camera, extra=2)
     two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera)
     many = triangulate_many(T_cw, pixels, camera)
-    centres = se3_inverse(T_cw)[:, :3, 3]
-    rays = points_w - centres[0], points_w - centres[1]
+    centers = se3_inverse(T_cw)[:, :3, 3]
+    rays = points_w - centers[0], points_w - centers[1]
     angles = torch.acos(torch.nn.functional.cosine_similarity(*rays, dim=-1))
     for result in (two, many):
         assert result.mask.all()

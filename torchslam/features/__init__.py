@@ -12,8 +12,7 @@ from torchslam.features.matching.brute_force import match, match_pairs
 from torchslam.features.matching.by_projection import match_by_projection
 from torchslam.features.matching.hamming import hamming, pack_bits, unpack_bits
 from torchslam.features.matching.radius_search import expand_runs
-from torchslam.features.opencv_orb import OpenCVORB
-from torchslam.features.orb import ORB
+from torchslam.features.orb import ORB, OpenCVORB
 from torchslam.features.simulated import SimulatedFeatures
 
 __all__ = [

@@ -1,7 +1,7 @@
 """The image pyramid, packed in one rectangle so that every dense step is one operation for all levels.
 
 All levels of an image lie in one rectangle with a common row stride. In the flattened rectangle the neighbor
-(dx, dy) of pixel p is p + dy * stride + dx, on every level alike. Neighbourhoods reach over a level's edge into
+(dx, dy) of pixel p is p + dy * stride + dx, on every level alike. Neighborhoods reach over a level's edge into
 another level; keypoints keep a border from the edge, so these values are never used.
 """
 

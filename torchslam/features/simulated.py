@@ -50,8 +50,8 @@ class SimulatedFeatures:
         self.num_keypoints, self.scales = num_keypoints, scales
         self.noise_px, self.outliers, self.dropout, self.seed = noise_px, outliers, dropout, seed
         T_wc = se3_inverse(T_cw)
-        centres = T_wc[:, :3, 3]
-        extent = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max()) or 1.0
+        centers = T_wc[:, :3, 3]
+        extent = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()) or 1.0
         self.depth_range = (depth_near * extent, depth_far * extent)
         generator = torch.Generator().manual_seed(seed)
         self.sizes = T_cw.new_zeros(0)  # (P,) metres

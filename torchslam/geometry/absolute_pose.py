@@ -12,7 +12,6 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.lie import rigid, se3_exp, transform
-from torchslam.geometry.local_optimization import State, best_of, minimize, retract_pose
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import (
@@ -23,9 +22,13 @@ from torchslam.geometry.projections import (
 )
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
+    ModelState,
     best_models,
+    best_of,
     gather_rows,
     is_significant,
+    levenberg_marquardt,
+    retract_pose,
     sample_minimal,
     sample_minimal_of_all,
     search,
@@ -35,7 +38,7 @@ from torchslam.geometry.ransac import (
 from torchslam.geometry.undistorted import UndistortedKeypoints
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
-CANDIDATES = 2  # hypotheses of each round that are optimised
+CANDIDATES = 2  # hypotheses of each round that are optimized
 LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
 _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
@@ -210,7 +213,7 @@ class _Search:
         )
         return P
 
-    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
+    def propose(self, count: int, generator: torch.Generator) -> tuple[ModelState, Tensor, Tensor]:
         """The best pose from `count` minimal samples, locally optimized, its score and its support."""
         P = (
             self._candidates_of_one(count, generator)
@@ -329,7 +332,7 @@ class _Problem:
             rows = rows.flatten(1, 2)
             return torch.bmm(rows.mT, rows), cost[:, 0]
 
-        (P,), _ = minimize((P,), evaluate, retract_pose, FINAL_ITERATIONS)
+        (P,), _ = levenberg_marquardt((P,), evaluate, retract_pose, FINAL_ITERATIONS)
         return P
 
 

@@ -1,6 +1,6 @@
 """Camera models: pinhole, radial-tangential (Brown-Conrady) and fisheye (Kannala-Brandt).
 
-Camera frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top left pixel.
+Camera frame: x right, y down, z forward. Pixel (0, 0) is the center of the top left pixel.
 """
 
 from __future__ import annotations
@@ -203,15 +203,15 @@ class Camera:
         normalized, _ = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2, None]
         distorted = self._distortion.distort(normalized, coefficients)
-        J_centre = torch.eye(2, dtype=pixels.dtype, device=pixels.device).expand(*pixels.shape, 2)
+        J_center = torch.eye(2, dtype=pixels.dtype, device=pixels.device).expand(*pixels.shape, 2)
         J_coefficients = focal * self._distortion.coefficient_slope(normalized, coefficients)
-        J_params = torch.cat((torch.diag_embed(distorted), J_centre, J_coefficients), dim=-1)
+        J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
     def normalize(self, pixels: Tensor) -> Tensor:
         """Undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
 
-        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the centre.
+        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
         """
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
@@ -229,7 +229,7 @@ class Camera:
         (..., N, 2) -> (..., N).
         """
         x, y = pixels.unbind(-1)
-        # The image reaches half a pixel beyond the centres of its outermost pixels.
+        # The image reaches half a pixel beyond the centers of its outermost pixels.
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 

@@ -1,4 +1,4 @@
-"""First derivatives of what an estimator found, by the implicit function theorem where it is a minimiser.
+"""First derivatives of what an estimator found, by the implicit function theorem where it is a minimizer.
 
 Those of any order, of minima of least squares: `solvers.implicit`.
 """
@@ -66,9 +66,9 @@ class _Last(torch.autograd.Function):
 
 
 def implicit_step(objective: Callable[[Tensor], Tensor], template: Tensor) -> Tensor:
-    """A step of value zero that carries the gradient of the minimiser with respect to the data.
+    """A step of value zero that carries the gradient of the minimizer with respect to the data.
 
-    objective: (B, D) -> (B,), a function of the local parameters, zero at the minimiser, that is also a function
+    objective: (B, D) -> (B,), a function of the local parameters, zero at the minimizer, that is also a function
     of data with a graph; the problems of the batch must be independent. template: (B, D), for shape and dtype.
     Returns (B, D): -H^-1 (gradient - its value) with the exact Hessian. Where the Hessian is not positive
     definite, the gradient is zero. It has no second derivative, see `first_order`.

@@ -9,6 +9,7 @@ state estimation in robotics", 2018; Eade, "Lie groups for 2D and 3D transformat
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -77,6 +78,26 @@ def so3_exp(omega: Tensor) -> Tensor:
     a, b, _, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + a * W + b * (W @ W)
+
+
+@lru_cache(maxsize=16)
+def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Identity matrix, cached: (size, size)."""
+    return torch.eye(size, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=16)
+def generators(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The generators of SO(3), cached: (3, 3, 3)."""
+    return skew(torch.eye(3, dtype=dtype, device=device))
+
+
+def cayley_rotation(omega: Tensor) -> Tensor:
+    """Rotation of the Cayley map: exp(omega) to second order, and cheaper. (P, 3) -> (P, 3, 3)."""
+    W = (omega @ generators(omega.dtype, omega.device).view(3, 9)).view(-1, 3, 3)
+    factor = 1 / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
+    turn = torch.baddbmm(W, W, W, alpha=0.5)  # W + W^2 / 2
+    return torch.addcmul(identity(3, omega.dtype, omega.device), factor, turn)
 
 
 @full_precision
@@ -294,10 +315,10 @@ def _sim3_left_jacobian_blocks(xi: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor
     a, b, _, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
     turn = torch.stack((torch.ones_like(a), s * a, s * s * b), dim=-2)
     grow = turn * (s * sigma).exp()[..., None, :]
-    travelled = weights * (grow @ partial.mT)
+    traveled = weights * (grow @ partial.mT)
     around = torch.linalg.cross(omega, rho)
     spanned = torch.stack((rho, around, torch.linalg.cross(omega, around)), dim=-2)
-    moments = (travelled @ turn.mT).mT @ spanned  # of t(s), with the coefficients of R(s)
+    moments = (traveled @ turn.mT).mT @ spanned  # of t(s), with the coefficients of R(s)
 
     S = skew(omega)
     powers = torch.stack((torch.eye(3, dtype=xi.dtype, device=xi.device).expand_as(S), S, S @ S), dim=-3)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.homography import decompose_homography
-from torchslam.geometry.local_optimization import best_of
-from torchslam.geometry.ransac import SUPPORT_WIDTH, is_significant, is_unlikely
+from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, is_significant, is_unlikely
 from torchslam.geometry.two_view import (
     TRANSFER_WIDTH,
     TwoViews,
@@ -271,8 +270,8 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
     weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
     spread = torch.ones_like(inliers[:, 0])
     for x, scale in ((views.x_1, views.scale_1), (views.x_2, views.scale_2)):
-        centred = (x - (weights * x).sum(1, keepdim=True)) * scale[..., None]
-        xx, xy, _, yy = ((weights * centred).mT @ centred).flatten(1).unbind(-1)
+        centered = (x - (weights * x).sum(1, keepdim=True)) * scale[..., None]
+        xx, xy, _, yy = ((weights * centered).mT @ centered).flatten(1).unbind(-1)
         smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy).square() + xy.square()).sqrt()
         spread = spread & (smaller > _LEAST_SPREAD**2)
     return spread

@@ -14,15 +14,14 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchslam.geometry.local_optimization import (
-    State,
-    generators,
-    in_parts,
-    minimize,
+from torchslam.geometry.lie import cayley_rotation, generators
+from torchslam.geometry.ransac import (
+    ModelState,
+    in_chunks,
+    levenberg_marquardt,
     retract_pose,
-    small_rotation,
+    truncated_score,
 )
-from torchslam.geometry.ransac import truncated_score
 
 
 def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, mask: Tensor) -> Tensor:
@@ -55,12 +54,12 @@ class Tangent:
 
     constant: Tensor
     linear: Tensor
-    retract: Callable[[State, Tensor], State]
+    retract: Callable[[ModelState, Tensor], ModelState]
 
     @staticmethod
     def of(
         derivatives: Callable[[Tensor], Tensor],
-        retract: Callable[[State, Tensor], State],
+        retract: Callable[[ModelState, Tensor], ModelState],
         columns: int,
         dtype: torch.dtype,
         device: torch.device,
@@ -87,7 +86,7 @@ def pose_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
 def rotation_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
     """Of rotations, by omega from the left."""
     axes = generators(dtype, device)
-    return Tangent.of(lambda R: axes @ R, lambda R, step: (small_rotation(step) @ R[0],), 3, dtype, device)
+    return Tangent.of(lambda R: axes @ R, lambda R, step: (cayley_rotation(step) @ R[0],), 3, dtype, device)
 
 
 @lru_cache(maxsize=16)
@@ -95,7 +94,7 @@ def homography_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
     """Of homographies whose last entry stays one, by the other eight."""
     entries = torch.eye(8, 9, dtype=dtype, device=device).unflatten(-1, (3, 3))
 
-    def retract(H: State, step: Tensor) -> State:
+    def retract(H: ModelState, step: Tensor) -> ModelState:
         return (H[0] + torch.nn.functional.pad(step, (0, 1)).unflatten(-1, (3, 3)),)
 
     return Tangent.of(lambda H: entries, retract, 3, dtype, device)
@@ -120,7 +119,7 @@ def fit_projections(
     def fit(*part: Tensor) -> tuple[Tensor, Tensor]:
         return _fit_part(tangent, iterations, width, *part)
 
-    P, cost = in_parts(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale * mask[..., None])
+    P, cost = in_chunks(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale * mask[..., None])
     return P, cost
 
 
@@ -153,5 +152,5 @@ def _fit_part(
         rows = rows.mul_((squared < width * width)[:, :, None, None]).view(B * K, T + 1, 2 * N)
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
-    (P,), cost = minimize((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)
+    (P,), cost = levenberg_marquardt((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)
     return P.view(B, K, 3, D), cost.view(B, K)

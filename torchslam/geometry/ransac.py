@@ -1,4 +1,8 @@
-"""What the robust estimators share: seeded batched sampling, scores, the search over rounds, significance."""
+"""What the robust estimators share: RANSAC with local optimization, seeded and batched.
+
+Samples, scores, the search over rounds, significance tests, and a small batched Levenberg-Marquardt for the local
+optimization. Differentiable least squares are in `torchslam.optim`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,80 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchslam.geometry.local_optimization import State
+from torchslam.geometry.lie import cayley_rotation, identity
+
+ModelState = tuple[Tensor, ...]
+
+_MAX_VALUES_AT_ONCE = 300_000
+_MIN_ITERATIONS = 2  # before it may stop
+
+
+def levenberg_marquardt(
+    state: ModelState,
+    evaluate: Callable[..., tuple[Tensor, Tensor]],
+    retract: Callable[[ModelState, Tensor], ModelState],
+    iterations: int,
+) -> tuple[ModelState, Tensor]:
+    """Minimize many small problems at once, each with its own damping.
+
+    state:    tensors with one leading dimension (P), the problems
+    evaluate: state -> (A, cost): A (P, D + 1, D + 1) is [J r]^T W [J r], and cost (P,) what must not grow
+    retract:  state, step (P, D) -> state
+    Stops once no problem can gain more than 1e-11 of its cost. Returns the state and its cost; problems that become
+    singular or NaN keep their last good state.
+    """
+    A, cost = evaluate(*state)
+    damping = torch.full_like(cost, 1e-4)[:, None, None]
+    eye = identity(A.shape[-1] - 1, A.dtype, A.device)
+    for iteration in range(iterations):
+        H, g = A[:, :-1, :-1], A[:, :-1, -1]
+        step = torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0].neg_()
+        moved = retract(state, step)
+        if iteration >= _MIN_ITERATIONS:
+            gain = (g * step).sum(-1).abs()
+            if bool((gain <= 1e-11 * cost).all()):  # too little to be worth a check
+                return _select(gain < torch.inf, moved, state), cost
+        A_moved, cost_moved = evaluate(*moved)
+        better = cost_moved < cost
+        A, cost, *rest = _select(better, (A_moved, cost_moved, *moved), (A, cost, *state))
+        state = tuple(rest)
+        damping = damping * torch.where(better, 0.1, 10.0)[:, None, None]
+    return state, cost
+
+
+def in_chunks(
+    function: Callable[..., tuple[Tensor, ...]], numbers: int, *tensors: Tensor
+) -> tuple[Tensor, ...]:
+    """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
+
+    numbers: values of the function's largest intermediate result per problem
+    """
+    size = max(1, _MAX_VALUES_AT_ONCE // numbers)
+    if len(tensors[0]) <= size:
+        return function(*tensors)
+    parts = [function(*part) for part in zip(*(x.split(size) for x in tensors), strict=True)]
+    return tuple(torch.cat(x) for x in zip(*parts, strict=True))
+
+
+def best_of(state: ModelState, cost: Tensor) -> tuple[ModelState, Tensor]:
+    """The candidate of least cost of each problem. (B, K, ...), (B, K) -> (B, ...), (B,)."""
+    cost, best = cost.nan_to_num(torch.inf).min(dim=1)
+    index = torch.arange(len(best), device=best.device)
+    return tuple(x[index, best] for x in state), cost
+
+
+def _select(condition: Tensor, new: ModelState, old: ModelState) -> ModelState:
+    """New values where the condition holds. All batched over the first dimension."""
+    return tuple(
+        torch.where(condition.view(-1, *(1,) * (x.dim() - 1)), x, y) for x, y in zip(new, old, strict=True)
+    )
+
+
+def retract_pose(pose: ModelState, step: Tensor) -> ModelState:
+    """Perturb [R t] by [rho, omega] from the left. (P, 3, 4), (P, 6) -> (P, 3, 4)."""
+    turn = cayley_rotation(step[:, 3:])
+    return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, pose[0]),)
+
 
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
@@ -102,14 +179,14 @@ def truncated_rows(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor,
 
 
 def search(
-    propose: Callable[[Tensor, int], tuple[State, Tensor, Tensor]],
+    propose: Callable[[Tensor, int], tuple[ModelState, Tensor, Tensor]],
     available: Tensor,
     size: int,
     confidence: float,
     first_round: int,
     max_samples: int,
     as_needed: bool = False,
-) -> State:
+) -> ModelState:
     """The best model of each problem over rounds of samples, until its support calls for no more of them.
 
     propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores (R,)
@@ -118,7 +195,7 @@ def search(
     `as_needed`, no more than the support calls for, but as many as the first one.
     """
 
-    def propose_in_parts(rows: Tensor, count: int) -> tuple[State, Tensor, Tensor]:
+    def propose_in_chunks(rows: Tensor, count: int) -> tuple[ModelState, Tensor, Tensor]:
         """Few problems at a time, so that what they compute stays in the cache."""
         if len(rows) * count <= _SAMPLES_AT_ONCE:
             return propose(rows, count)
@@ -127,7 +204,7 @@ def search(
         return tuple(torch.cat(x) for x in zip(*models, strict=True)), torch.cat(scores), torch.cat(supports)
 
     rows = torch.arange(len(available), device=available.device)
-    models, best, support = propose_in_parts(rows, first_round)
+    models, best, support = propose_in_chunks(rows, first_round)
     drawn, count = first_round, first_round
     while drawn < max_samples:
         needed = samples_needed(support, available, size, confidence)
@@ -138,7 +215,7 @@ def search(
         if as_needed:
             count = min(count, max(first_round, math.ceil(float(needed.max())) - drawn))
         drawn += count
-        new, score, new_support = propose_in_parts(rows, count)
+        new, score, new_support = propose_in_chunks(rows, count)
         better = score > best[rows]
         rows = rows[better]
         models = tuple(old.index_copy(0, rows, x[better]) for old, x in zip(models, new, strict=True))

@@ -11,15 +11,16 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import first_order, needs_gradient
-from torchslam.geometry.lie import rigid, so3_exp, transform, vee
-from torchslam.geometry.local_optimization import State, minimize, small_rotation
+from torchslam.geometry.lie import cayley_rotation, rigid, so3_exp, transform, vee
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
+    ModelState,
     best_models,
     gather_rows,
     is_significant,
+    levenberg_marquardt,
     sample_minimal,
     search,
     truncated_rows,
@@ -34,14 +35,14 @@ def umeyama(
     weights: Tensor | None = None,
     with_scale: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The similarity that minimises sum_i w_i |target_i - (s R source_i + t)|^2.
+    """The similarity that minimizes sum_i w_i |target_i - (s R source_i + t)|^2.
 
     source, target: (..., N, 3); weights: (..., N) non-negative weights or a boolean mask; rows of weight zero
     may hold anything. Returns scale (...), R (..., 3, 3), t (..., 3).
 
     Differentiable (once; a second time raises RuntimeError) in points and weights, on exact data and at repeated
     singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
-    With fewer than three points, or collinear ones, the result is finite and one of many minimisers, and its gradient
+    With fewer than three points, or collinear ones, the result is finite and one of many minimizers, and its gradient
     leaves out the free direction.
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
@@ -65,7 +66,7 @@ def umeyama(
 
 
 def _nearest_rotation(M: Tensor) -> Tensor:
-    """The rotation that maximises tr(R^T M), with a finite first-order gradient. (..., 3, 3) -> (..., 3, 3).
+    """The rotation that maximizes tr(R^T M), with a finite first-order gradient. (..., 3, 3) -> (..., 3, 3).
 
     At the maximum S = M R^T is symmetric; for a change of M the rotation moves by exp(omega) with
     (tr(S) I - S) omega = vee(2 antisymmetric part of dM R^T).
@@ -93,7 +94,7 @@ _THRESHOLD = 3.035
 _DEPTH_SIGMA = 0.1
 _SAMPLE = 3  # pairs that fix a similarity
 _FIRST_ROUND = 160  # samples
-_CANDIDATES = 2  # hypotheses of each round that are optimised
+_CANDIDATES = 2  # hypotheses of each round that are optimized
 _LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
 _FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
 
@@ -256,8 +257,8 @@ class _Problem:
         S_21 = torch.where(success[:, None, None], rigid(P[..., :3], P[..., 3]), eye)
         return S_21, success, squared, score
 
-    def propose(self, count: int, generator: torch.Generator) -> tuple[State, Tensor, Tensor]:
-        """The best similarity from `count` minimal samples, locally optimised, its score and its support."""
+    def propose(self, count: int, generator: torch.Generator) -> tuple[ModelState, Tensor, Tensor]:
+        """The best similarity from `count` minimal samples, locally optimized, its score and its support."""
         sample = sample_minimal(self.mask, _SAMPLE, count, generator)
         source, target = (gather_rows(view.points, sample) for view in (self.forward, self.backward))
         scale, R, t = umeyama(source, target, with_scale=self.with_scale)
@@ -313,7 +314,7 @@ class _Problem:
             rows = torch.where(used[:, 0, :, None, None], rows, 0.0).flatten(1, 2)
             return 0.5 * torch.bmm(rows.mT, rows), cost[:, 0]
 
-        (P,), cost = minimize((P,), evaluate, _retract, iterations)
+        (P,), cost = levenberg_marquardt((P,), evaluate, _retract, iterations)
         return P, cost
 
     def depths(self, moved: Tensor) -> tuple[Tensor, Tensor]:
@@ -338,8 +339,8 @@ class _Problem:
         success = is_significant(inliers.sum(-1), count, _SAMPLE, chance, solutions=1)
         for view in (self.forward, self.backward):
             mean = (weights * view.points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
-            centred = weights * (view.points - mean)
-            spread = torch.linalg.eigvalsh(centred.mT @ centred)
+            centered = weights * (view.points - mean)
+            spread = torch.linalg.eigvalsh(centered.mT @ centered)
             success = success & (spread[:, 1] > 1e-6 * spread[:, 2])
         return success
 
@@ -356,9 +357,9 @@ def _chain(J: Tensor, points: Tensor) -> Tensor:
     return torch.cat((J, rotation, J @ points[..., None]), dim=-1)
 
 
-def _retract(P: State, step: Tensor) -> State:
+def _retract(P: ModelState, step: Tensor) -> ModelState:
     """Moves [sR t] by [rho, omega] or [rho, omega, sigma] from the left. (B, 3, 4), (B, 6 or 7)."""
-    turn = small_rotation(step[:, 3:6])
+    turn = cayley_rotation(step[:, 3:6])
     if step.shape[-1] == 7:
         turn = turn * step[:, 6, None, None].exp()
     return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, P[0]),)

@@ -2,7 +2,7 @@
 
 Every change of axes is made here:
 
-| | pose | camera axes | world | centre of the top left pixel |
+| | pose | camera axes | world | center of the top left pixel |
 |---|---|---|---|---|
 | torchslam | `T_cw`, `T_wc` | x right, y down, z forward | that of the map | (0, 0) |
 | COLMAP | `T_cw`, quaternion w first | the same | that of the map | (0.5, 0.5) |
@@ -75,7 +75,7 @@ def with_unit(T: Tensor, unit: Tensor) -> Tensor:
 
 
 def without_scale(S_cw: Tensor) -> Tensor:
-    """The pose (..., 4, 4) of the camera of a similarity: its rotation and its centre, in the unit of the world."""
+    """The pose (..., 4, 4) of the camera of a similarity: its rotation and its center, in the unit of the world."""
     scale = sim3_scale(S_cw)
     return rigid(S_cw[..., :3, :3] / scale[..., None, None], S_cw[..., :3, 3] / scale[..., None])
 
@@ -87,11 +87,11 @@ def covariances_with_unit(covariances: Tensor, unit: Tensor) -> Tensor:
     return units[..., :, None] * covariances * units[..., None, :]
 
 
-HALF_PIXEL = 0.5  # from an origin at the centre of the top left pixel to one at its corner
+HALF_PIXEL = 0.5  # from an origin at the center of the top left pixel to one at its corner
 
 
 def corner_pixels(pixels: Tensor) -> Tensor:
-    """Pixels (..., 2) from the corner of the image, not from the centre of its first pixel."""
+    """Pixels (..., 2) from the corner of the image, not from the center of its first pixel."""
     return pixels + HALF_PIXEL
 
 

@@ -15,15 +15,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
 from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
-from torchslam.geometry.lie import skew
-from torchslam.geometry.local_optimization import (
-    State,
-    best_of,
-    generators,
-    in_parts,
-    minimize,
-    small_rotation,
-)
+from torchslam.geometry.lie import cayley_rotation, generators, skew
 from torchslam.geometry.projections import (
     fit_projections,
     homography_tangent,
@@ -32,8 +24,12 @@ from torchslam.geometry.projections import (
 )
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
+    ModelState,
     best_models,
+    best_of,
     gather_rows,
+    in_chunks,
+    levenberg_marquardt,
     pad_groups,
     sample_minimal,
     truncated_score,
@@ -135,7 +131,7 @@ class TwoViews:
 _CANDIDATES = 4  # essential matrices of each round that are optimized
 _MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras,
 _CHECKED_CANDIDATES = 24  # of so many
-_ITERATIONS = 4  # of their local optimisation
+_ITERATIONS = 4  # of their local optimization
 # Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
 # far from the noise ranks the samples all the same, but tells less between those that come close.
 _SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
@@ -180,11 +176,11 @@ def tangent_basis(t: Tensor) -> Tensor:
     return torch.stack((a, torch.linalg.cross(t, a, dim=-1)), dim=-2)
 
 
-def _retract_essential(state: State, step: Tensor) -> State:
+def _retract_essential(state: ModelState, step: Tensor) -> ModelState:
     """Turns R from the left and the frame of t, whose rows are t, a, b, about its own b and a."""
     zero, (a, b) = torch.zeros_like(step[:, :1]), step[:, 3:].split(1, dim=-1)
     turns = torch.cat((step[:, :3], zero, -b, -a), dim=-1)
-    return (torch.bmm(small_rotation(turns.view(-1, 3)), state[0].view(-1, 3, 3)).view_as(state[0]),)
+    return (torch.bmm(cayley_rotation(turns.view(-1, 3)), state[0].view(-1, 3, 3)).view_as(state[0]),)
 
 
 def fit_essential(
@@ -195,7 +191,7 @@ def fit_essential(
     scales: Tensor,
     kernel: Kernel = "truncated",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Optimises poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
+    """Optimizes poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
 
     scales: (B,) of the kernel, in thresholds
     """
@@ -204,7 +200,7 @@ def fit_essential(
         return _fit_essential_part(iterations, kernel, *part)
 
     numbers = t.shape[1] * 6 * views.mask.shape[1]
-    R, t, cost = in_parts(fit, numbers, R, t, *views.epipolar, views.mask, scales)
+    R, t, cost = in_chunks(fit, numbers, R, t, *views.epipolar, views.mask, scales)
     return R, t, cost
 
 
@@ -240,7 +236,7 @@ def _fit_essential_part(
         return torch.bmm(rows, rows.mT), cost.view(-1)
 
     start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
-    (pose,), cost = minimize((start,), evaluate, _retract_essential, iterations)
+    (pose,), cost = levenberg_marquardt((start,), evaluate, _retract_essential, iterations)
     pose = pose.view(B, K, 2, 3, 3)
     return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
 
@@ -267,8 +263,8 @@ def score_essential(views: TwoViews, E: Tensor, soft: bool = False) -> Tensor:
 
 def propose_essential(
     views: TwoViews, count: int, generator: torch.Generator, by_noise: bool
-) -> tuple[State, Tensor, Tensor]:
-    """The best (R, t) of `count` samples of five matches, locally optimised, its score and its support.
+) -> tuple[ModelState, Tensor, Tensor]:
+    """The best (R, t) of `count` samples of five matches, locally optimized, its score and its support.
 
     by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
     lie behind a camera count as wrong
@@ -297,7 +293,7 @@ def propose_essential(
 
 
 def _optimized(views: TwoViews, R: Tensor, t: Tensor, by_noise: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The best of candidates (B, K), the first of which scored best, locally optimised: R, t, cost (B,)."""
+    """The best of candidates (B, K), the first of which scored best, locally optimized: R, t, cost (B,)."""
     if not by_noise:
         R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(len(t)))
         (R, t), cost = best_of((R, t), cost)
@@ -374,15 +370,19 @@ def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
     return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
-def fit_homography(views: TwoViews, H: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
-    """Optimises homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
+def fit_homography(
+    views: TwoViews, H: Tensor, iterations: int, width: float = 1.0
+) -> tuple[ModelState, Tensor]:
+    """Optimizes homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
     tangent = homography_tangent(H.dtype, H.device)
     H, cost = fit_projections(H, tangent, *_transfer(views), iterations, width)
     return (H,), cost
 
 
-def fit_rotation(views: TwoViews, R: Tensor, iterations: int, width: float = 1.0) -> tuple[State, Tensor]:
-    """Optimises pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
+def fit_rotation(
+    views: TwoViews, R: Tensor, iterations: int, width: float = 1.0
+) -> tuple[ModelState, Tensor]:
+    """Optimizes pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
     tangent = rotation_tangent(R.dtype, R.device)
     R, cost = fit_projections(R, tangent, *_transfer(views), iterations, width)
     return (R,), cost
@@ -400,7 +400,7 @@ def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
     def score(*part: Tensor) -> tuple[Tensor]:
         return (score_projections(*part),)
 
-    (scores,) = in_parts(
+    (scores,) = in_chunks(
         score, 3 * H.shape[1] * mask.shape[1], H.float(), h_1.float(), x_2.float(), scale, mask
     )
     return scores

@@ -83,7 +83,7 @@ def test_match_agrees_with_opencv() -> None:
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     found = matcher.match(first.descriptors[0].numpy(), second.descriptors[0].numpy())
     ours = match(first, second, ratio=None, max_distance=None)
-    # Of several nearest neighbours at one distance OpenCV may take another.
+    # Of several nearest neighbors at one distance OpenCV may take another.
     d = hamming(first.descriptors, second.descriptors)[0]
     unique = {
         i

@@ -53,7 +53,7 @@ def spread_bits(descriptors: Tensor, amplitude: int) -> Tensor:
 def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
     """Hamming distance row by row: (..., D) uint8 twice, D a multiple of 8 up to 248 -> (...) int64.
 
-    Counts set bits by summing neighbouring bit fields of whole words (Warren: Hacker's Delight, 2002).
+    Counts set bits by summing neighboring bit fields of whole words (Warren: Hacker's Delight, 2002).
     """
     words_1 = descriptors_1.contiguous().view(torch.int64)
     words_2 = descriptors_2.contiguous().view(torch.int64)
@@ -168,7 +168,7 @@ def nearest_by_hamming(
     allowed: Tensor | None,
     with_second: bool,
 ) -> Nearest:
-    """Exact nearest neighbours by Hamming distance; needs two maxima over the matrix and one more for the second."""
+    """Exact nearest neighbors by Hamming distance; needs two maxima over the matrix and one more for the second."""
     keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
     bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
     columns = keys.shape[2]
@@ -199,7 +199,7 @@ def nearest_by_hamming(
 def nearest_by_cosine(
     similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None, with_second: bool
 ) -> Nearest:
-    """Nearest neighbours by cosine similarity (B, N1, N2); distances keep their graph."""
+    """Nearest neighbors by cosine similarity (B, N1, N2); distances keep their graph."""
     values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
     best, column = values.max(2)
     mutual = best >= values.amax(1).gather(1, column)
