@@ -37,10 +37,18 @@ EXTRACTORS = ("orb", "opencv-orb", "xfeat", "aliked")
 
 
 def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None = None) -> nn.Module:
-    """The extractor of that name: a module from images (B, 1, H, W) to Features.
+    """Make the extractor of a name.
 
-    weights: file for "xfeat" and "aliked", unused by the others. Raises ConfigError for an unknown name, missing or
-    unreadable weights.
+    Args:
+        name: one of `EXTRACTORS`.
+        num_keypoints: largest number of keypoints per image.
+        weights: file of weights for "xfeat" and "aliked", unused by the others.
+
+    Returns:
+        A module from images (B, 1, H, W) to Features.
+
+    Raises:
+        ConfigError: The name is unknown, or the weights are missing or unreadable.
     """
     if name == "orb":
         return ORB(num_keypoints)

@@ -33,10 +33,13 @@ to 1.35, of which the least is taken (with 1.2 the start is refused on a short s
 class XFeat(nn.Module):
     """XFeat: 64 floats per keypoint (Potje et al., CVPR 2024).
 
-    weights:       safetensors file of the network
-    num_keypoints: keypoints per image, at most; rows beyond what the image offers are masked
-    threshold:     of the keypoint heat map, 0 to 1
-    Raises ConfigError if the file cannot be read or holds another network.
+    Args:
+        weights: safetensors file of the network.
+        num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
+        threshold: of the keypoint heat map, 0 to 1.
+
+    Raises:
+        ConfigError: The file cannot be read or holds another network.
     """
 
     def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
@@ -99,9 +102,12 @@ class XFeat(nn.Module):
 class ALIKED(nn.Module):
     """ALIKED: 64 (t16) or 128 (n16, n32) floats per keypoint (Zhao et al., IEEE TIM 2023).
 
-    weights:       safetensors file of the network; which variant it is, its shapes tell
-    num_keypoints: keypoints per image, at most; rows beyond what the image offers are masked
-    Raises ConfigError if the file cannot be read or holds another network.
+    Args:
+        weights: safetensors file of the network; its shapes determine the variant.
+        num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
+
+    Raises:
+        ConfigError: The file cannot be read or holds another network.
     """
 
     def __init__(self, weights: str | Path, num_keypoints: int = 1000) -> None:

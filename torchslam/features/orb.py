@@ -76,16 +76,17 @@ class Corners:
 class ORB(nn.Module):
     """Oriented FAST corners with 256-bit descriptors, for batches of images on any device.
 
-    num_keypoints:  keypoints per image, at most; rows beyond what the image offers are masked
-    scale_factor:   ratio of the sizes of neighboring pyramid levels
-    num_levels:     of the pyramid; levels too small to hold a keypoint stay empty
-    threshold:      of FAST, in gray values of 0 to 255, for corners anywhere
-    low_threshold:  for the best corner of each cell, so that regions of little contrast have keypoints too; for all
-                    corners of an image of weak texture, which offers less than half of `num_keypoints` otherwise. Where
-                    even so there are fewer, faint corners count, of more than 4 gray values.
-    ranking:        "fast": corners compete by their FAST score, which repeats better; "harris": by Harris response
-    differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); what is
-                    chosen, angles and descriptors stay discrete
+    Args:
+        num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
+        scale_factor: ratio of the sizes of neighboring pyramid levels.
+        num_levels: of the pyramid; levels too small to hold a keypoint stay empty.
+        threshold: of FAST, gray values of 0 to 255, for corners anywhere.
+        low_threshold: of FAST for the best corner of each cell, so that regions of low contrast have keypoints too;
+            for all corners of an image of weak texture, which otherwise offers less than half of `num_keypoints`.
+            If there are still fewer, faint corners of more than 4 gray values count.
+        ranking: "fast" ranks corners by their FAST score, which repeats better; "harris" by their Harris response.
+        differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); the
+            choice of corners, angles and descriptors stay discrete.
     """
 
     def __init__(
@@ -114,11 +115,17 @@ class ORB(nn.Module):
         self.differentiable = differentiable
 
     def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
-        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
+        """Detect and describe keypoints.
 
-        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
+        Args:
+            images: (B, 1, H, W) floats in [0, 1].
+            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere.
 
-        Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
+        Returns:
+            Features with N = num_keypoints rows, in order of falling score, masked ones last.
+
+        Raises:
+            ValueError: The images or the mask have another shape or type.
         """
         corners = self.detect(images, wanted)
         stride, dtype = corners.pyramid.stride, images.dtype
@@ -143,9 +150,11 @@ class ORB(nn.Module):
         )
 
     def detect(self, images: Tensor, wanted: Tensor | None = None) -> Corners:
-        """Choose the corners of a batch of images (B, 1, H, W), without sub-pixel positions and descriptors.
+        """Choose the corners of a batch of images, without sub-pixel positions and descriptors.
 
-        wanted: (B, 1, H, W) bool, where they may lie: the budget goes there alone
+        Args:
+            images: (B, 1, H, W) floats in [0, 1].
+            wanted: (B, 1, H, W) bool, where corners may lie, which get the whole budget; None: everywhere.
         """
         check_images(images, wanted)
         pyramid = plan_pyramid(*images.shape[-2:], self.scale_factor, self.num_levels)
@@ -278,10 +287,13 @@ def check_images(images: Tensor, wanted: Tensor | None = None) -> None:
 
 
 class OpenCVORB(nn.Module):
-    """cv2.ORB for batches of images. Not differentiable; results come back on the images' device.
+    """OpenCV's ORB behind the interface of `ORB`. Not differentiable; results are on the images' device.
 
-    num_keypoints: keypoints per image, at most; rows beyond what OpenCV finds are masked
-    scale_factor, num_levels, threshold: of the pyramid and of FAST (gray values of 0 to 255), as cv2.ORB has them
+    Args:
+        num_keypoints: largest number of keypoints per image; rows beyond what OpenCV finds are masked.
+        scale_factor: ratio of the sizes of neighboring pyramid levels.
+        num_levels: of the pyramid.
+        threshold: of FAST, gray values of 0 to 255.
     """
 
     def __init__(

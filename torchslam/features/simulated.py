@@ -15,20 +15,21 @@ LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB
 
 
 class SimulatedFeatures:
-    """Keypoints of a made-up scene: every point has its own random descriptor, seen alike from everywhere.
+    """Keypoints of a synthetic scene: every point has its own random descriptor, the same from everywhere.
 
     Points are scattered in the views of the true trajectory, at depths between `depth_near` and `depth_far` times
-    the extent of the trajectory (the largest distance of a camera from their mean; 1 m where the camera rests).
+    the extent of the trajectory (the largest distance of a camera from their mean; 1 m if the camera rests). Each
+    frame draws from a generator seeded by (seed, frame), so frames can be requested in any order. The scene is on
+    the CPU, whose generator draws the same everywhere; features are on the device of the frame's pose.
 
-    T_cw:       (F, 4, 4) true poses
-    noise_px:   standard deviation of the keypoints
-    outliers:   share of the keypoints that lie at a uniformly random place of the image
-    dropout:    share of the visible points that a frame misses
-    scales:     whether points have a size and a direction. Then a keypoint has the scale at which its point appears
-                from that depth, in steps of the pyramid's factor, and is seen within the pyramid alone; its noise
-                grows with its scale, and its angle turns with the camera. Without it all scales are one.
-    Each frame draws from a generator seeded by (seed, frame), so frames can be asked for in any order. The scene lies
-    on the CPU, whose generator draws the same everywhere; features go where the frame's pose is.
+    Args:
+        T_cw: (F, 4, 4) true poses.
+        noise_px: standard deviation of the keypoints.
+        outliers: fraction of the keypoints that are at a uniformly random place of the image.
+        dropout: fraction of the visible points that a frame misses.
+        scales: whether points have a size and a direction. Then a keypoint has the scale at which its point appears
+            from that depth, in steps of the pyramid's factor, and is seen within the pyramid alone; its noise grows
+            with its scale, and its angle turns with the camera. Without it all scales are one.
     """
 
     def __init__(

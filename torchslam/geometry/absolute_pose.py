@@ -46,12 +46,13 @@ _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no mor
 
 @dataclass(frozen=True)
 class AbsolutePose:
-    """Poses of B cameras.
+    """Absolute poses of B cameras.
 
-    T_cw:    (B, 4, 4) world to camera; the identity where nothing was found
-    inliers: (B, N) points within the threshold of their pixel, in front of the camera
-    success: (B,) the inliers are no accident, and not all on one line
-    score:   (B,) sum over the points of 1 - min((error / threshold)^2, 1)
+    Attributes:
+        T_cw: (B, 4, 4) world to camera; the identity where no pose was found.
+        inliers: (B, N) points within the threshold of their pixel, in front of the camera.
+        success: (B,) whether the inliers are significant and not all on one line.
+        score: (B,) sum over the points of 1 - min((error / threshold)^2, 1).
     """
 
     T_cw: Tensor

@@ -24,13 +24,14 @@ Scalar = float | Tensor
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
-    model:  "pinhole", "radial_tangential" or "fisheye"
-    params: (..., P) fx, fy, cx, cy in pixels, then what the model has of distortion, as OpenCV orders and defines it:
-            nothing for a pinhole, k1, k2, p1, p2, k3 for radial_tangential, k1, k2, k3, k4 for fisheye
-    size:   (width, height) in pixels
+    Every method is differentiable with respect to points, pixels and `params`. A camera is a pytree with `params`
+    as its only leaf, so that `torch.func` and `torch.utils.data.default_collate` accept it.
 
-    Every method is differentiable with respect to points, pixels and `params`. A camera is a pytree with `params` as
-    its only leaf, so that `torch.func` and `torch.utils.data.default_collate` take it.
+    Attributes:
+        model: "pinhole", "radial_tangential" or "fisheye".
+        params: (..., P) fx, fy, cx, cy in pixels, then the distortion as OpenCV orders and defines it: none for a
+            pinhole, k1, k2, p1, p2, k3 for radial_tangential, k1, k2, k3, k4 for fisheye.
+        size: (width, height) in pixels.
     """
 
     model: str
@@ -110,12 +111,12 @@ class Camera:
 
     @property
     def width(self) -> int:
-        """Of the images, pixels."""
+        """Width of the images, pixels."""
         return self.size[0]
 
     @property
     def height(self) -> int:
-        """Of the images, pixels."""
+        """Height of the images, pixels."""
         return self.size[1]
 
     @property
@@ -127,7 +128,7 @@ class Camera:
 
     @cached_property
     def limit(self) -> Tensor:
-        """(...) how far out the distortion is monotone: a radius in x/z, y/z, for a fisheye an angle; or infinity."""
+        """(...) extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
         return self._distortion.limit(self.params.detach()[..., 4:])
 
     @property
@@ -135,7 +136,7 @@ class Camera:
         return distortion.MODELS[self.model]
 
     def with_params(self, params: Tensor) -> Camera:
-        """The same model and size with other parameters."""
+        """Replace the parameters, keeping model and size."""
         # Not `replace`: compiled graphs of torch 2.5 do not take it.
         return Camera(self.model, params, self.size)
 
@@ -151,32 +152,39 @@ class Camera:
 
     @staticmethod
     def stack(cameras: Sequence[Camera]) -> Camera:
-        """Cameras as one with a leading dimension. Raises ValueError unless they have one model and one size."""
+        """Stack cameras along a leading dimension.
+
+        Raises:
+            ValueError: The cameras differ in model or size.
+        """
         kinds = sorted({(camera.model, tuple(camera.size)) for camera in cameras})
         if len(kinds) != 1:
             raise ValueError(f"cameras of a batch must have one model and one size, not {kinds}")
         return cameras[0].with_params(torch.stack([camera.params for camera in cameras]))
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
-        """The same camera on another device or in another dtype; arguments as of `Tensor.to`."""
+        """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
     def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of points in the camera frame.
+        """Project points in the camera frame.
 
-        points_c: (..., N, 3)
+        Args:
+            points_c: (..., N, 3) points.
 
-        Returns pixels (..., N, 2), always finite, and valid (..., N): in front of the camera and within the monotone
-        part of the distortion. Invalid points get the middle of the image and no gradient.
+        Returns:
+            Pixels (..., N, 2), always finite, and valid (..., N): in front of the camera and within the monotone
+            part of the distortion. Invalid points get the center of the image and no gradient.
         """
         normalized, valid = self._normalize_points(points_c)
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
     def project_with_point_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels as from `project`, with the analytic derivative with respect to the points.
+        """Project points, with the analytic derivative with respect to the points.
 
-        Returns pixels (..., N, 2), valid (..., N) and d pixels / d points_c (..., N, 2, 3), zero where invalid.
+        Returns:
+            Pixels (..., N, 2), valid (..., N) and d pixels / d points_c (..., N, 2, 3), zero where invalid.
         """
         normalized, valid = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
@@ -194,10 +202,11 @@ class Camera:
         return self._to_pixels(distorted, valid), valid, J
 
     def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pixels as from `project`, with the analytic derivatives with respect to points and parameters.
+        """Project points, with the analytic derivatives with respect to points and parameters.
 
-        Returns pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and
-        d pixels / d params (..., N, 2, P). Derivatives of invalid points are zero.
+        Returns:
+            Pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and d pixels / d params (...,
+            N, 2, P). Derivatives of invalid points are zero.
         """
         pixels, valid, J_points = self.project_with_point_jacobians(points_c)
         normalized, _ = self._normalize_points(points_c)
@@ -209,7 +218,7 @@ class Camera:
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
     def normalize(self, pixels: Tensor) -> Tensor:
-        """Undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
+        """Compute undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
 
         Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
         """
@@ -218,25 +227,22 @@ class Camera:
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
     def unproject(self, pixels: Tensor) -> Tensor:
-        """Bearings, of unit length, of pixels. (..., N, 2) -> (..., N, 3)."""
+        """Compute bearings of unit length of pixels. (..., N, 2) -> (..., N, 3)."""
         normalized = self.normalize(pixels)
         ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
         return ray / ray.norm(dim=-1, keepdim=True)
 
     def in_image(self, pixels: Tensor, border: float = 0.0) -> Tensor:
-        """Whether pixels lie inside the image, `border` pixels away from its edge.
-
-        (..., N, 2) -> (..., N).
-        """
+        """Test whether pixels lie inside the image, `border` pixels away from its edge. (..., N, 2) -> (..., N)."""
         x, y = pixels.unbind(-1)
         # The image reaches half a pixel beyond the centers of its outermost pixels.
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
     def pixel_scale(self, normalized: Tensor) -> Tensor:
-        """Pixels per unit of undistorted image coordinates, along x and y, locally.
+        """Pixels per unit of undistorted image coordinates, along x and y, locally. (..., N, 2) -> (..., N, 2).
 
-        (..., N, 2) -> (..., N, 2). Exact without distortion; with it, the mean over all directions.
+        Exact without distortion; with it, the mean over all directions.
         """
         scale = self.params[..., None, :2].expand(normalized.shape)
         if self.model == "pinhole":

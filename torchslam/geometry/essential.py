@@ -28,13 +28,19 @@ _NEWTON_STEPS = 5
 
 @full_precision
 def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
-    """Essential matrices of samples of five matches, with the sample that each belongs to.
+    """Compute the essential matrices of samples of five matches.
 
-    x_1, x_2: (S, 5, 2) undistorted image coordinates. Returns E (R, 3, 3) of norm sqrt(2) for the R real solutions
-    of all samples together, up to ten each, and sample (R,) in ascending order. Solutions closer together than
-    1.4 degrees of the last unknown's angle can be missed; degenerate samples may give none or wrong ones. Not
-    differentiable by design: it makes hypotheses.
-    Source: Nister, "An efficient solution to the five-point relative pose problem", 2004.
+    Solutions closer together than 1.4 degrees of the last unknown's angle can be missed; degenerate samples may
+    give none or wrong ones. Not differentiable by design: it generates hypotheses. Source: Nister, "An efficient
+    solution to the five-point relative pose problem", 2004.
+
+    Args:
+        x_1: (S, 5, 2) undistorted image coordinates in view 1.
+        x_2: (S, 5, 2) undistorted image coordinates in view 2.
+
+    Returns:
+        E (R, 3, 3) of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample
+        (R,) of each, ascending.
     """
     with torch.no_grad():
         basis = _null_space(x_1, x_2)
@@ -201,17 +207,22 @@ def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
 
 @full_precision
 def essential_from_pose(R_21: Tensor, t_21: Tensor) -> Tensor:
-    """E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
+    """Compute essential matrices E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
     return skew(t_21) @ R_21
 
 
 @full_precision
 def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
-    """The two rotations and the direction, up to sign, of essential matrices of any scale.
+    """Decompose essential matrices of any scale into two rotations and a direction up to sign.
 
-    E: (..., 3, 3). Returns R (..., 2, 3, 3) and t (..., 3) of unit length: the poses are (R_i, t) and (R_i, -t).
-    Without a singular value decomposition, so the gradient is right at the equal singular values.
-    Source: Horn, "Recovering baseline and orientation from essential matrix", 1990.
+    Without a singular value decomposition, so that the gradient is correct at the equal singular values. Source:
+    Horn, "Recovering baseline and orientation from essential matrix", 1990.
+
+    Args:
+        E: (..., 3, 3) essential matrices.
+
+    Returns:
+        R (..., 2, 3, 3) and t (..., 3) of unit length: the poses are (R_i, t) and (R_i, -t).
     """
     gram = E @ E.mT
     half_trace = 0.5 * gram.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -235,11 +246,19 @@ def sampson_errors(
     variance_1: Tensor | float = 1.0,
     variance_2: Tensor | float = 1.0,
 ) -> Tensor:
-    """Signed Sampson distances to the epipolar constraint, zero at both epipoles.
+    """Compute signed Sampson distances to the epipolar constraint, zero at both epipoles.
 
-    E: (..., 3, 3); x_1, x_2: (..., N, 2); variance_1, variance_2: (..., N) of the coordinates in each image, one by
-    default. Returns (..., N): the first-order distance over both images together, in standard deviations.
     Source: Hartley and Zisserman, "Multiple view geometry", 2004, eq. 11.9.
+
+    Args:
+        E: (..., 3, 3) essential matrices.
+        x_1: (..., N, 2) undistorted image coordinates in view 1.
+        x_2: (..., N, 2) undistorted image coordinates in view 2.
+        variance_1: (..., N) of the coordinates in view 1; None: one.
+        variance_2: (..., N) of the coordinates in view 2; None: one.
+
+    Returns:
+        (..., N) first-order distances over both images together, in standard deviations.
     """
     one = torch.ones_like(x_1[..., :1])
     x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
@@ -253,12 +272,20 @@ def sampson_errors(
 def epipolar_offsets(
     T_21: Tensor, pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Where matches lie under a motion: beside their epipolar lines, and how far along them from infinity.
+    """Compute the offsets of matches from the epipolar lines of a motion, across and along them.
 
-    T_21: (..., 4, 4); pixels_1, pixels_2: (..., N, 2). Returns two times (..., N), in pixels at the middle of camera 2:
-    the signed Sampson distance; and the disparity to a point at infinity, which is |e| / z for a point on its line at
-    depth z in camera 2, e being the way along the line by one unit of the translation: negative behind that camera.
-    Both are zero at the epipole, and without a translation; the disparity also where infinity is behind camera 2.
+    Args:
+        T_21: (..., 4, 4) from camera 1 to camera 2.
+        pixels_1: (..., N, 2) matches in view 1.
+        pixels_2: (..., N, 2) matches in view 2.
+        camera_1: of view 1.
+        camera_2: of view 2.
+
+    Returns:
+        Twice (..., N), in pixels at the center of camera 2: the signed Sampson distance, and the disparity to a
+        point at infinity. For a point on its line at depth z in camera 2 the disparity is |e| / z, e being the
+        shift along the line by one unit of the translation; it is negative behind that camera. Both are zero at the
+        epipole and without a translation; the disparity also where infinity is behind camera 2.
     """
     x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
     R, t = T_21[..., :3, :3], T_21[..., None, :3, 3]

@@ -14,10 +14,17 @@ from torchslam.geometry.precision import full_precision
 
 @full_precision
 def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
-    """Homographies with H_33 = 1 of samples of four or more matches, in the algebraic least-squares sense.
+    """Compute homographies with H_33 = 1 of samples of four or more matches, in the algebraic least-squares sense.
 
-    x_1, x_2: (..., N, 2). Returns (..., 3, 3); degenerate samples (three on a line) give zeros, or anything. For
-    samples of more than four, coordinates should be of order one. Source: Hartley and Zisserman, 2004, alg. 4.1.
+    For samples of more than four, coordinates should be of order one. Source: Hartley and Zisserman, 2004, alg.
+    4.1.
+
+    Args:
+        x_1: (..., N, 2) coordinates in view 1.
+        x_2: (..., N, 2) coordinates in view 2.
+
+    Returns:
+        (..., 3, 3); degenerate samples (three points on a line) give zeros, or anything.
     """
     x, y = x_1.unbind(-1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
@@ -33,7 +40,7 @@ def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
 
 @full_precision
 def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
-    """Rotations that take two rays to two rays, exact for the first. (..., 2, 3) twice -> (..., 3, 3)."""
+    """Compute rotations that take two rays to two rays, exact for the first. (..., 2, 3) twice -> (..., 3, 3)."""
 
     def frame(rays: Tensor) -> Tensor:
         a, b = rays.unbind(-2)
@@ -46,9 +53,15 @@ def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
 
 @full_precision
 def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
-    """Differences H(x_1) - x_2, very large where H takes a point behind the camera.
+    """Compute differences H(x_1) - x_2, very large where H takes a point behind the camera.
 
-    (..., 3, 3), (..., N, 2) twice -> (..., N, 2).
+    Args:
+        H: (..., 3, 3) homographies.
+        x_1: (..., N, 2) coordinates in view 1.
+        x_2: (..., N, 2) coordinates in view 2.
+
+    Returns:
+        (..., N, 2) differences.
     """
     mapped = x_1 @ H[..., :2].mT + H[..., None, :, 2]
     depth = mapped[..., 2:]
@@ -58,12 +71,16 @@ def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
 
 @full_precision
 def decompose_homography(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The motions and planes that explain a homography: four, of which two have the scene in front.
+    """Decompose homographies into the four motions and planes that explain them, two of which have the scene in front.
 
-    H: (..., 3, 3) of any scale and sign. Returns R (..., 4, 3, 3), t (..., 4, 3) in units of the plane's distance
-    and unit normals (..., 4, 3) in the first camera: H ~ R + t n^T. A pure rotation has t = 0 and any normal. Not
-    differentiable by design.
-    Source: Ma et al., "An invitation to 3-D vision", 2004, section 5.3.3.
+    Not differentiable by design. Source: Ma et al., "An invitation to 3-D vision", 2004, section 5.3.3.
+
+    Args:
+        H: (..., 3, 3) of any scale and sign.
+
+    Returns:
+        R (..., 4, 3, 3), t (..., 4, 3) in units of the plane's distance, and unit normals (..., 4, 3) in the first
+        camera: H ~ R + t n^T. A pure rotation has t = 0 and any normal.
     """
     with torch.no_grad():
         H = torch.where(torch.linalg.det(H)[..., None, None] < 0, -H, H)

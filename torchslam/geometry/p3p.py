@@ -12,15 +12,20 @@ from torchslam.geometry.precision import full_precision
 
 @full_precision
 def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """All poses R, t with ray_i parallel to R point_i + t, of three rays and points: up to four.
+    """Compute all poses R, t with ray_i parallel to R point_i + t for three rays and points.
 
-    rays: (..., 3, 3), the rows of unit length; points: (..., 3, 3), one per row. Returns R (..., 4, 3, 3),
-    t (..., 4, 3) and valid (..., 4); invalid entries and degenerate samples (collinear points) may hold anything.
-    Not differentiable by design: it makes hypotheses.
+    Not differentiable by design: it generates hypotheses. The three distance equations in the depths form a pencil
+    of conics; a degenerate one of them is a pair of lines, which a real root of a cubic finds, and lines meet a
+    conic in closed form. Source: Persson and Nordberg, "Lambda twist", 2018; Ding et al., "Revisiting the P3P
+    problem", 2023.
 
-    The three distance equations in the depths form a pencil of conics; a degenerate one of them is a pair of lines,
-    which a real root of a cubic finds, and lines meet a conic in closed form.
-    Source: Persson and Nordberg, "Lambda twist", 2018; Ding et al., "Revisiting the P3P problem", 2023.
+    Args:
+        rays: (..., 3, 3) rows of unit length.
+        points: (..., 3, 3) one point per row.
+
+    Returns:
+        R (..., 4, 3, 3), t (..., 4, 3) and valid (..., 4) for up to four solutions. Invalid entries, and all
+        entries of degenerate samples (collinear points), may hold anything.
     """
     with torch.no_grad():
         # Inside, the samples are the last dimension: (sample row, coordinate, S).

@@ -31,17 +31,22 @@ _MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 class RelativePose:
     """Relative poses of B pairs of views.
 
-    T_21:      (B, 4, 4) from camera 1 to camera 2, translation of length one; zero for "rotation". The likeliest
-               also where there is no `success`; the identity for fewer than six matches
-    inliers:   (B, N) matches within the threshold of the chosen model
-    success:   (B,) rotation and direction are determined: no accident, no pure rotation, no ambiguous plane
-    model:     per pair "essential", "homography" (the scene is a plane, as far as one can tell) or "rotation": as
-               strings, and as indices (B,) int64 of these, in `model_index`
-    ambiguous: (B,) the matches lie on a plane and two motions explain them; T_21 is the likelier
-    score_essential, score_homography, score_rotation: (B,) sum over the matches of 1 - min((error / threshold)^2, 1);
-               zero for models that were not asked for
-    T_21_essential: (B, 4, 4) the pose of the essential matrix, whatever was chosen, without gradient; for those who
-               want a pose also where there is no `success`: of real pairs that were refused it is right now and then
+    Attributes:
+        T_21: (B, 4, 4) from camera 1 to camera 2, translation of length one, or zero for "rotation". The most
+            likely pose even without `success`; the identity for fewer than six matches.
+        inliers: (B, N) matches within the threshold of the chosen model.
+        success: (B,) whether rotation and direction are determined: the inliers are significant, the motion is no
+            pure rotation, and the plane, if any, is not ambiguous.
+        model: B strings, "essential", "homography" (as far as the matches tell, the scene is a plane) or
+            "rotation".
+        model_index: (B,) int64 indices of these models, in this order.
+        ambiguous: (B,) whether the matches lie on a plane and two motions explain them; T_21 is the more likely
+            one.
+        score_essential: (B,) sum over the matches of 1 - min((error / threshold)^2, 1); zero if not requested.
+        score_homography: (B,) as `score_essential`.
+        score_rotation: (B,) as `score_essential`.
+        T_21_essential: (B, 4, 4) the pose of the essential matrix, whatever was chosen, without gradient: a guess
+            where there is no `success`.
     """
 
     T_21: Tensor
@@ -76,34 +81,48 @@ def estimate_relative_pose(
     weights: Tensor | None = None,
     min_samples: int = 512,
 ) -> RelativePose:
-    """Relative poses of B pairs of views by RANSAC over five-point essential matrices, with model selection.
+    """Estimate relative poses of B pairs of views by RANSAC over five-point essential matrices, with model selection.
 
-    pixels_1, pixels_2: (B, N, 2) matches
-    threshold: pixels, about the noise of one coordinate, or somewhat more, for matches of weight one
-    mask:      (B, N), rows outside it, or with NaN, are ignored
-    model:     "auto" fits a homography and a pure rotation as well. The richer model is chosen only where matches
-               that it explains contradict the simpler one, more of them than accident would bring; or, but with the
-               kernel "truncated", all together, by lying beside it along their epipolar lines, or because what it
-               explains is an accident, or because no motion before the plane explains the matches as the essential
-               matrix does. Noise of any size has no direction, and where that of edges has one, it goes both ways, so
-               that as much of it is behind the cameras: where the matches do not tell, the simpler one stays. A pure
-               rotation or a plane with two valid motions give `success` False. "essential" asks no such thing
-    kernel:    of the final refinement of the essential matrix, over the matches that it may explain. Its scale, and
-               what contradicts a model, then go by the noise that the matches show, and so does the search from its
-               best samples on: the threshold only has to tell wrong ones from right ones. In the search, matches
-               behind a camera count as wrong. "truncated": all of that goes by the threshold, and the search does not
-               ask where matches lie
-    weights:   (B, N) information of the matches, in which squared errors count; the threshold of a match is
-               `threshold / sqrt(weight)`. Zero, infinity or NaN is no match
-    min_samples, max_samples: of five matches, that are tried at least and at most
-    The same arguments and seed give the same result. Too few matches and pure noise give `success` False for that
-    pair. Raises ValueError for wrong shapes, and for an unknown model or kernel.
+    With `model="auto"` a homography and a pure rotation are fitted as well. The richer model is chosen only if
+    matches that it explains contradict the simpler one, by one of these criteria (all but the first need another
+    kernel than "truncated"):
 
-    Where an input requires a gradient, T_21 carries that of the final least squares of the chosen model with respect to
-    pixels, weights and camera parameters, the matches it uses and the level of the noise fixed (implicit function
-    theorem).
-    Sources: Nister, 2004; Chum et al., "Locally optimized RANSAC", 2003; Torr, "An assessment of information
-    criteria for motion model selection", 1997, for the problem of choosing.
+    1. There are more such matches than chance would bring.
+    2. All together lie to one side of the simpler model, along their epipolar lines. Noise of any size has no
+       direction; that of edges has one, but goes both ways, so that as many matches end up behind the cameras.
+    3. What the simpler model explains is accidental.
+    4. No motion in front of the plane explains the matches as well as the essential matrix.
+
+    A pure rotation, or a plane with two valid motions, gives `success` False; so do too few matches and pure noise.
+    The same arguments and seed give the same result. Where an input requires a gradient, T_21 carries that of the
+    final least squares of the chosen model with respect to pixels, weights and camera parameters, with the matches
+    in use and the noise level fixed (implicit function theorem). Sources: Nister, 2004; Chum et al., "Locally
+    optimized RANSAC", 2003; Torr, "An assessment of information criteria for motion model selection", 1997.
+
+    Args:
+        pixels_1: (B, N, 2) matches in the first view.
+        pixels_2: (B, N, 2) matches in the second view.
+        camera_1: of the first view, one or B.
+        camera_2: of the second view, one or B.
+        threshold: pixels, about the noise of one coordinate or somewhat more, for matches of weight one.
+        mask: (B, N) matches in use; those with NaN are never used.
+        seed: of the random samples.
+        confidence: probability that some sample has no outlier.
+        max_samples: largest number of samples of five matches.
+        model: "auto", or "essential" to skip model selection.
+        kernel: of the final refinement of the essential matrix. With all but "truncated", its scale, the model
+            selection and the search use the noise level estimated from the matches, the threshold only separates
+            wrong matches, and the search counts matches behind a camera as wrong. With "truncated" the threshold
+            sets all of that.
+        weights: (B, N) information of the matches; the threshold of a match is `threshold / sqrt(weight)`. A weight
+            of zero, infinity or NaN excludes the match.
+        min_samples: smallest number of samples of five matches.
+
+    Returns:
+        The relative poses.
+
+    Raises:
+        ValueError: Wrong shapes, or an unknown model or kernel.
     """
     _check(pixels_1, pixels_2, weights, model, kernel)
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:

@@ -35,16 +35,22 @@ def umeyama(
     weights: Tensor | None = None,
     with_scale: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The similarity that minimizes sum_i w_i |target_i - (s R source_i + t)|^2.
+    """Align points by the similarity that minimizes sum_i w_i |target_i - (s R source_i + t)|^2.
 
-    source, target: (..., N, 3); weights: (..., N) non-negative weights or a boolean mask; rows of weight zero
-    may hold anything. Returns scale (...), R (..., 3, 3), t (..., 3).
-
-    Differentiable (once; a second time raises RuntimeError) in points and weights, on exact data and at repeated
+    Differentiable once in points and weights (a second time raises RuntimeError), on exact data and at repeated
     singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
-    With fewer than three points, or collinear ones, the result is finite and one of many minimizers, and its gradient
-    leaves out the free direction.
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    With fewer than three points, or collinear ones, the result is finite and one of many minimizers, and its
+    gradient leaves out the free direction. Source: Umeyama, "Least-squares estimation of transformation parameters
+    between two point patterns", 1991.
+
+    Args:
+        source: (..., N, 3) points.
+        target: (..., N, 3) corresponding points.
+        weights: (..., N) non-negative weights or a boolean mask; rows of weight zero may hold anything.
+        with_scale: False fixes the scale to one.
+
+    Returns:
+        Scale (...), rotation (..., 3, 3) and translation (..., 3).
     """
     w = torch.ones_like(source[..., 0]) if weights is None else weights.to(source.dtype)
     used = (w > 0)[..., None]
@@ -103,10 +109,11 @@ _FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
 class Similarity:
     """Similarities between the coordinates of B pairs of cameras.
 
-    S_21:    (B, 4, 4) from camera 1 to camera 2; the identity where nothing was found
-    inliers: (B, N) pairs of points within the threshold of their pixels in both images
-    success: (B,) the inliers are no accident, and not all on one line
-    score:   (B,) sum over the pairs of 1 - min((larger error / threshold)^2, 1)
+    Attributes:
+        S_21: (B, 4, 4) from camera 1 to camera 2; the identity where none was found.
+        inliers: (B, N) pairs of points within the threshold of their pixels in both images.
+        success: (B,) whether the inliers are significant and not all on one line.
+        score: (B,) sum over the pairs of 1 - min((larger error / threshold)^2, 1).
     """
 
     S_21: Tensor
@@ -133,23 +140,38 @@ def estimate_similarity(
     confidence: float = 0.9999,
     max_samples: int = 3000,
 ) -> Similarity:
-    """Similarities of B pairs of cameras by RANSAC over three pairs of points, refined in the pixels of both images.
+    """Estimate similarities of B pairs of cameras by RANSAC over three pairs of points, with a refinement in pixels.
 
-    points_1, points_2: (B, N, 3) the same points in the coordinates of camera 1, and of camera 2
-    pixels_1, pixels_2: (B, N, 2) where the cameras saw them
-    sigmas_1, sigmas_2: (B, N) standard deviations of these in pixels, one if None
-    threshold:          reprojection error of an inlier, in standard deviations: of the points of camera 1, moved by
-                        S_21, in image 2, and of those of camera 2, moved by its inverse, in image 1
-    depth_sigma:        relative standard deviation of the depths in camera 2. Where both cameras are at one place, as
-                        where a loop closes, pixels do not depend on the scale; there depths tell it.
-    mask:               (B, N), rows outside it, that are not finite, behind their camera, or with a sigma not above
-                        zero, are ignored
-    with_scale:         if not, the scale is one
+    The same arguments and seed give the same result, which is detached. Too few pairs, points on a line, or pure
+    noise give `success` False for that pair of cameras. Sources: Horn, "Closed-form solution of absolute
+    orientation using unit quaternions", 1987; Mur-Artal et al., "ORB-SLAM: a versatile and accurate monocular SLAM
+    system", 2015, section VII-B; for the minimal solution `umeyama`.
 
-    The same arguments and seed give the same result, which is detached. Too few pairs, points on a line, or pure noise
-    give `success` False for that pair of cameras. Raises ValueError for shapes that do not fit.
-    Sources: Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; Mur-Artal et al.,
-    "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, section VII-B; for the minimal solution `umeyama`.
+    Args:
+        points_1: (B, N, 3) points in the coordinates of camera 1.
+        points_2: (B, N, 3) the same points in the coordinates of camera 2.
+        pixels_1: (B, N, 2) where camera 1 saw them.
+        pixels_2: (B, N, 2) where camera 2 saw them.
+        camera_1: one or B.
+        camera_2: one or B.
+        sigmas_1: (B, N) standard deviations of `pixels_1`, pixels; None: one.
+        sigmas_2: (B, N) standard deviations of `pixels_2`, pixels; None: one.
+        threshold: reprojection error of an inlier in standard deviations, of the points of each camera in the other
+            image.
+        depth_sigma: relative standard deviation of the depths in camera 2. They determine the scale where both
+            cameras are at one place, as in a loop closure, and pixels do not depend on it.
+        mask: (B, N) pairs in use; pairs that are not finite, behind their camera, or with a sigma not above zero
+            are never used.
+        seed: of the random samples.
+        with_scale: False fixes the scale to one.
+        confidence: probability that some sample has no outlier.
+        max_samples: largest number of samples per pair of cameras.
+
+    Returns:
+        The similarities.
+
+    Raises:
+        ValueError: The shapes of points and pixels do not agree.
     """
     shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
     if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):

@@ -17,11 +17,14 @@ from torchslam.geometry.precision import full_precision
 class Triangulation:
     """Points seen in two views. Invalid rows are finite.
 
-    points_w: (..., N, 3)
-    angles:   (..., N) parallax between the two rays at the point, radians
-    depths_1, depths_2: (..., N) z in each camera
-    errors_1, errors_2: (..., N) reprojection error in pixels; infinite where the point does not project
-    mask:     (..., N) the input mask, where the rays intersect in front of both cameras
+    Attributes:
+        points_w: (..., N, 3) points.
+        angles: (..., N) parallax between the two rays at the point, radians.
+        depths_1: (..., N) z in camera 1.
+        depths_2: (..., N) z in camera 2.
+        errors_1: (..., N) reprojection error in pixels; infinite where the point does not project.
+        errors_2: (..., N) reprojection error in pixels; infinite where the point does not project.
+        mask: (..., N) the input mask, where the rays intersect in front of both cameras.
     """
 
     points_w: Tensor
@@ -37,11 +40,12 @@ class Triangulation:
 class MultiViewTriangulation:
     """Points seen in up to V views. Invalid rows are finite.
 
-    points_w: (..., N, 3)
-    angles:   (..., N) largest parallax between two of the rays, radians
-    depths:   (..., N, V) z in each camera
-    errors:   (..., N, V) reprojection error in pixels; infinite where the point does not project
-    mask:     (..., N) seen in two views or more, and in front of all cameras that see it
+    Attributes:
+        points_w: (..., N, 3) points.
+        angles: (..., N) largest parallax between two of the rays, radians.
+        depths: (..., N, V) z in each camera.
+        errors: (..., N, V) reprojection error in pixels; infinite where the point does not project.
+        mask: (..., N) seen in two views or more, and in front of all cameras that see it.
     """
 
     points_w: Tensor
@@ -62,15 +66,24 @@ def triangulate(
     mask: Tensor | None = None,
     normalized: tuple[Tensor, Tensor] | None = None,
 ) -> Triangulation:
-    """Triangulates matches of two views, with the least squared error in undistorted coordinates.
-
-    T_1w, T_2w: (..., 4, 4) world to camera; pixels_1, pixels_2: (..., N, 2)
-    mask:       (..., N), rows outside it may hold anything
-    normalized: the pixels undistorted, twice (..., N, 2), where the caller has them already
+    """Triangulate matches of two views, with the least squared error in undistorted coordinates.
 
     Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject by `angles`,
-    `depths` and `errors`.
-    Source: Lindstrom, "Triangulation made easy", 2010 (two iterations, exact to far below the noise).
+    `depths` and `errors`. Source: Lindstrom, "Triangulation made easy", 2010 (two iterations, exact to far below
+    the noise).
+
+    Args:
+        T_1w: (..., 4, 4) world to camera 1.
+        T_2w: (..., 4, 4) world to camera 2.
+        pixels_1: (..., N, 2) matches in view 1.
+        pixels_2: (..., N, 2) matches in view 2.
+        camera_1: of view 1.
+        camera_2: of view 2.
+        mask: (..., N) matches in use; rows outside it may hold anything.
+        normalized: the pixels undistorted, twice (..., N, 2), if the caller has them already.
+
+    Returns:
+        The points, and what their quality can be judged by.
     """
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     mask = finite if mask is None else mask & finite
@@ -113,10 +126,19 @@ def triangulation_covariance(
     camera_1: Camera,
     camera_2: Camera,
 ) -> Tensor:
-    """How well two views, poses taken as exact, determine points: (sum of J^T J / sigma^2)^-1. (..., N, 3, 3).
+    """Covariances (sum of J^T J / sigma^2)^-1 of points triangulated from two views with exact poses.
 
-    points_w: (..., N, 3); sigmas_1, sigmas_2: (..., N) standard deviations of their pixels, or (..., N, 2, 2) their
-    covariances. Zero where the two views do not determine a point: no parallax, or not in front of both.
+    Args:
+        T_1w: (..., 4, 4) world to camera 1.
+        T_2w: (..., 4, 4) world to camera 2.
+        points_w: (..., N, 3) points.
+        sigmas_1: (..., N) standard deviations of the pixels in view 1, or (..., N, 2, 2) their covariances.
+        sigmas_2: (..., N) or (..., N, 2, 2), of view 2.
+        camera_1: of view 1.
+        camera_2: of view 2.
+
+    Returns:
+        (..., N, 3, 3); zero where the views do not determine a point: no parallax, or not in front of both.
     """
     information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
     determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
@@ -135,10 +157,17 @@ def triangulation_covariance(
 
 @full_precision
 def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
-    """Moves matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
+    """Move matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
 
-    E: (..., 3, 3); x_1, x_2: (..., N, 2) undistorted image coordinates. Returns both corrected.
     Source: Lindstrom, "Triangulation made easy", 2010.
+
+    Args:
+        E: (..., 3, 3) essential matrices.
+        x_1: (..., N, 2) undistorted image coordinates in view 1.
+        x_2: (..., N, 2) undistorted image coordinates in view 2.
+
+    Returns:
+        The corrected x_1 and x_2.
     """
     E_22 = E[..., :2, :2]
     line_2 = _homogeneous(x_1) @ E.mT  # E x_1
@@ -166,11 +195,20 @@ def triangulate_many(
     mask: Tensor | None = None,
     iterations: int = 3,
 ) -> MultiViewTriangulation:
-    """Triangulates points from V views: linear on the rays, then Gauss-Newton on the reprojection error.
+    """Triangulate points from V views: linear on the rays, then Gauss-Newton on the reprojection error.
 
-    T_cw: (..., V, 4, 4); pixels: (..., N, V, 2); mask: (..., N, V) which views see the point. Entries outside
-    the mask may hold anything. Differentiable with respect to poses, pixels and camera parameters. No threshold
-    is applied: reject by `angles`, `depths` and `errors`.
+    Differentiable with respect to poses, pixels and camera parameters. No threshold is applied: reject by `angles`,
+    `depths` and `errors`.
+
+    Args:
+        T_cw: (..., V, 4, 4) world to camera.
+        pixels: (..., N, V, 2) observations; entries outside the mask may hold anything.
+        camera: of all views.
+        mask: (..., N, V) which views see the point.
+        iterations: of Gauss-Newton.
+
+    Returns:
+        The points, and what their quality can be judged by.
     """
     seen = torch.isfinite(pixels).all(-1)
     seen = seen if mask is None else seen & mask

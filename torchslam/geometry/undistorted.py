@@ -18,10 +18,11 @@ _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some tho
 
 @dataclass(frozen=True)
 class UndistortedKeypoints:
-    """Keypoints (N,) of a camera, undistorted once; coordinates come first in memory.
+    """Keypoints (N,) of one camera, undistorted once; coordinates come first in memory.
 
-    xy:    (2, N) undistorted image coordinates, x/z and y/z
-    slope: (2, 2, N) d pixel / d xy there: slope[j, i] is that of pixel coordinate i in xy[j]
+    Attributes:
+        xy: (2, N) undistorted image coordinates, x/z and y/z.
+        slope: (2, 2, N) d pixel / d xy there: slope[j, i] is that of pixel coordinate i in xy[j].
     """
 
     xy: Tensor
@@ -29,7 +30,7 @@ class UndistortedKeypoints:
 
     @classmethod
     def of(cls, pixels: Tensor, camera: Camera) -> UndistortedKeypoints:
-        """Of pixels (N, 2) of one camera, exactly."""
+        """Undistort pixels (N, 2) of one camera exactly."""
         xy = camera.normalize(pixels)
         if camera.model == "pinhole":
             slope = torch.diag(camera.params[:2])[..., None].expand(2, 2, len(pixels))
@@ -49,25 +50,28 @@ class UndistortedKeypoints:
         return torch.addcmul(a * d, b, c, value=-1).abs_().sqrt_()
 
     def whitened(self, noise: KeypointNoise) -> Tensor:
-        """(2, 2, N) slopes in units of the noise (N,) of the keypoints: times an error in xy, to first order, they are
-        an error of covariance one. Noise whose inverse covariance is not definite gives zero."""
+        """Slopes (2, 2, N) in units of the noise (N,) of the keypoints.
+
+        Times an error in xy they are, to first order, an error of covariance one. Noise whose inverse covariance is
+        not definite gives zero.
+        """
         if noise.information.shape[-1] < 3:
             return self.slope / noise.sigmas
         return torch.einsum("nki,jin->jkn", whitening(noise.weights), self.slope)
 
 
 class Undistortion:
-    """Undistorts the keypoints of one camera, frame by frame, without iterations: from the nearest node of a table and
-    the slope there, to a hundredth of a pixel, two towards the edge of a fisheye.
+    """Undistort the keypoints of one camera, frame by frame, without iterations.
 
-    The table is made when first asked for, or by `prepare`.
+    Interpolates linearly from the nearest node of a table: precise to a hundredth of a pixel, two hundredths
+    towards the edge of a fisheye. The table is made on first use, or by `prepare`.
     """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
 
     def __call__(self, pixels: Tensor) -> UndistortedKeypoints:
-        """Of pixels (N, 2)."""
+        """Undistort pixels (N, 2)."""
         if self.camera.model == "pinhole":
             return UndistortedKeypoints.of(pixels, self.camera)
         last = self._size - 1
@@ -78,7 +82,7 @@ class Undistortion:
         return UndistortedKeypoints(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
 
     def prepare(self) -> None:
-        """Make the table, so that nobody waits for it later."""
+        """Make the table now rather than on first use."""
         if self.camera.model != "pinhole":
             _ = self._table
 

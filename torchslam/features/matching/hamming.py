@@ -22,7 +22,8 @@ _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in f
 def pack_bits(bits: Tensor) -> Tensor:
     """Pack booleans into bytes, least significant bit first: (..., 8 D) bool -> (..., D) uint8.
 
-    Raises ValueError if the last dimension is no multiple of eight.
+    Raises:
+        ValueError: The last dimension is not a multiple of eight.
     """
     if bits.shape[-1] % 8:
         raise ValueError(f"the number of bits must be a multiple of 8, got {bits.shape[-1]}")
@@ -31,7 +32,7 @@ def pack_bits(bits: Tensor) -> Tensor:
 
 
 def unpack_bits(descriptors: Tensor) -> Tensor:
-    """The bits of packed descriptors, the inverse of `pack_bits`: (..., D) uint8 -> (..., 8 D) bool."""
+    """Unpack descriptors to bits, the inverse of `pack_bits`: (..., D) uint8 -> (..., 8 D) bool."""
     return bit_table(0, 1, descriptors.device)[descriptors.long()].flatten(-2).to(torch.bool)
 
 
@@ -94,9 +95,14 @@ def _sum_of_bytes(counts: Any) -> Any:
 
 
 def hamming(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """All Hamming distances between two batches of packed descriptors, exact.
+    """Compute all exact Hamming distances between two batches of packed descriptors.
 
-    descriptors_1: (..., N1, D) uint8; descriptors_2: (..., N2, D) uint8. Returns (..., N1, N2) int32, in bits.
+    Args:
+        descriptors_1: (..., N1, D) uint8.
+        descriptors_2: (..., N2, D) uint8.
+
+    Returns:
+        (..., N1, N2) int32 distances in bits.
     """
     bits = 8 * descriptors_1.shape[-1]
     return (bits - sign_products(descriptors_1, descriptors_2, 1).to(torch.int32)) >> 1
