@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.optim import RefinedPose, refine_pose
-from torchslam.optim.core.implicit import Backward
+from torchslam.optim import Backward, RefinedPose, refine_pose
 
 HERE = Path(__file__).parent
 MODES: tuple[tuple[Backward, int], ...] = (("implicit", 20), ("unroll", 20), ("unroll", 5), ("truncated", 20))
@@ -167,7 +166,7 @@ def draw(
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for (mode, iterations), errors in zip(MODES, zip(*bias, strict=True), strict=True):
         left.semilogy([100 * share for share in shares], errors, marker="o", label=label(mode, iterations))
-    left.axhline(1e-5, color="grey", linestyle=":", linewidth=1)
+    left.axhline(1e-5, color="gray", linestyle=":", linewidth=1)
     left.set(
         xlabel="outliers [%]",
         ylabel="relative error of the gradient",

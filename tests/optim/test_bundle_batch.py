@@ -135,7 +135,7 @@ def test_every_problem_finds_a_camera_of_its_own(bundle_scene, directions):
 
 def test_many_at_once_or_few(bundle_scene, monkeypatch):
     problems = mixed(bundle_scene)
-    monkeypatch.setattr(minimization, "_CELLS_AT_ONCE", 400)
+    monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)
     told = []
     batch = batch_of(problems)
     bundle_adjust(batch, progress=lambda now, most: told.append((now, most)))

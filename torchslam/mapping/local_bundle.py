@@ -1,33 +1,42 @@
-"""Bundle adjustment of a part of the map: which keyframes are free, which are fixed, what happens to outliers."""
+"""Local and global bundle adjustment of a map: the window, its solution, outlier removal, asynchronous adjustment.
+
+Local bundle adjustment frees the newest keyframe, the most covisible ones and their points; other keyframes that
+observe these points are fixed. `AsyncBundleAdjustment` requests it for one keyframe and applies the result some frames
+later, so that another process can solve it meanwhile.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchslam.config import BundleAdjustmentConfig
-from torchslam.geometry import CHI_SQUARE_95, Camera, fits, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
 from torchslam.map.map import Map
-from torchslam.map.observation_index import most
-from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.map.observation_index import top_rows
+from torchslam.optim import BundleProblem, Marginals, Progress, bundle_adjust
 from torchslam.optim.bundle.local_numpy import adjust_local_bundle
-from torchslam.optim.bundle.schur import Marginals
-from torchslam.optim.core.levenberg_marquardt import Progress
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 
-NEGLIGIBLE = 1e-4  # share of the cost that a step must promise: the next keyframe moves the map by more
-HUBER = CHI_SQUARE_95**0.5  # where a residual leaves the quadratic part
+LOCAL_TOLERANCE = 1e-4  # predicted relative reduction of the cost; the next keyframe moves the map by more
+HUBER = CHI_SQUARE_95**0.5  # whitened residual at which the kernel leaves its quadratic part
 
 
 @dataclass(frozen=True)
-class Part:
+class BundleWindow:
     """A part of the map that is adjusted at once.
 
-    keyframes: (k,) rows, ascending; point_ids: (p,) rows; seen: the observations of these by those
-    problem:   the same as a problem of its own
+    keyframes: (k,) rows, ascending
+    point_ids: (p,) rows
+    seen:      observations of the points by the keyframes
+    problem:   the same as a bundle adjustment problem
     """
 
     keyframes: Tensor
@@ -37,49 +46,61 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """Where a part belongs: T_cw (k, 4, 4), points_w (p, 3), and how certain that is, where it was asked for."""
+class BundleResult:
+    """The solution of a window: T_cw (k, 4, 4), points_w (p, 3), and covariances if requested."""
 
     T_cw: Tensor
     points_w: Tensor
     marginals: Marginals | None
 
 
-def adjust(
+def adjust_local(
     slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool = False
 ) -> None:
-    """Adjust what is around a keyframe; if `covariances`, the map learns how certain all this is."""
-    part = around(slam_map, keyframe, camera, settings)
-    if part is not None:
-        take(slam_map, part, solve_around(part.problem, settings.local_iterations, covariances), camera)
+    """Run a local bundle adjustment around a keyframe; `covariances`: also update the covariances of the map."""
+    window = select_window(slam_map, keyframe, camera, settings)
+    if window is not None:
+        result = solve_local(window.problem, settings.local_iterations, covariances)
+        apply_result(slam_map, window, result, camera)
 
 
-def around(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> Part | None:
-    """A keyframe, the ones that see most of its points, and all points that these see; None where that is nothing.
+def select_window(
+    slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig
+) -> BundleWindow | None:
+    """Select a keyframe, the keyframes most covisible with it and their points; None if there is nothing to adjust.
 
-    Other keyframes that see these points take part with fixed poses, and so does the first keyframe of the map.
+    Other keyframes that observe these points are fixed, and so is the first keyframe of the map.
     """
-    near = slam_map.covisible(keyframe, settings.local_window - 1)
-    free = torch.cat([near.new_tensor([keyframe]), near])
+    covisible = slam_map.covisible(keyframe, settings.local_window - 1)
+    free = torch.cat([covisible.new_tensor([keyframe]), covisible])
     free = free[free != 0]
     shared = slam_map.observers(slam_map.points_seen_by(free))
     shared[free] = 0
-    return part_of(slam_map, free, most(shared, settings.max_fixed_keyframes, least=1), camera)
+    return build_window(slam_map, free, top_rows(shared, settings.max_fixed_keyframes, least=1), camera)
 
 
-def solve_around(problem: BundleProblem, iterations: int, covariances: bool) -> Adjusted:
-    """Adjust what is around a keyframe, as exactly as the next one leaves it; what is fixed is taken as exact."""
-    if covariances:
-        return solve(problem, iterations, covariances, tolerance=NEGLIGIBLE)
-    return Adjusted(*adjust_local_bundle(problem, HUBER, iterations, NEGLIGIBLE)[:2], None)
+def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> BundleResult:
+    """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call.
+
+    The covariances are those of `bundle_adjust` at the solution, so that they do not change it.
+    """
+    T_cw, points_w, _ = adjust_local_bundle(problem, HUBER, iterations, LOCAL_TOLERANCE)
+    if not covariances:
+        return BundleResult(T_cw, points_w, None)
+    solved = replace(problem, T_cw=T_cw, points_w=points_w)
+    return BundleResult(T_cw, points_w, solve(solved, iterations=0, covariances=True).marginals)
 
 
 def adjust_all(
     slam_map: Map, camera: Camera, settings: BundleAdjustmentConfig, progress: Progress | None = None
 ) -> None:
-    """Adjust the whole map, the first keyframe fixed.
+    """Run a global bundle adjustment with the first keyframe fixed.
 
-    progress: called before each iteration; if it raises, the map stays as it was.
+    Args:
+        slam_map: The map.
+        camera: The camera of all keyframes.
+        settings: Number of iterations.
+        progress: Called before each iteration; if it raises, the map stays as it was.
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
     adjust_keyframes(
@@ -96,14 +117,14 @@ def adjust_keyframes(
     covariances: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Move the free keyframes (k,) and the points they see to the least reprojection error, then drop outliers."""
-    part = part_of(slam_map, free, fixed, camera)
-    if part is not None:
-        take(slam_map, part, solve(part.problem, iterations, covariances, progress), camera)
+    """Minimize the reprojection error over the free keyframes (k,) and their points, then remove outliers."""
+    window = build_window(slam_map, free, fixed, camera)
+    if window is not None:
+        apply_result(slam_map, window, solve(window.problem, iterations, covariances, progress), camera)
 
 
-def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part | None:
-    """The free keyframes (k,), what they see, and the fixed ones that see some of it; None where that is nothing."""
+def build_window(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> BundleWindow | None:
+    """Build the problem of free keyframes (k,), their points and the fixed keyframes; None if nothing is observed."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
     rows = true_indices(is_among(seen.point_index, slam_map.points_seen_by(free)))
@@ -123,7 +144,7 @@ def part_of(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> Part 
         weights=seen.noise.weights,
         fixed_frames=torch.isin(keyframes, fixed),
     )
-    return Part(keyframes, point_ids, seen, problem)
+    return BundleWindow(keyframes, point_ids, seen, problem)
 
 
 def solve(
@@ -131,43 +152,169 @@ def solve(
     iterations: int,
     covariances: bool = False,
     progress: Progress | None = None,
-    tolerance: float = 1e-8,
-) -> Adjusted:
-    """The least reprojection error of a part. A pure function: it may be called anywhere."""
+) -> BundleResult:
+    """Minimize the reprojection error of a window by `bundle_adjust`."""
     solution = bundle_adjust(
         problem,
         kernel="huber",
         scale=HUBER,
         backward="detached",
         iterations=iterations,
-        tolerance=tolerance,
         progress=progress,
         check=False,
     )
-    return Adjusted(solution.T_cw, solution.points_w, solution.covariance() if covariances else None)
+    return BundleResult(solution.T_cw, solution.points_w, solution.covariance() if covariances else None)
 
 
-def take(slam_map: Map, part: Part, adjusted: Adjusted, camera: Camera) -> None:
-    """Put a part of the map to where it belongs, and forget what disagrees with that.
+def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, camera: Camera) -> None:
+    """Move a window of the map to its solution and remove outlier observations.
 
-    The map must be as it was when the part was taken from it, but for what frames count in it.
+    Since the window was built, only the frame counters of the map may have changed.
     """
-    slam_map.keyframes["T_cw"][part.keyframes] = adjusted.T_cw
-    slam_map.points["positions_w"][part.point_ids] = adjusted.points_w
-    if adjusted.marginals is not None:
-        slam_map.take_covariances(part.keyframes, part.point_ids, adjusted.marginals)
-    drop_outliers(slam_map, part.seen, camera)
-    slam_map.refresh(part.keyframes)
+    slam_map.keyframes["T_cw"][window.keyframes] = result.T_cw
+    slam_map.points["positions_w"][window.point_ids] = result.points_w
+    if result.marginals is not None:
+        slam_map.set_covariances(window.keyframes, window.point_ids, result.marginals)
+    remove_outliers(slam_map, window.seen, camera)
+    slam_map.refresh(window.keyframes)
 
 
-def drop_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
-    """Forget observations that disagree with the map, and kill points that fewer than two keyframes still see."""
+def remove_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
+    """Remove observations that fail the chi-square test, and points that fewer than two keyframes still observe."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    wrong = ~fits(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
+    wrong = ~passes_gate(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
     slam_map.drop(seen, wrong)
 
 
 def select(seen: Observations, rows: Tensor) -> Observations:
-    """Some of the observations, by index."""
+    """Select observations by index."""
     columns = (getattr(seen, name) for name in Observations.__dataclass_fields__)
     return Observations(*(column.index_select(0, rows) for column in columns))
+
+
+PendingResult = Callable[[], BundleResult]
+"""Waits for the result of a started adjustment."""
+
+
+class Solver(Protocol):
+    """Starts a local bundle adjustment (problem, iterations, covariances) and returns its pending result."""
+
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult: ...
+
+
+def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
+    """Solve in this process, when the result is requested."""
+    return lambda: solve_local(problem, iterations, covariances)
+
+
+class ApplyAt(Enum):
+    """When the result of a local bundle adjustment is applied to the map."""
+
+    NOW = "now"
+    BEFORE_NEXT_FRAME = "before the next frame is tracked"
+    AFTER_DELAY = "after `bundle_adjustment.delay_frames` more frames"
+
+
+@dataclass(frozen=True)
+class AdjustmentRequest:
+    """A requested adjustment: applied after frame `due`, or before the next frame if `due` is None.
+
+    version: `Map.version` at the time of the request
+    """
+
+    due: int | None
+    slam_map: Map
+    keyframe: int
+    version: int
+
+
+@dataclass(frozen=True)
+class RunningAdjustment:
+    """A started adjustment; both None if there is nothing to adjust."""
+
+    window: BundleWindow | None
+    result: PendingResult | None
+
+
+class AsyncBundleAdjustment:
+    """One local bundle adjustment at a time: requested, started, and applied later.
+
+    Until it is applied, only the frame counters of the map may change; hence the result does not depend on when or
+    where it is solved.
+
+    solver: solves in this process by default
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        settings: BundleAdjustmentConfig,
+        covariances: bool,
+        solver: Solver = solve_here,
+    ) -> None:
+        self.camera, self.settings, self.covariances, self.solver = camera, settings, covariances, solver
+        self._request: AdjustmentRequest | None = None
+        self._running: RunningAdjustment | None = None
+
+    @contextmanager
+    def solved_by(self, solver: Solver) -> Iterator[None]:
+        """Solve elsewhere while the context is entered."""
+        before, self.solver = self.solver, solver
+        try:
+            yield
+        finally:
+            self.solver = before
+
+    @property
+    def is_pending(self) -> bool:
+        """Whether an adjustment is requested and not applied yet."""
+        return self._request is not None
+
+    @property
+    def is_due_before_next_frame(self) -> bool:
+        """Whether the result must be applied before the next frame is tracked."""
+        return self._request is not None and self._request.due is None
+
+    @property
+    def due(self) -> int | None:
+        """The frame after which the result is applied; None if none is pending or it is due before the next frame."""
+        return None if self._request is None else self._request.due
+
+    def is_due(self, frame: int) -> bool:
+        """Whether the result must be applied after this frame."""
+        return self._request is not None and (self._request.due is None or frame >= self._request.due)
+
+    def set_deadline(self, frame: int) -> None:
+        """Apply a pending result after this frame, since the map is about to change."""
+        if self._request is not None:
+            self._request = replace(self._request, due=frame)
+
+    def request(self, slam_map: Map, keyframe: int, due: int | None) -> None:
+        """Request an adjustment around a keyframe, applied after frame `due` or, if None, before the next frame."""
+        assert self._request is None, "an adjustment is pending"
+        self._request = AdjustmentRequest(due, slam_map, keyframe, slam_map.version)
+
+    def start(self) -> None:
+        """Start the requested adjustment if it is not running."""
+        if self._request is None or self._running is not None:
+            return
+        window = select_window(self._request.slam_map, self._request.keyframe, self.camera, self.settings)
+        result = None
+        if window is not None:
+            result = self.solver(window.problem, self.settings.local_iterations, self.covariances)
+        self._running = RunningAdjustment(window, result)
+
+    def apply(self, slam_map: Map) -> None:
+        """Wait for a requested adjustment and apply it to the map."""
+        self.start()
+        request, running = self._request, self._running
+        self._request = self._running = None
+        if request is None or running is None:
+            return
+        assert slam_map.version == request.version, "rows were renumbered since the request"
+        if running.window is not None and running.result is not None:
+            apply_result(slam_map, running.window, running.result(), self.camera)
+
+    def drop(self) -> None:
+        """Discard a pending adjustment, since its map is gone."""
+        self._request = self._running = None

@@ -1,21 +1,27 @@
 """Differentiable least squares: poses, maps and pose graphs refined, robust, batched, with right gradients."""
 
+from torchslam.optim._core.implicit import Backward
+from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
+from torchslam.optim._core.priors import CameraPrior, PosePrior
+from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, minimize
+from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.bundle.api import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.optim.core.priors import CameraPrior, PosePrior
-from torchslam.optim.least_squares import LeastSquaresSolution, minimize
-from torchslam.optim.pose.refinement import RefinedPose, refine_pose
-from torchslam.optim.pose_graph.api import PoseGraph, PoseGraphSolution, pose_graph_optimize
+from torchslam.optim.pose._refinement import RefinedPose, refine_pose
+from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, pose_graph_optimize
 
 __all__ = [
+    "Backward",
     "BundleProblem",
     "BundleSolution",
     "CameraPrior",
+    "Convergence",
     "LeastSquaresSolution",
+    "Manifold",
     "Marginals",
     "PoseGraph",
     "PoseGraphSolution",
     "PosePrior",
+    "Progress",
     "RefinedPose",
     "bundle_adjust",
     "minimize",

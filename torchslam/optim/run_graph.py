@@ -22,10 +22,10 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.bundle.api import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.optim.core.implicit import Backward
-from torchslam.optim.core.levenberg_marquardt import Progress
-from torchslam.optim.pose.refinement import refine_pose
+from torchslam.optim._core.implicit import Backward
+from torchslam.optim._core.levenberg_marquardt import Progress
+from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.pose._refinement import refine_pose
 from torchslam.types import Trajectory
 from torchslam.utils.bounded_read import check_regular
 
@@ -388,9 +388,8 @@ def solve_graphs(
 ) -> tuple[GraphSolution, ...]:
     """The minimum of every graph as `solve_graph` finds it, up to rounding; options and errors as there.
 
-    Graphs need not be of one size, nor see through one camera; those whose cameras have the same model, and whose
-    weights are both numbers or both matrices, are solved together. What has converged leaves the batch, and one that
-    fails does not touch the others.
+    Graphs may differ in size and camera. Those with the same camera model and the same kind of weights are solved
+    together. Converged problems leave the batch, and a failure does not affect the others.
     """
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
@@ -416,7 +415,7 @@ def _solve_alike(
     iterations: int,
     tolerance: float,
 ) -> tuple[GraphSolution, ...]:
-    """Graphs whose cameras have one model, together."""
+    """Solve graphs with one camera model together."""
     options = kernel, scale, backward, iterations, tolerance
     submaps = [
         _GraphSubmap(number, *keyframe_problem(graph, submap))
@@ -507,7 +506,7 @@ def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
 
 
 def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:
-    """The columns that every graph has, all of one submap, whose number is the graph's."""
+    """The columns of `ObservationGraph` alone, in one submap with the number of the graph."""
     columns = {name: getattr(graph, name) for name in ObservationGraph.columns()}
     whole = ObservationGraph(camera=graph.camera, **columns)
     return replace(whole, submap=torch.full_like(graph.submap, number))

@@ -20,7 +20,7 @@ from torchslam.map.atlas import Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
 from torchslam.mapping.local_bundle import adjust_all
-from torchslam.optim.core.levenberg_marquardt import Progress
+from torchslam.optim import Progress
 from torchslam.optim.run_graph import concatenate_graphs, solve_graph
 from torchslam.system.front_end import source
 from torchslam.system.session import Session

@@ -1,4 +1,4 @@
-"""Where is the camera, by guesses of who matches whom: PnP near an expected pose or by RANSAC, robust refinement."""
+"""Pose estimation against a map: PnP near a predicted pose or by RANSAC, guided matching, robust refinement."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from torchslam.geometry import (
     KeypointNoise,
     UndistortedKeypoints,
     Undistortion,
-    fits,
     innovation_covariances,
     mahalanobis_squared,
+    passes_gate,
     start_pose,
     transform,
 )
 from torchslam.map.map import Map
-from torchslam.optim.core.numpy_backend import RobustKernel
-from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, nearby_pose
+from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
 from torchslam.tracking.correspondences import Projected, match_near, project_points
 from torchslam.tracking.match_selection import (
     MATURE_OBSERVATIONS,
@@ -34,11 +33,12 @@ from torchslam.tracking.match_selection import (
 from torchslam.tracking.matcher import DescriptorMatcher, MatchIndices
 from torchslam.types import FrameFeatures, PoseEstimate
 
-OUTLIER_GATE_FACTOR = 4.0  # times the gate: twice as far off as what agrees may still turn out to
+OUTLIER_GATE_FACTOR = 4.0
+"""Factor on the chi-square gate before the first refinement: matches up to twice as far off may become inliers."""
 
 
 class Localizer:
-    """Poses a frame by the points of a map, wherever in it; it keeps nothing and leaves the map as it is."""
+    """Estimates the pose of a frame from matches with map points; stateless, and does not change the map."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera = camera
@@ -57,12 +57,15 @@ class Localizer:
         local_points: Tensor,
         expected_T_cw: Tensor | None = None,
     ) -> PoseEstimate | None:
-        """The pose by the first of several sets of matches that gives one, refined against the local points (n,).
+        """Estimate the pose of a frame by PnP, then refine it against the local points.
 
-        local_points:  ascending
-        expected_T_cw: (4, 4) where it is looked for first; None where nobody knows
+        Args:
+            candidates: sets of matches, tried in turn until enough of their matches are inliers
+            local_points: (n,) ids, ascending
+            expected_T_cw: (4, 4) predicted pose, tried before RANSAC; None without a prediction
 
-        Where too few of the matches agree with a pose, the next sets are heard too, and most inliers win.
+        Returns:
+            The estimate with the most inliers; None if no set gives a pose.
         """
         best: PoseEstimate | None = None
         for pairs in candidates:
@@ -81,7 +84,7 @@ class Localizer:
         local_points: Tensor,
         expected_T_cw: Tensor | None,
     ) -> PoseEstimate | None:
-        """PnP over matches, then all local points near their projection, then robust refinement."""
+        """PnP by the matches, then guided matching of all local points, then robust refinement."""
         settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
         if len(point_ids) < settings.min_matches:
             return None
@@ -99,7 +102,7 @@ class Localizer:
         if len(ids) < settings.min_inliers:
             return None
         weights = weights_of(pairs, guided, len(view.mask))
-        noise = noise if weights is None else noise.stated().weighed(weights)
+        noise = noise if weights is None else noise.with_explicit_information().scaled(weights)
         refined, errors, inliers = self._refine(
             slam_map, T_cw, ids, view.keypoints[at], undistorted[at], noise
         )
@@ -123,7 +126,7 @@ class Localizer:
     def _start(
         self, points_w: Tensor, seen: UndistortedKeypoints, expected_T_cw: Tensor | None
     ) -> Tensor | None:
-        """The pose (4, 4) that most matches agree with: the one next to the expected one, or else by RANSAC."""
+        """(4, 4) initial pose: the one near the expected pose, or else by RANSAC."""
         threshold = self.settings.threshold_px
         T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
         return start_pose(points_w, seen, self.camera.size, threshold, self.seed) if T_cw is None else T_cw
@@ -133,16 +136,16 @@ class Localizer:
         return project_points(slam_map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
 
     def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
-        """The local points, or those around what was matched where that is elsewhere in the map."""
+        """The local points, or those around the matched points if these are elsewhere in the map."""
         if len(local_points) and _are_among(point_ids, local_points):
             return local_points
-        return slam_map.points_seen_by(self.covisible_keyframes(slam_map, point_ids))
-
-    def covisible_keyframes(self, slam_map: Map, point_ids: Tensor) -> Tensor:
-        """(k,) the keyframe that sees most of the points (n,), and those that share most points with it."""
         keyframe = int(slam_map.observers(point_ids).argmax())
-        near = slam_map.covisible(keyframe, self.settings.local_keyframes)
-        return torch.cat([near.new_tensor([keyframe]), near])
+        return slam_map.points_seen_by(self.local_keyframes(slam_map, keyframe))
+
+    def local_keyframes(self, slam_map: Map, keyframe: int) -> Tensor:
+        """(k,) a keyframe and those that share most points with it."""
+        covisible = slam_map.covisible(keyframe, self.settings.local_keyframes)
+        return torch.cat([covisible.new_tensor([keyframe]), covisible])
 
     def _refine(
         self,
@@ -153,15 +156,16 @@ class Localizer:
         undistorted: UndistortedKeypoints,
         noise: KeypointNoise,
     ) -> tuple[FramePose, Tensor, Tensor]:
-        """The pose, the squared errors (n,) in units of the noise, and (n,) who agrees with the pose.
+        """The pose, the squared errors (n,) in units of the noise, and (n,) the inliers.
 
-        By least squares on what is not far from agreeing with T_cw, old points alone if there are enough of them, then
-        on all that agrees with that.
+        First by the matches within the widened gate around T_cw, mature points alone if there are enough of them, then
+        by the inliers of that pose.
         """
         problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
         linearization = problem.linearize(T_cw)
-        mask = fits(
-            linearization.squared / noise.margin**2, OUTLIER_GATE_FACTOR * self.measurement.max_chi_square
+        mask = passes_gate(
+            linearization.squared / noise.gate_factor**2,
+            OUTLIER_GATE_FACTOR * self.measurement.max_chi_square,
         )
         old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
         if int(old.sum()) >= self.settings.min_matches:
@@ -171,7 +175,7 @@ class Localizer:
         for kernel in kernels:
             refined = problem.minimize(linearization, weights * mask, kernel)
             linearization = refined.linearization
-            errors = linearization.squared / noise.margin**2
+            errors = linearization.squared / noise.gate_factor**2
             mask = self.agrees(slam_map, refined.T_cw, ids, pixels, noise, errors)
             if int(mask.sum()) < 6:
                 break
@@ -186,29 +190,29 @@ class Localizer:
         noise: KeypointNoise,
         errors: Tensor | None = None,
     ) -> Tensor:
-        """(n,) whether points are seen where they should be, by the configured gate.
+        """(n,) inliers of a pose by the configured gate.
 
-        errors: (n,) squared, in units of the noise, where they are known
+        The pose was fitted to these pixels, so its own uncertainty does not widen the gate.
 
-        The pose was fitted to these very pixels, so its own uncertainty does not widen the gate.
+        Args:
+            errors: (n,) squared, in units of the noise, if they are known
         """
         chi_square, points = self.measurement.max_chi_square, slam_map.points
         by_noise = self.measurement.gate == "chi_square"
         if by_noise and errors is not None:
-            return fits(errors, chi_square)
+            return passes_gate(errors, chi_square)
         points_c = transform(T_cw, points["positions_w"][ids])
         if by_noise:
-            return fits(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
+            return passes_gate(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
         projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
-        innovations = innovation_covariances(J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.spread)
+        innovations = innovation_covariances(
+            J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.sigma_or_covariance
+        )
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
 
 def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Tensor | None:
-    """(n,) what a matcher gave to those of its pairs that a guided search found as well; None where it gave nothing.
-
-    Pairs that the guided search alone found count as the median of the matcher's.
-    """
+    """(n,) weights of guided matches: the matcher's where it found the same pair, else their median; None without."""
     if pairs.weights is None:
         return None
     points = torch.full((keypoints,), -1, device=pairs.first.device).index_put((pairs.second,), pairs.first)
@@ -218,6 +222,6 @@ def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Ten
 
 
 def _are_among(ids: Tensor, ascending: Tensor) -> bool:
-    """Whether ids (n,) are all among others (m,), at least one; `isin` would sort them, which they are."""
+    """Whether all ids (n,) are among others (m,), which are sorted and not empty."""
     at = torch.searchsorted(ascending, ids).clamp_(max=len(ascending) - 1)
     return bool((ascending.index_select(0, at) == ids).all())

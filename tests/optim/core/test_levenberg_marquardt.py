@@ -4,7 +4,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchslam.optim.core.levenberg_marquardt import minimize
+from torchslam.optim._core.levenberg_marquardt import minimize_batch
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ STARTS = torch.tensor([[-1.2, 1.0], [2.0, -3.0], [1.0, 1.0]], dtype=torch.float6
 
 
 def test_finds_the_minimum_and_reports():
-    model, report = minimize(Rosenbrock(3), STARTS, iterations=60, tolerance=1e-14)
+    model, report = minimize_batch(Rosenbrock(3), STARTS, iterations=60, tolerance=1e-14)
     torch.testing.assert_close(model.x, torch.ones_like(STARTS))
     assert report.converged.all()
     assert (report.cost <= report.initial_cost).all()
@@ -51,15 +51,15 @@ def test_finds_the_minimum_and_reports():
 
 
 def test_elements_do_not_see_each_other():
-    together, report = minimize(Rosenbrock(3), STARTS, iterations=7, tolerance=1e-14)
+    together, report = minimize_batch(Rosenbrock(3), STARTS, iterations=7, tolerance=1e-14)
     for row in range(3):
-        alone, one = minimize(Rosenbrock(1), STARTS[row : row + 1], iterations=7, tolerance=1e-14)
+        alone, one = minimize_batch(Rosenbrock(1), STARTS[row : row + 1], iterations=7, tolerance=1e-14)
         assert torch.equal(alone.x[0], together.x[row])
         assert one.iterations[0] == report.iterations[row]
 
 
 def test_cost_never_rises():
-    costs = [minimize(Rosenbrock(3), STARTS, iterations=n, tolerance=0.0)[0].cost for n in range(12)]
+    costs = [minimize_batch(Rosenbrock(3), STARTS, iterations=n, tolerance=0.0)[0].cost for n in range(12)]
     for before, after in pairwise(costs):
         assert (after <= before * (1 + 1e-12)).all()
 
@@ -67,12 +67,14 @@ def test_cost_never_rises():
 def test_what_is_not_solvable_stays():
     problem = Rosenbrock(3)
     problem.solvable = torch.tensor([True, False, True])
-    model, report = minimize(problem, STARTS, iterations=60, tolerance=1e-14)
+    model, report = minimize_batch(problem, STARTS, iterations=60, tolerance=1e-14)
     assert torch.equal(model.x[1], STARTS[1])
     assert report.iterations[1] == 0
 
 
 def test_tells_its_progress_before_each_iteration():
     told = []
-    _, report = minimize(Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: told.append(now))
+    _, report = minimize_batch(
+        Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: told.append(now)
+    )
     assert told == [(iteration, 60) for iteration in range(int(report.iterations.max()))]

@@ -1,6 +1,6 @@
 import torch
 
-from torchslam.optim.core.linear import factorize
+from torchslam.optim._core.linear import factorize
 
 
 def test_solves_definite_and_flags_the_rest(dtype, device):

@@ -2,8 +2,8 @@ import torch
 
 from torchslam.geometry import se3_exp
 from torchslam.optim import PosePrior
-from torchslam.optim.core.priors import prior_error, prior_expansion, prior_hessian
-from torchslam.optim.core.tangent import retract
+from torchslam.optim._core.priors import prior_error, prior_expansion, prior_hessian
+from torchslam.optim._core.tangent import retract
 
 
 def make_prior(generator):

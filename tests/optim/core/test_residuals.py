@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchslam.optim.core.residuals import (
+from torchslam.optim._core.residuals import (
     Observations,
     exact_expansion,
     gauss_newton_expansion,

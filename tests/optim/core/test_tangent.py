@@ -1,7 +1,7 @@
 import torch
 
 from torchslam.geometry import se3_exp, transform
-from torchslam.optim.core.tangent import move, point_jacobian, pull_back, retract
+from torchslam.optim._core.tangent import move, point_jacobian, pull_back, retract
 
 
 def test_retraction_agrees_with_the_exponential_and_stays_rigid(generator):

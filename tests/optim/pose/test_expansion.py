@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim.core.residuals import Observations
-from torchslam.optim.core.tangent import retract
-from torchslam.optim.pose.refinement import PoseObservations
+from torchslam.optim._core.residuals import Observations
+from torchslam.optim._core.tangent import retract
+from torchslam.optim.pose._refinement import PoseObservations
 
 PINHOLE = Camera.pinhole(500.0, 480.0, 320.0, 240.0, size=(640, 480))
 BENT = Camera.radial_tangential(500.0, 480.0, 320.0, 240.0, -0.2, 0.05, 1e-3, -5e-4, size=(640, 480))

@@ -17,9 +17,9 @@ from torchslam.geometry import (
     sim3_scale,
 )
 from torchslam.optim import PoseGraph, pose_graph_optimize
+from torchslam.optim.pose_graph._api import _sanitized
 from torchslam.optim.pose_graph._problem import PoseGraphProblem, build_pose_graph_layout
 from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, dissect, factorize_sparse
-from torchslam.optim.pose_graph.api import _sanitized
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 SIGMAS = torch.tensor([0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01], dtype=torch.float64)

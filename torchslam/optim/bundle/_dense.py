@@ -17,6 +17,19 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
+from torchslam.optim._core.batching import Tensors, index_tree, where_tree
+from torchslam.optim._core.linear import DefiniteFactor, factorize, inverse_root_3x3
+from torchslam.optim._core.residuals import (
+    Expansion,
+    Linearization,
+    Observations,
+    exact_expansion,
+    gauss_newton_expansion,
+    linearize,
+    rounding_cost,
+    variance_factor,
+)
+from torchslam.optim._core.tangent import cross_entries, retract, rotated
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
@@ -30,19 +43,6 @@ from torchslam.optim.bundle._problem import (
     prior_terms,
 )
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.core.batching import Tensors, index_tree, where_tree
-from torchslam.optim.core.linear import DefiniteFactor, factorize, inverse_root_3x3
-from torchslam.optim.core.residuals import (
-    Expansion,
-    Linearization,
-    Observations,
-    exact_expansion,
-    gauss_newton_expansion,
-    linearize,
-    rounding_cost,
-    variance_factor,
-)
-from torchslam.optim.core.tangent import cross_entries, retract, rotated
 
 # An observation of the sparse equations costs as much as so many cells of a grid.
 _MAX_CELLS_PER_OBSERVATION = 8
@@ -245,7 +245,7 @@ def _sum_by_frame(
 
 class FactorizedDense(NamedTuple):
     """Equations ready to be solved for any right side: the inverse roots (B, 3, 3, P) of the points' blocks, zero for
-    points that do not move, the coupling times them (B, D, 3 P), and what is left for frames and cameras."""
+    points that do not move, the coupling times them (B, D, 3 P), and the reduced system of frames and cameras."""
 
     root: Tensor
     whitened: Tensor
@@ -348,7 +348,7 @@ class DenseModel(NamedTuple):
 
 @dataclass(frozen=True)
 class DenseBundle:
-    """Bundle adjustments for `levenberg_marquardt.minimize`, and what follows from their minima.
+    """A batch of bundle adjustments for `minimize_batch`, with their covariances and exact solvers.
 
     directions: (K, n) in which the cameras' parameters move, None where they do not
     """
@@ -386,15 +386,17 @@ class DenseBundle:
         equations, (T_cw, points_w, params) = model.equations, model.estimate
         factorized = self._factorized(model.estimate, equations, damping)
         step, points = factorized.solve(equations.gradient, equations.points_gradient)
-        decrease = (step * equations.gradient).sum(1) + (points * equations.points_gradient).sum((1, 2))
-        decrease = torch.where(factorized.reduced.definite, 0.5 * decrease, torch.inf)
+        predicted_reduction = (step * equations.gradient).sum(1) + (points * equations.points_gradient).sum(
+            (1, 2)
+        )
+        predicted_reduction = torch.where(factorized.reduced.definite, 0.5 * predicted_reduction, torch.inf)
         frames, camera = self._split(step)
         leading = frames.shape[1]
         moved = retract(T_cw[:, :leading], -rotated(T_cw[:, :leading, :3, :3], frames[..., None])[..., 0])
         T_cw = torch.cat((moved, T_cw[:, leading:]), dim=1)
         if self.directions is not None:
             params = params - camera.unflatten(1, (params.shape[1], -1)) @ self.directions.mT
-        return DenseEstimate(T_cw, points_w - points, params), decrease
+        return DenseEstimate(T_cw, points_w - points, params), predicted_reduction
 
     def select(self, accept: Tensor, new: DenseModel, old: DenseModel) -> DenseModel:
         return new if accept.all() else where_tree(accept, new, old)
@@ -540,8 +542,7 @@ class DenseBundle:
         )
 
     def _gauge(self, estimate: DenseEstimate) -> Tensor | None:
-        """Directions (B, 6 F', g), along the world's axes, that what is fixed leaves open, zero where nothing is; None
-        where nowhere."""
+        """Gauge directions (B, 6 F', g) along the axes of the world, zero where the gauge is fixed; None if all are."""
         layout = self.data.layout
         free, anchors = layout.free, layout.anchors.sum(1)
         is_open = (anchors < 2) & ~layout.held_points & free.any(1)

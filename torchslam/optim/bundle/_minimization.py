@@ -1,4 +1,4 @@
-"""Bundle adjustments as `implicit_minimum` takes them: batches in the order of the problem, whatever solves them."""
+"""Bundle adjustments as `implicit_minimum` takes them: batches in the order of the problem, for either solver."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.robust import Kernel
+from torchslam.optim._core.batching import Tensors
+from torchslam.optim._core.implicit import Ndims
+from torchslam.optim._core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize_batch
+from torchslam.optim._core.residuals import Observations, linearize_each, only
+from torchslam.optim._core.tangent import move, pull_back, push, retract
 from torchslam.optim.bundle._dense import (
     DenseBundle,
     DenseLayout,
@@ -27,18 +32,13 @@ from torchslam.optim.bundle._problem import (
 )
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
-from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.implicit import Ndims
-from torchslam.optim.core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize
-from torchslam.optim.core.residuals import Observations, linearize_each, only
-from torchslam.optim.core.tangent import move, pull_back, push, retract
 
-# Of all grids that are solved at once: what they need stays in the processor's cache, or keeps an accelerator busy.
-_CELLS_AT_ONCE, _CELLS_ON_DEVICE = 1 << 14, 1 << 20
+# Frame-point pairs of the dense problems solved at once: they fit the cache of a CPU, or keep a GPU busy.
+_MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
 
 
 class BundleMinimum(NamedTuple):
-    """The estimates, what moved (B, F), (B, P), what counted (B, O), and how it went (B,)."""
+    """Estimates, moved frames (B, F) and points (B, P), counted observations (B, O), and convergence (B,)."""
 
     T_cw: Tensor
     points_w: Tensor
@@ -58,14 +58,14 @@ class BundleMinimum(NamedTuple):
 
 
 class BatchPart(NamedTuple):
-    """Elements that are solved together, and their layout: that of one problem, or grids of several."""
+    """Elements that are solved together, and their layout: sparse for one problem, dense for several."""
 
     rows: slice
     layout: SparseLayout | DenseLayout
 
 
 class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
-    """What solves elements, `SparseBundle` one and `DenseBundle` many, in a way and an order of its own."""
+    """Solver of one element (`SparseBundle`) or of many (`DenseBundle`), in an order of its own."""
 
     @property
     def start(self) -> X: ...
@@ -75,11 +75,11 @@ class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
         ...
 
     def ordered(self, estimate: BundleEstimate) -> X:
-        """The estimate (B, ...) in the order of the problems as this one has it."""
+        """Convert an estimate (B, ...) from the order of the problems."""
         ...
 
     def in_order(self, estimate: X) -> BundleEstimate:
-        """The way back."""
+        """Convert an estimate to the order of the problems."""
         ...
 
     def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
@@ -127,11 +127,11 @@ class BundleMinimization:
     def minimize(self, inputs: Tensors) -> BundleMinimum:
         given = BundleData(*inputs)
         moving, parts = self._laid_out(given)
-        return BundleMinimum(*_joined([self._minimize(given, moving, part) for part in parts]))
+        return BundleMinimum(*_concatenated([self._minimize(given, moving, part) for part in parts]))
 
     def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
         bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
-        model, convergence = minimize(
+        model, convergence = minimize_batch(
             bundle, bundle.start, self.iterations, self.tolerance, self._progress(given, part)
         )
         with torch.no_grad():
@@ -159,7 +159,7 @@ class BundleMinimization:
             ]
 
         def solve(right: Tensors) -> Tensors:
-            solved = _joined([solver(tuple(x[rows] for x in right)) for rows, solver in solvers])
+            solved = _concatenated([solver(tuple(x[rows] for x in right)) for rows, solver in solvers])
             success = found.success[:, None]
             return tuple(torch.where(success if x.ndim == 2 else success[..., None], x, 0.0) for x in solved)
 
@@ -252,19 +252,19 @@ class BundleMinimization:
             model = bundle.evaluate(bundle.ordered(_part(at, part)), ~bundle.solvable)
             solution, _ = bundle.step(model, torch.zeros_like(model.cost))
             steps.append(bundle.in_order(solution))
-        return BundleEstimate(*_joined(steps))
+        return BundleEstimate(*_concatenated(steps))
 
     def marginals(self, found: BundleMinimum, inputs: Sequence[Tensor]) -> Marginals:
         with torch.no_grad():
             bundles = self._bundles(BundleData(*inputs))
             return Marginals(
-                *_joined([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
+                *_concatenated([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
             )
 
     def _progress(self, given: BundleData, part: BatchPart) -> Progress | None:
-        """Told of the iterations of all elements, as if one came after the other."""
-        told, before = self.progress, self.iterations * part.rows.start
-        return None if told is None else lambda now, most: told(before + now, most * len(given.T_cw))
+        """Reports the iterations of all elements, as if one came after the other."""
+        report, before = self.progress, self.iterations * part.rows.start
+        return None if report is None else lambda now, most: report(before + now, most * len(given.T_cw))
 
     def _bundles(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any, Any]]]:
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
@@ -286,18 +286,18 @@ class BundleMinimization:
 
 
 def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
-    """How a batch is solved: on grids, as many at once as fit, or one after the other."""
+    """Split a batch into parts: dense, as many problems at once as fit, or sparse, one at a time."""
     batch = len(given.T_cw)
-    use_grids = batch > 1 and suits_dense(given, moving)
+    use_dense = batch > 1 and suits_dense(given, moving)
     size = 1
-    if use_grids:
-        cells = _CELLS_AT_ONCE if given.T_cw.device.type == "cpu" else _CELLS_ON_DEVICE
+    if use_dense:
+        cells = _MAX_CELLS_CPU if given.T_cw.device.type == "cpu" else _MAX_CELLS_GPU
         size = max(1, cells // (moving.frames.shape[1] * moving.points.shape[1]))
     parts = []
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))
         of_part = MovingParts(*(mask[rows] for mask in moving))
-        if use_grids:
+        if use_dense:
             parts.append(BatchPart(rows, build_dense_layout(given.part(rows), of_part)))
             continue
         counted, frames, points = (mask[0] for mask in of_part)
@@ -310,6 +310,6 @@ def _part(estimate: BundleEstimate, part: BatchPart) -> BundleEstimate:
     return BundleEstimate(*(tensor[part.rows] for tensor in estimate))
 
 
-def _joined(parts: Sequence[Tensors]) -> Tensors:
+def _concatenated(parts: Sequence[Tensors]) -> Tensors:
     """Parts of a batch, one after the other."""
     return parts[0] if len(parts) == 1 else tuple(torch.cat(tensors) for tensors in zip(*parts, strict=True))

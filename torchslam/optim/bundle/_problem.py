@@ -12,9 +12,9 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
-from torchslam.optim.core.priors import CameraPrior, PosePrior, prior_expansion, prior_hessian
-from torchslam.optim.core.residuals import only, usable
-from torchslam.optim.core.tangent import rotated
+from torchslam.optim._core.priors import CameraPrior, PosePrior, prior_expansion, prior_hessian
+from torchslam.optim._core.residuals import only, usable
+from torchslam.optim._core.tangent import rotated
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
     T_cw = problem.T_cw if problem.is_batch else problem.T_cw[None]
     if not len(T_cw):
         raise ValueError("a batch must have a problem")
-    points_w, pixels, weights, asked = _rows(problem, T_cw)
+    points_w, pixels, weights, mask = _rows(problem, T_cw)
     params, camera_index = _cameras(problem, T_cw)
     priors = _priors(problem, T_cw, params)
     check_dtypes(
@@ -193,15 +193,15 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         prior_params_information=priors[3],
     )
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
-    rows = asked.shape
+    rows = mask.shape
     frame_index = checked_rows("frame_index", problem.frame_index, rows, num_frames)
     point_index = checked_rows("point_index", problem.point_index, rows, num_points)
 
     is_finite = torch.isfinite(T_cw).flatten(2).all(-1)
     seen_points = points_w.flatten(0, 1)[flat_rows(point_index, num_points)].unflatten(0, rows)
-    counted = asked & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
-    wanted = frame_index.new_zeros(batch, num_frames)
-    wanted = wanted.scatter_add(1, frame_index, asked.long()) > 0
+    counted = mask & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
+    counts = frame_index.new_zeros(batch, num_frames)
+    is_observing = counts.scatter_add(1, frame_index, mask.long()) > 0
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
     return BundleData(
         torch.where(is_finite[..., None, None], T_cw, eye),
@@ -212,7 +212,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
         *priors,
         counted,
-        (is_finite | ~wanted).all(-1),
+        (is_finite | ~is_observing).all(-1),
         frame_index,
         point_index,
         camera_index,
@@ -222,7 +222,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
 
 
 def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points (B, P, 3), and of the observations pixels (B, O, 2), weights (B, O) and which are asked for (B, O)."""
+    """Points (B, P, 3), and of the observations pixels (B, O, 2), weights (B, O) and mask (B, O)."""
     points_w, pixels = problem.points_w, problem.pixels
     if T_cw.shape[2:] != (4, 4) or points_w.shape[-1:] != (3,) or pixels.shape[-1:] != (2,):
         raise ValueError(
@@ -233,13 +233,13 @@ def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor,
     points_w = _over("points_w", "(P, 3)", points_w, (batch, points_w.shape[-2], 3))
     pixels = _over("pixels", "(O, 2)", pixels, (batch, count, 2))
     weights = torch.ones_like(pixels[..., 0]) if problem.weights is None else problem.weights
-    asked = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
+    mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
     matrix = (2, 2) if weights.shape[-2:] == (2, 2) and weights.shape[-3:-2] == (count,) else ()
     return (
         points_w,
         pixels,
         _over("weights", "(O,) or (O, 2, 2)", weights, (batch, count, *matrix)),
-        _over("mask", "(O,)", asked, (batch, count)),
+        _over("mask", "(O,)", mask, (batch, count)),
     )
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchslam.optim.core.linear import DefiniteFactor, factorize
+from torchslam.optim._core.linear import DefiniteFactor, factorize
 
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
@@ -77,7 +77,7 @@ class Structure:
 
 
 def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, num_points: int) -> Structure:
-    """The structure of observations (O,) that are ordered as `Structure` asks.
+    """The structure of observations (O,) in the order of `Structure`.
 
     frame_slots: slot of the observing frame, `num_frames` for all fixed ones.
     """
@@ -158,8 +158,8 @@ class NormalEquations:
         """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
 
         Points that their observations do not determine are left out, as if fixed.
-        gauge: (F, 6, g) directions of the frames along which the solution is to be zero. Where these fix what the
-        observations leave open, and no more, they change no right side that is orthogonal to what is open.
+        gauge: (F, 6, g) directions of the frames along which the solution is set to zero. If they span the null space
+        of the observations, solutions for right sides orthogonal to it do not change.
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)

@@ -19,6 +19,18 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
+from torchslam.optim._core.batching import Tensors
+from torchslam.optim._core.residuals import (
+    Expansion,
+    Linearization,
+    Observations,
+    exact_expansion_of_each,
+    gauss_newton_expansion,
+    linearize_each,
+    rounding_cost,
+    variance_factor,
+)
+from torchslam.optim._core.tangent import cross_entries, retract, rotated
 from torchslam.optim.bundle._problem import (
     BundleEstimate,
     BundleInputs,
@@ -34,27 +46,15 @@ from torchslam.optim.bundle._schur import (
     Structure,
     build_structure,
 )
-from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.residuals import (
-    Expansion,
-    Linearization,
-    Observations,
-    exact_expansion_of_each,
-    gauss_newton_expansion,
-    linearize_each,
-    rounding_cost,
-    variance_factor,
-)
-from torchslam.optim.core.tangent import cross_entries, retract, rotated
 
 
 @dataclass(frozen=True)
 class SparseLayout:
     """The order in which one bundle adjustment is processed, and what of it moves.
 
-    observations: (O',) rows of the problem's observations that count, ordered as `Structure` asks
+    observations: (O',) rows of the problem's observations that count, in the order of `Structure`
     frame_index:  (O',) rows of T_cw; point_index: (O',) positions in point_order
-    point_order:  (P,) rows of points_w, ordered as `Structure` asks; point_rank: (P,) its inverse
+    point_order:  (P,) rows of points_w, in the order of `Structure`; point_rank: (P,) its inverse
     free_frames:  (F',) rows of T_cw that move; free_points: (P,) bool, in point_order
     """
 
@@ -98,7 +98,7 @@ def build_sparse_layout(
 def assemble_sparse(
     structure: Structure, expansion: Expansion, rays_w: Tensor, free_points: Tensor, exact: bool
 ) -> NormalEquations:
-    """Normal equations of observations ordered as `structure` asks, for frames that move along the world's axes.
+    """Normal equations of observations in the order of `structure`, for frames that move along the world's axes.
 
     expansion: gradient (3 + K, O) and Hessian (3 + K, 3 + K, O) in the points in the world and the camera
     rays_w:    (3, O) from the observing camera to the point, in the axes of the world
@@ -145,9 +145,9 @@ def product(A: Tensor, B: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SparseModel:
-    """The local model of the cost (1,) at an estimate; its equations are made when they are asked for.
+    """The local model of the cost (1,) at an estimate; its equations are assembled on first use.
 
-    Where a minimization ends nobody asks, and they are most of the work.
+    The last model of a minimization never needs them, and they are most of the work.
     """
 
     estimate: BundleEstimate
@@ -169,7 +169,7 @@ class Seen(NamedTuple):
 
 
 class SparseBundle:
-    """A bundle adjustment for `levenberg_marquardt.minimize` (a batch of one), and what follows from its minimum."""
+    """A bundle adjustment for `minimize_batch` (a batch of one), with its covariances and exact solver."""
 
     def __init__(
         self,
@@ -216,7 +216,9 @@ class SparseBundle:
         equations, estimate = model.equations, model.estimate
         factorized = equations.factorized(damping, self._gauge(estimate))
         step = factorized.solve(equations.gradient)
-        decrease = torch.where(factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf)
+        predicted_reduction = torch.where(
+            factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf
+        )
         frames = self.layout.free_frames
         T_free = estimate.T_cw.index_select(0, frames)
         moved = retract(T_free, -rotated(T_free[:, :3, :3], step.frames[..., None])[..., 0])
@@ -227,7 +229,7 @@ class SparseBundle:
             BundleEstimate(
                 estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params
             ),
-            decrease[None],
+            predicted_reduction[None],
         )
 
     def select(self, accept: Tensor, new: SparseModel, old: SparseModel) -> SparseModel:
@@ -248,7 +250,7 @@ class SparseBundle:
         return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
     def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
-        """Directions (F', 6, g) that what is fixed leaves open: scale, or a similarity; None where nothing is.
+        """Gauge directions (F', 6, g): the scale, or a similarity; None where the gauge is fixed.
 
         In the axes of the world, as are all vectors of the equations.
         """

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
 from torchslam.geometry.gating import whitening
-from torchslam.optim.bundle._problem import BundleProblem, as_mask, checked_rows
-from torchslam.optim.core.linear import inverse_root_3x3
-from torchslam.optim.core.numpy_backend import (
+from torchslam.optim._core.linear import inverse_root_3x3
+from torchslam.optim._core.numpy_backend import (
     MIN_DEPTH,
     Array,
     cross_columns,
@@ -30,6 +29,7 @@ from torchslam.optim.core.numpy_backend import (
     solve_symmetric,
     to_numpy,
 )
+from torchslam.optim.bundle._problem import BundleProblem, as_mask, checked_rows
 
 # Keeps a frame solvable that lost all its observations: its step is zero.
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5

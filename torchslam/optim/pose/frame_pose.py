@@ -2,7 +2,7 @@
 
 Errors are taken in undistorted coordinates and multiplied with the slope of the distortion at the keypoint, which makes
 them pixels to first order, so no iteration evaluates the distortion. Gross outliers must be removed before. The NumPy
-backend has no gradients (`core.numpy_backend`).
+backend has no gradients (`optim._core.numpy_backend`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
-from torchslam.optim.core.numpy_backend import (
+from torchslam.optim._core.numpy_backend import (
     MIN_DEPTH,
     ROBUST_KERNELS,
     Array,

@@ -23,10 +23,10 @@ from torchslam.geometry.lie import (
     skew,
 )
 from torchslam.geometry.robust import Kernel, Robustified, robustify
-from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.implicit import Ndims
-from torchslam.optim.core.levenberg_marquardt import minimize
-from torchslam.optim.core.tangent import pull_back_sim3, push_sim3, retract_sim3
+from torchslam.optim._core.batching import Tensors
+from torchslam.optim._core.implicit import Ndims
+from torchslam.optim._core.levenberg_marquardt import minimize_batch
+from torchslam.optim._core.tangent import pull_back_sim3, push_sim3, retract_sim3
 from torchslam.optim.pose_graph._sparse_cholesky import (
     BlockStructure,
     SparseFactor,
@@ -56,7 +56,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class PoseGraphLayout:
-    """The discrete part of a pose graph: what counts, what moves, and in which order it is processed.
+    """The discrete part of a pose graph: counted edges, moving nodes, and the order of elimination.
 
     i, j:     (E,) int64 nodes of the edges
     counted:  (B, E) bool; moving: (B, K) bool, nodes that counted edges join with a fixed one
@@ -77,7 +77,7 @@ class PoseGraphLayout:
 
 
 def build_pose_graph_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> PoseGraphLayout:
-    """Decide what moves, and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
+    """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
     moving = _reached(edges, counted, fixed) & ~fixed
@@ -138,7 +138,7 @@ class EdgeLinearization(NamedTuple):
     """Errors of the edges and how they change.
 
     error:   (B, E, D); J: (B, E, D, D) d error / d eta; carry: (B, E, D, D) Ad(X), so that eta = xi_j - carry xi_i
-    pull:    (B, E, D) information @ error; squared: (B, E) error^T information error
+    weighted_residual: (B, E, D) information @ error; squared: (B, E) error^T information error
     kernel:  rho and its derivatives (B, E); zero where the edge does not count
     sigma:   (B, E) the error in log scale, a constant where the scale is fixed
     """
@@ -172,7 +172,7 @@ class PoseGraphModel:
 
 
 class PoseGraphProblem:
-    """A pose graph for `levenberg_marquardt.minimize`, and what follows from its minimum."""
+    """A pose graph for `minimize_batch`, with its exact Hessian."""
 
     def __init__(self, layout: PoseGraphLayout, inputs: PoseGraphInputs, kernel: Kernel) -> None:
         self.layout, self.inputs, self.kernel = layout, inputs, kernel
@@ -195,9 +195,9 @@ class PoseGraphProblem:
         damping = _DAMPING_SHARE * damping
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
-        decrease = 0.5 * (xi * model.gradient).sum((-2, -1))
+        predicted_reduction = 0.5 * (xi * model.gradient).sum((-2, -1))
         moved = torch.where(self.layout.moving[..., None, None], retract_sim3(model.S_cw, -xi), model.S_cw)
-        return moved, torch.where(factor.definite, decrease, torch.inf)
+        return moved, torch.where(factor.definite, predicted_reduction, torch.inf)
 
     def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
         if accept.all():
@@ -314,7 +314,7 @@ class PoseGraphMinimization:
 
     def minimize(self, inputs: Tensors) -> Tensors:
         problem = self._problem(inputs)
-        model, convergence = minimize(problem, inputs[0], self.iterations, self.tolerance)
+        model, convergence = minimize_batch(problem, inputs[0], self.iterations, self.tolerance)
         with torch.no_grad():
             success = problem.solvable & problem.factorized(model).definite
         how = convergence.iterations, convergence.converged, convergence.initial_cost
@@ -358,7 +358,7 @@ class PoseGraphMinimization:
         return PoseGraphProblem(self._layout(*inputs[4:]), PoseGraphInputs(*inputs[:4]), self.kernel)
 
     def _layout(self, counted: Tensor, fixed: Tensor, edges: Tensor) -> PoseGraphLayout:
-        """The layout for what counts and is fixed; the last one is kept, which mostly is the next one."""
+        """The layout for counted edges and fixed nodes; the last one is cached."""
         key = counted, fixed
         if self._last is None or not all(map(torch.equal, self._last[0], key)):
             self._last = key, build_pose_graph_layout(edges, counted, fixed, self.dims)

@@ -187,7 +187,7 @@ class SparseFactor:
     """Cholesky factors of systems that were scaled to a unit diagonal.
 
     scale:    (B, K * D) such that scale * matrix * scale has a unit diagonal
-    factors:  per front the lower triangle (B, n, n) of what is eliminated, and the rows below it (B, m, n)
+    factors:  per front the lower triangle (B, n, n) of the eliminated nodes, and the rows below it (B, m, n)
     definite: (B,) bool, the matrix is positive definite, whatever its units
     """
 

@@ -20,7 +20,7 @@ from torch._C._functorch import TransformType, get_interpreter_stack
 from torch.func import grad, vjp
 
 from torchslam.geometry.precision import full_precision
-from torchslam.optim.core.batching import InDims, Tensors, leading, nested_vmap, vmap_by_fold, vmap_by_loop
+from torchslam.optim._core.batching import InDims, Tensors, leading, nested_vmap, vmap_by_fold, vmap_by_loop
 
 Backward = Literal["implicit", "unroll", "truncated", "detached"]
 """How gradients pass a minimization.
@@ -55,7 +55,7 @@ class Minimization(Protocol):
     them; None where there are no batches."""
 
     def minimize(self, inputs: Tensors) -> Tensors:
-        """The minimum, and what else is to know about it."""
+        """The minimum, followed by the other results."""
         ...
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:

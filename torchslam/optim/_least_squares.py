@@ -13,13 +13,12 @@ from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, robustify
-from torchslam.optim.core import levenberg_marquardt as levenberg
-from torchslam.optim.core import tangent
-from torchslam.optim.core.batching import Tensors, index_tree, where_tree
-from torchslam.optim.core.implicit import Backward, Ndims, check_backward, implicit_minimum
-from torchslam.optim.core.levenberg_marquardt import Convergence
-from torchslam.optim.core.linear import DefiniteFactor, factorize
-from torchslam.optim.core.residuals import Linearization, flat_along
+from torchslam.optim._core import tangent
+from torchslam.optim._core.batching import Tensors, index_tree, where_tree
+from torchslam.optim._core.implicit import Backward, Ndims, check_backward, implicit_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
+from torchslam.optim._core.linear import DefiniteFactor, factorize
+from torchslam.optim._core.residuals import Linearization, flat_along
 
 Manifold = Literal["euclidean", "se3", "sim3"]
 """What an unknown moves on.
@@ -263,7 +262,7 @@ class _Data(NamedTuple):
 
 @dataclass(frozen=True)
 class _Problem:
-    """The least-squares problems for `levenberg_marquardt.minimize`, and what follows from their minima."""
+    """The least-squares problems for `minimize_batch`, with their exact Hessians."""
 
     residual: Residual
     product: Product
@@ -295,9 +294,9 @@ class _Problem:
         floor = torch.finfo(damping.dtype).tiny ** 0.5  # what nothing depends on stays where it is
         factor = factorize(model.hessian + torch.diag_embed(diagonal + floor), strict=False)
         step = factor.solve(model.gradient[..., None]).squeeze(-1)
-        decrease = 0.5 * (step * model.gradient).sum(-1)
-        decrease = torch.where(factor.definite, decrease, torch.inf)
-        return self.product.retract(model.unknowns, -step), decrease
+        predicted_reduction = 0.5 * (step * model.gradient).sum(-1)
+        predicted_reduction = torch.where(factor.definite, predicted_reduction, torch.inf)
+        return self.product.retract(model.unknowns, -step), predicted_reduction
 
     def select(self, accept: Tensor, new: _Model, old: _Model) -> _Model:
         return new if accept.all() else where_tree(accept, new, old)
@@ -365,7 +364,7 @@ class _Minimization:
         self.ndims: tuple[Ndims, Ndims, Ndims] | None = None
 
     def dimensions(self, tensors: Tensors) -> tuple[Ndims, Ndims, Ndims]:
-        """Of vectors, of what is found, and of inputs, without the batch."""
+        """Numbers of dimensions of vectors, results and inputs, without the batch."""
         inputs = tuple(tensor.ndim - 1 for tensor in tensors)
         return (1,), (*inputs[: self.num_unknowns], 0, 0, 0, 0, 0), inputs
 
@@ -374,7 +373,7 @@ class _Minimization:
         with torch.no_grad():
             finite = finite & torch.isfinite(self._problem(inputs).cost(start))
         problem = self._problem(inputs, finite)
-        model, convergence = levenberg.minimize(problem, start, self.iterations, self.tolerance)
+        model, convergence = minimize_batch(problem, start, self.iterations, self.tolerance)
         with torch.no_grad():
             success = finite & factorize(torch.where(finite[:, None, None], model.hessian, 0.0)).definite
         how = convergence.iterations, convergence.converged, convergence.initial_cost

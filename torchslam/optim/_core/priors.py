@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.lie import se3_inverse, skew, so3_left_jacobian, so3_log
-from torchslam.optim.core.tangent import retract
+from torchslam.optim._core.tangent import retract
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Bundle adjustment: poses, points and, where wanted, the cameras; sparse, robust, batched, differentiable."""
+"""Bundle adjustment of poses, points and optionally cameras: sparse, robust, batched, differentiable."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
+from torchslam.optim._core.implicit import Backward, check_backward, implicit_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.core.implicit import Backward, check_backward, implicit_minimum
-from torchslam.optim.core.levenberg_marquardt import Convergence, Progress
 
 __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
 
@@ -126,7 +126,7 @@ def bundle_adjust(
         free_camera: True frees all K parameters of every camera. A tensor (K, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
         backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
-            points. There is none to the start of what moves.
+            points. Nothing flows to the start of free unknowns.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.core.implicit import Backward, check_backward, implicit_minimum
-from torchslam.optim.core.levenberg_marquardt import Convergence
+from torchslam.optim._core.implicit import Backward, check_backward, implicit_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 
 # 95 % of the norms of seven standard normal numbers lie below.

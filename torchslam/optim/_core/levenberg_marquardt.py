@@ -16,17 +16,15 @@ from typing import Protocol, Self, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchslam.optim.core.batching import concat_tree, index_tree
+from torchslam.optim._core.batching import concat_tree, index_tree
 
 _INITIAL_DAMPING = 1e-4
 _DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
 _DAMPING_RANGE = (1e-10, 1e8)
-# Below this share of the cost, the decrease that a step promises says that the optimum is close.
-_NEAR = 1e-2
-
+_CURVATURE_BELOW = 1e-2  # predicted relative reduction of the cost below which the kernel's curvature is used
 
 Progress = Callable[[int, int], None]
-"""Told before each iteration its number, from 0, and how many there are at most."""
+"""Called before each iteration with its number, from 0, and the maximum number of iterations."""
 
 
 class Model(Protocol):
@@ -41,7 +39,7 @@ X = TypeVar("X")
 
 
 class LeastSquares(Protocol[X, M]):
-    """What the loop asks of a problem with estimate X and local models M."""
+    """A problem with estimates X and local models M."""
 
     @property
     def solvable(self) -> Tensor:
@@ -49,7 +47,7 @@ class LeastSquares(Protocol[X, M]):
         ...
 
     def evaluate(self, estimate: X, use_curvature: Tensor) -> M:
-        """The cost and its quadratic model at an estimate. use_curvature: (B,) bool, the optimum is close."""
+        """The cost and its quadratic model at an estimate. use_curvature: (B,) bool, add the kernel's curvature."""
         ...
 
     def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
@@ -75,20 +73,22 @@ class Divisible(Protocol):
 
 @runtime_checkable
 class Rounded(Protocol):
-    """A problem that knows how much of its costs is rounding: where no more is left, steps only shuffle it."""
+    """A problem with known rounding errors: a cost below them cannot be reduced."""
 
     def rounding(self) -> Tensor:
-        """(B,) the cost of exact data."""
+        """(B,) the cost of exact data, from rounding alone."""
         ...
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """How a minimization went, per element.
+    """Convergence of a minimization, per element.
 
-    iterations: (B,) int64 steps tried
-    converged:  (B,) bool, the last step promised less than the tolerance
-    initial_cost, cost: (B,) half the sum of robustified squared residuals, before and after
+    Attributes:
+        iterations: (B,) int64 steps tried.
+        converged: (B,) bool, the predicted reduction of the last step was below the tolerance.
+        initial_cost: (B,) half the sum of robustified squared residuals at the start.
+        cost: (B,) the same at the end.
     """
 
     iterations: Tensor
@@ -102,7 +102,7 @@ class Convergence:
         return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
 
 
-def minimize(
+def minimize_batch(
     problem: LeastSquares[X, M],
     start: X,
     iterations: int,
@@ -111,8 +111,8 @@ def minimize(
 ) -> tuple[M, Convergence]:
     """Minimize from `start`; returns the model at the last accepted estimate.
 
-    An element has converged when a step is predicted to lower its cost by less than `tolerance` times the cost, or
-    when the residuals have vanished; it rests from then on. What `progress` raises ends the minimization.
+    An element has converged when the predicted reduction of its cost is below `tolerance` times the cost, or when its
+    residuals have vanished; it stays unchanged from then on. An exception of `progress` ends the minimization.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
@@ -125,27 +125,27 @@ def minimize(
         vanished = torch.maximum(vanished, problem.rounding())
     damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
-    rows, resting = torch.arange(len(active), device=active.device), []
+    rows, finished = torch.arange(len(active), device=active.device), []
     for iteration in range(iterations):
         if progress is not None:
             progress(iteration, iterations)
-        estimate, decrease = problem.step(model, damping)
-        share = decrease.detach() / model.cost.detach()
-        trial = problem.evaluate(estimate, share < _NEAR)
-        accept = active & (share < torch.inf) & (trial.cost <= slack * model.cost)
+        estimate, predicted_reduction = problem.step(model, damping)
+        relative_reduction = predicted_reduction.detach() / model.cost.detach()
+        trial = problem.evaluate(estimate, relative_reduction < _CURVATURE_BELOW)
+        accept = active & (relative_reduction < torch.inf) & (trial.cost <= slack * model.cost)
         steps = steps.index_add(0, rows, active.long())
-        active = active & (share > tolerance) & (model.cost.detach() > vanished)
+        active = active & (relative_reduction > tolerance) & (model.cost.detach() > vanished)
         model = problem.select(accept, trial, model)
         damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():
             break
         if isinstance(problem, Divisible) and not active.all():
-            rest, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
-            resting.append((rows[rest], index_tree(model, rest)))
+            done, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
+            finished.append((rows[done], index_tree(model, done)))
             problem, model = problem.part(stay), index_tree(model, stay)
             rows, active, damping, vanished = index_tree((rows, active, damping, vanished), stay)
     converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
-    if resting:
-        where, models = zip(*resting, (rows, model), strict=True)
+    if finished:
+        where, models = zip(*finished, (rows, model), strict=True)
         model = concat_tree(models, where)
     return model, Convergence(steps, converged, initial_cost, model.cost.detach())

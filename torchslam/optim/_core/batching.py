@@ -1,4 +1,4 @@
-"""Parts of batches, and how a function of batches takes the further dimensions of `torch.func.vmap`."""
+"""Trees of batched tensors, and rules by which a function of batches supports `torch.func.vmap`."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from torch.utils._pytree import tree_map
 
 Tensors = tuple[Tensor, ...]
 InDims = Sequence[int | None]
-"""The dimension of each tensor along which the elements run; None where all share it."""
-
+"""The mapped dimension of each tensor; None where all elements share the tensor."""
 
 Tree = TypeVar("Tree")
-"""Named tuples of batched tensors, also within one another."""
+"""Nested named tuples of batched tensors."""
 
 
 def index_tree(tree: Tree, rows: Tensor) -> Tree:
-    """Some elements of a batch."""
+    """Select elements of a batch by their rows (b,)."""
     return tree_map(lambda tensor: tensor.index_select(0, rows), tree)
 
 
 def where_tree(first: Tensor, one: Tree, other: Tree) -> Tree:
-    """Per element, `one` where `first` (B,) and `other` elsewhere."""
+    """Select per element: `one` where `first` (B,) is true, `other` elsewhere."""
 
     def choose(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b)
@@ -34,27 +33,27 @@ def where_tree(first: Tensor, one: Tree, other: Tree) -> Tree:
 
 
 def concat_tree(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
-    """The batch of which each tree has the elements in its rows (b,)."""
+    """Merge trees into one batch; each has the elements of its rows (b,)."""
     order = torch.argsort(torch.cat(list(rows)))
     return tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *trees)
 
 
 def nested_vmap(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
-    """A function of tensors, over `many` more leading dimensions of them."""
+    """Map a function over `many` additional leading dimensions of its tensors."""
     for _ in range(many):
         function = vmap(function)
     return function
 
 
 def leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
-    """A tensor whose elements run along its first dimension."""
+    """Move the mapped dimension to the front, or expand a shared tensor."""
     return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
 
 
 def vmap_by_loop(
     function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]
 ) -> Tensors:
-    """One element after the other."""
+    """Apply the function to one element after the other."""
     elements = [
         function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
         for row in range(size)
@@ -70,7 +69,7 @@ def vmap_by_fold(
     ndims: Sequence[int],
     before: Sequence[int],
 ) -> Tensors:
-    """All elements at once, in the batch that the function knows, which comes after `before` dimensions."""
+    """Fold the mapped dimension into the batch dimension of the function, which follows `before` dimensions."""
     batched = [
         x.ndim - (dim is not None) > ndim + skip
         for x, dim, ndim, skip in zip(tensors, dims, ndims, before, strict=True)

@@ -23,7 +23,7 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-# As in `core.levenberg_marquardt`.
+# As in `_core.levenberg_marquardt`.
 _INITIAL_DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0
 _CURVATURE_BELOW = 1e-2  # predicted relative reduction of the cost below which the kernel's curvature is used
 _COST_SLACK = 1 + 1e-13  # an increase of the cost by rounding does not reject a step
@@ -96,7 +96,7 @@ ROBUST_KERNELS = {"cauchy": cauchy, "huber": huber}
 
 
 def retract_pose(pose: Array, step: Array) -> Array:
-    """A pose (3, 4) moved by a left perturbation [rho, omega] (6,), as in `core.tangent.retract`."""
+    """A pose (3, 4) moved by a left perturbation [rho, omega] (6,), as in `_core.tangent.retract`."""
     x, y, z = (0.5 * step[3:]).tolist()
     xx, yy, zz = x * x, y * y, z * z
     f = 2 / (1 + xx + yy + zz)
@@ -115,7 +115,7 @@ def retract_pose(pose: Array, step: Array) -> Array:
 def variance_factor(
     squared: Array, influence: Array, weights: Array, kernel: RobustKernel, scale: float, num_parameters: int
 ) -> float:
-    """Variance of unit weight from residuals of two components, as in `core.residuals.variance_factor`.
+    """Variance of unit weight from residuals of two components, as in `_core.residuals.variance_factor`.
 
     Args:
         squared: (N,) weighted squared errors.
@@ -166,7 +166,7 @@ def solve_symmetric(matrix: Array, right: Array) -> Array | None:
 
 
 def is_definite(matrix: Array) -> bool:
-    """Whether a matrix is clearly positive definite, whatever its units, as in `core.linear.factorize`."""
+    """Whether a matrix is clearly positive definite, whatever its units, as in `_core.linear.factorize`."""
     factor = _scaled_cholesky(matrix)
     return factor is not None and bool(factor[2].diagonal().min() > np.finfo(matrix.dtype).eps ** 0.4)
 

@@ -18,12 +18,12 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim.core.batching import Tensors
-from torchslam.optim.core.implicit import Backward, Ndims, check_backward, implicit_minimum
-from torchslam.optim.core.levenberg_marquardt import Convergence, minimize
-from torchslam.optim.core.linear import factorize
-from torchslam.optim.core.priors import PosePrior, prior_expansion, prior_hessian
-from torchslam.optim.core.residuals import (
+from torchslam.optim._core.batching import Tensors
+from torchslam.optim._core.implicit import Backward, Ndims, check_backward, implicit_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
+from torchslam.optim._core.linear import factorize
+from torchslam.optim._core.priors import PosePrior, prior_expansion, prior_hessian
+from torchslam.optim._core.residuals import (
     Observations,
     Weighed,
     exact_expansion,
@@ -33,7 +33,7 @@ from torchslam.optim.core.residuals import (
     variance_factor,
     weigh,
 )
-from torchslam.optim.core.tangent import move, point_jacobian, pull_back, push, retract
+from torchslam.optim._core.tangent import move, point_jacobian, pull_back, push, retract
 
 
 class PoseModel(NamedTuple):
@@ -186,7 +186,7 @@ class PoseInputs:
 
 
 class PoseProblem:
-    """The least-squares problem of `refine_pose`: for `minimize`, and what follows from its minimum."""
+    """The least-squares problem of `refine_pose` for `minimize_batch`, with covariances and the exact Hessian."""
 
     def __init__(self, inputs: PoseInputs) -> None:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
@@ -273,7 +273,7 @@ class PoseMinimization:
         finite = torch.isfinite(T_cw).flatten(1).all(-1)
         identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         start = torch.where(finite[:, None, None], T_cw, identity)
-        model, convergence = minimize(problem, start, self.iterations, self.tolerance)
+        model, convergence = minimize_batch(problem, start, self.iterations, self.tolerance)
         with torch.no_grad():
             success = problem.solvable & factorize(model.hessian).definite & finite
         refined = torch.where(success[:, None, None], model.T_cw, start.detach())

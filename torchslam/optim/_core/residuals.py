@@ -5,7 +5,7 @@ camera frame (and, where it is free, of the camera's parameters). Poses and worl
 in `pose` and in `bundle`.
 
 An observation of a point that cannot be projected (behind the camera, beyond the distortion's range) costs as much as
-an error of the image's diagonal and pulls nowhere: no step gains by pushing a point behind the camera.
+an error of the image's diagonal and has no gradient: no step gains by pushing a point behind the camera.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def rounding_cost(weights: Tensor, params: Tensor) -> Tensor:
     """(B,) what exact observations cost because numbers are rounded: below it there is nothing to be gained.
 
     weights: (B, ...) inverse variances, or the diagonals of inverse covariances, zero where nothing counts
-    params:  (B, C, K) of the cameras: focal lengths and principal points are as large as what is added up to a pixel
+    params:  (B, C, K) of the cameras: focal lengths and principal points bound the terms of a pixel's coordinates
     """
     pixels = params.detach()[..., :4].abs().amax((1, 2))
     rounding = _ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
@@ -152,7 +152,7 @@ class Weighed(NamedTuple):
 
 
 def weigh(observations: Observations, squared_px: Tensor, valid: Tensor) -> Weighed:
-    """What squared errors (..., N), px or whitened, cost and how they pull; those that are not valid pull nowhere."""
+    """Costs and weights of squared errors (..., N), px or whitened; errors that are not valid have weight zero."""
     camera, weights = observations.camera, observations.factors
     diagonal: Tensor | float = float(camera.width**2 + camera.height**2)
     if observations.has_matrices:
