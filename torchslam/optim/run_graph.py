@@ -7,8 +7,9 @@ minimizer: one linear solve for the keyframes and the points, one small one for 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
@@ -239,36 +240,15 @@ def solve_graph(
     Raises:
         ValueError: a submap has no keyframe, two submaps see the same point, or the camera is free for several submaps.
     """
-    submaps = graph.submaps
-    if free_camera is not False and len(submaps) > 1:
+    if free_camera is not False and len(graph.submaps) > 1:
         raise ValueError("a free camera needs a graph of one submap")
-    solved = graph.points_w.new_zeros(len(graph.points_w), dtype=torch.int64)
-    T_cw, points_w = graph.T_cw.detach(), graph.points_w.detach()
-    success, moved = torch.zeros_like(graph.is_keyframe), torch.zeros_like(solved, dtype=torch.bool)
-    bundles: list[BundleSolution] = []
-    options = (kernel, scale, backward, iterations, tolerance)
-    for submap in submaps:
-        keyframes, points, problem = keyframe_problem(graph, submap)
-        solved[points] += 1
-        bundle = bundle_adjust(
-            problem, kernel, scale, free_camera, backward, iterations, tolerance, progress=progress
-        )
-        bundles.append(bundle)
-        T_cw, points_w = (
-            T_cw.index_copy(0, keyframes, bundle.T_cw),
-            points_w.index_copy(0, points, bundle.points_w),
-        )
-        finite = torch.isfinite(problem.T_cw).flatten(1).all(-1)
-        success = success.index_copy(0, keyframes, bundle.success & finite)
-        moved = moved.index_copy(0, points, bundle.moved_points)
-    if bool((solved > 1).any()):
-        raise ValueError("a point is seen in two submaps")
-    if not bundles:
-        raise ValueError("the graph has no keyframe")
-    camera = bundles[0].camera
-    T_cw, success, converged = pose_other_frames(graph, T_cw, points_w, camera, moved, success, *options)
-    found = T_cw, points_w, camera, success, moved, converged & bundle_converged(graph, bundles)
-    return GraphSolution(graph.timestamps, *found, graph.submap, tuple(bundles))
+    options = kernel, scale, backward, iterations, tolerance
+
+    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
+        settings = kernel, scale, free_camera, backward, iterations, tolerance, progress
+        return [bundle_adjust(submap.problem, *settings) for submap in submaps]
+
+    return _solve([graph], adjust, *options)[0]
 
 
 def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
@@ -349,16 +329,13 @@ def pose_other_frames(
 
 def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
     """One graph of several with submaps of their own; the camera is that of the first."""
-    frames, points = (
-        torch.tensor([0, *(len(getattr(graph, name)) for graph in graphs)]).cumsum(0).tolist()
-        for name in ("T_cw", "points_w")
-    )
+    frames, points = _starts([graph.T_cw for graph in graphs]), _starts([graph.points_w for graph in graphs])
     columns: dict[str, Any] = {}
     for name in graphs[0].columns():
         parts = [getattr(graph, name) for graph in graphs]
         if name in ("frame_index", "point_index"):
             starts = frames if name == "frame_index" else points
-            parts = [part + start for part, start in zip(parts, starts, strict=False)]
+            parts = [part + start for part, start in zip(parts, starts, strict=True)]
         columns[name] = torch.cat(parts)
     return replace(graphs[0], **columns)
 
@@ -391,6 +368,11 @@ def solve_graphs(
     Graphs may differ in size and camera. Those with the same camera model and the same kind of weights are solved
     together. Converged problems leave the batch, and a failure does not affect the others.
     """
+    options = kernel, scale, backward, iterations, tolerance
+
+    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
+        return _adjust_together(submaps, *options)
+
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
         kind = (graph.camera.model, graph.camera.params.dtype, graph.camera.params.device, graph.weights.ndim)
@@ -401,28 +383,25 @@ def solve_graphs(
         if len(rows) == 1:
             found = (solve_graph(graphs[rows[0]], kernel, scale, False, backward, iterations, tolerance),)
         else:
-            some = [graphs[row] for row in rows]
-            found = _solve_alike(some, kernel, scale, backward, iterations, tolerance)
+            found = _solve([graphs[row] for row in rows], adjust, *options)
         solved.update(zip(rows, found, strict=True))
     return tuple(solved[row] for row in range(len(graphs)))
 
 
-def _solve_alike(
+def _solve(
     graphs: Sequence[ObservationGraph],
-    kernel: Kernel,
-    scale: Tensor | float,
-    backward: Backward,
-    iterations: int,
-    tolerance: float,
+    adjust: Callable[[Sequence[_GraphSubmap]], list[BundleSolution]],
+    *options: Any,
 ) -> tuple[GraphSolution, ...]:
-    """Solve graphs with one camera model together."""
-    options = kernel, scale, backward, iterations, tolerance
+    """Solve graphs with one camera model; `adjust` solves the bundle adjustments of all their submaps."""
     submaps = [
         _GraphSubmap(number, *keyframe_problem(graph, submap))
         for number, graph in enumerate(graphs)
         for submap in graph.submaps
     ]
-    bundles = _bundles(submaps, *options)
+    if not submaps:
+        raise ValueError("the graph has no keyframe")
+    bundles = adjust(submaps)
     # Rows of all graphs, one after the other, as `concatenate_graphs` has them; `submap` tells the graphs apart.
     joined = concatenate_graphs([_plain(graph, number) for number, graph in enumerate(graphs)])
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
@@ -438,8 +417,10 @@ def _solve_alike(
     points_w = joined.points_w.detach().index_copy(0, points, points_w)
     moved = moved.bool().index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
     success = success.index_copy(0, frames, succeeded & finite)
-    params = torch.stack([graph.camera.params for graph in graphs])
-    camera = graphs[0].camera.with_params(params[joined.submap])
+    cameras = [graph.camera for graph in graphs] if len(graphs) > 1 else [bundles[0].camera]
+    camera = cameras[0]
+    if len(cameras) > 1:
+        camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
     T_cw, success, is_minimum = pose_other_frames(joined, T_cw, points_w, camera, moved, success, *options)
     solutions = []
     for number, graph in enumerate(graphs):
@@ -447,12 +428,12 @@ def _solve_alike(
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
         own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
         converged = is_minimum[rows] & bundle_converged(graph, own)
-        found = T_cw[rows], points_w[places], graph.camera, success[rows], moved[places], converged
+        found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places], converged
         solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
     return tuple(solutions)
 
 
-def _bundles(
+def _adjust_together(
     submaps: Sequence[_GraphSubmap],
     kernel: Kernel,
     scale: Tensor | float,
@@ -513,5 +494,5 @@ def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:
 
 
 def _starts(tables: Sequence[Tensor]) -> list[int]:
-    """In which row each of some tables begins where they stand one after the other."""
-    return torch.tensor([0, *(len(table) for table in tables)]).cumsum(0).tolist()[:-1]
+    """The first row of each table in their concatenation."""
+    return list(accumulate((len(table) for table in tables[:-1]), initial=0))

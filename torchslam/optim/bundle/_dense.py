@@ -84,7 +84,7 @@ def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
     if given.weights.ndim > 2:
-        return False  # whitening makes the grids' way of a pinhole camera a longer one
+        return False  # the dense equations take scalar weights only
     if not 0 < cells <= _MAX_CELLS_PER_OBSERVATION * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
