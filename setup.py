@@ -12,7 +12,7 @@ CONFIGS = sorted((Path(__file__).parent / "configs").glob("*.toml"))
 
 
 class BuildWithConfigs(build_py):
-    """Puts them where `torchslam.config.builtin` looks; an editable installation reads them where they are."""
+    """Puts them where `torchslam.config` looks; an editable installation reads them where they are."""
 
     def run(self) -> None:
         super().run()

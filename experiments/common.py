@@ -1,4 +1,4 @@
-"""What the experiments share: where sequences lie, batches of runs with their figures, Markdown tables."""
+"""Shared by the experiments: sequences, batches of runs with their metrics, cached results, Markdown tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "sh
 
 
 def sequences(names: list[str]) -> list[Frames]:
-    """Open those of the sequences that are at hand; say which are not."""
+    """Open the available sequences; report the others."""
     found = []
     for name in names:
         if name.startswith("synthetic:"):
@@ -33,8 +33,8 @@ def sequences(names: list[str]) -> list[Frames]:
     return found
 
 
-def at_hand(names: Iterable[str]) -> list[str]:
-    """Those of the names that are rendered sequences, or folders and files of `DATA_DIR`; says which are not."""
+def available(names: Iterable[str]) -> list[str]:
+    """Select rendered sequences and those in `DATA_DIR`; report the others."""
     found = []
     for name in names:
         if name.startswith("synthetic:") or (DATA_DIR / name).exists():
@@ -44,15 +44,15 @@ def at_hand(names: Iterable[str]) -> list[str]:
     return found
 
 
-def row_of(name: str, *apart: str, overrides: Iterable[str] = (), **more: Any) -> Row:
-    """A row of a batch: a sequence that is `at_hand`; `apart`: words that tell it from other runs over the same."""
+def row_of(name: str, *labels: str, overrides: Iterable[str] = (), **more: Any) -> Row:
+    """A row of a batch; `labels` distinguish it from other runs over the same sequence."""
     place = name if name.startswith("synthetic:") else str(DATA_DIR / name)
-    label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *apart))
+    label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *labels))
     return Row(label, place, overrides=tuple(overrides), **more)
 
 
 def parser_of(description: str | None, output: Path | None = None) -> argparse.ArgumentParser:
-    """A parser of an experiment that its module describes, with the file that its table goes to, if it has one."""
+    """Create the parser of an experiment with its module's description and, optionally, the file of its table."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -62,31 +62,33 @@ def parser_of(description: str | None, output: Path | None = None) -> argparse.A
 
 
 def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
-    """Where the runs of an experiment go, and who does them; what is there already is not done again."""
+    """Add the options for the output folder and the engine of an experiment; existing results are reused."""
     parser.add_argument("--output", type=Path, default=Path("results") / experiment, metavar="DIR")
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
 
 
-def figures_of_all(rows: Sequence[Row], options: argparse.Namespace, pictures: bool = False) -> list[Columns]:
-    """Run the rows with the options of `add_engine`; returns the metrics of each, times included.
+def metrics_of_runs(
+    rows: Sequence[Row], options: argparse.Namespace, plots: bool = False
+) -> list[Columns]:
+    """Run the rows with the options of `add_engine`; return the metrics of each, times included.
 
-    Raises SystemExit where one ended with an error.
+    Raises SystemExit if one ended with an error.
     """
     output = options.output.absolute()
-    tasks = [Task(row, str(output), overwrite=True, pictures=pictures) for row in rows]
-    check(run_batch(tasks, Engine(options.engine, options.workers), on_progress=_tell))
+    tasks = [Task(row, str(output), overwrite=True, plots=plots) for row in rows]
+    check(run_batch(tasks, Engine(options.engine, options.workers), on_progress=_log))
     folders = [output / RUNS / row.name for row in rows]
     return [read_metrics(folder) | read_times(folder) for folder in folders]
 
 
-def kept(
+def cached_run(
     name: str, label: str, settings: Iterable[str], work: Callable[[Path], Columns], output: str, code: Path
 ) -> Columns:
-    """Run a piece of an experiment that is not a row of a batch, or reuse its stored columns: see `run_or_reuse`.
+    """Run a part of an experiment that is not a row of a batch, or reuse its stored columns: see `run_or_reuse`.
 
-    name:  unique, as a part of the name of a folder; label: what it is called in the experiment
-    work:  as of `run_or_reuse`; code: folder of the experiment, hashed together with torchslam and the data
+    name: unique, part of a folder name; label: its name in the experiment
+    code: folder of the experiment, hashed together with torchslam and the data
     """
 
     def fingerprints_of() -> Columns:
@@ -96,44 +98,44 @@ def kept(
     return run_or_reuse(Path(output), name, fingerprints_of, work, overwrite=True)
 
 
-def each_case(
+def run_cases(
     work: Callable[[Columns], Columns],
     cases: Sequence[Columns],
     options: argparse.Namespace,
     on_progress: Callable[[Columns], None],
 ) -> list[Columns]:
-    """What a function that never raises, as by `kept`, makes of the cases; `on_progress` each of them when it is done.
+    """Apply a function that never raises, such as `cached_run`, to each case; cases are JSON values.
 
-    Cases are what JSON can say. Raises SystemExit where a process died.
+    Raises SystemExit if a process died.
     """
     found: dict[int, Columns] = {}
     for number, columns in Engine(options.engine, options.workers).each(work, cases):
         if columns is None:
-            raise SystemExit(f"{cases[number]}: the process that ran it died")
+            raise SystemExit(f"{cases[number]}: its process died")
         found[number] = columns
         on_progress(columns)
     return [found[number] for number in range(len(cases))]
 
 
 def check(found: Iterable[Columns]) -> None:
-    """Raises SystemExit that names what ended with an error."""
+    """Raise SystemExit with the runs that ended with an error."""
     errors = [f"{columns['name']}: {columns['error']}" for columns in found if columns["status"] == ERROR]
     if errors:
         raise SystemExit("\n".join(errors))
 
 
-def _tell(columns: Columns) -> None:
+def _log(columns: Columns) -> None:
     print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table."""
+    """Format a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + "\n"
 
 
 def write_between(readme: Path, text: str) -> None:
-    """Replace what stands between the two marks `<!-- table -->` and `<!-- end -->` of a README."""
+    """Replace the text between the marks `<!-- table -->` and `<!-- end -->` of a README."""
     before, _, rest = readme.read_text(encoding="utf-8").partition("<!-- table -->\n")
     _, _, after = rest.partition("<!-- end -->")
     readme.write_text(f"{before}<!-- table -->\n{text}<!-- end -->{after}", encoding="utf-8")

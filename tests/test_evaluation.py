@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import jacfwd, jacrev
 
 from torchslam.data import open_sequence
-from torchslam.data.association import interpolate_poses
+from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate, ate_apart, evaluate, rpe
 from torchslam.geometry.lie import quaternion_from_matrix, rigid, se3_exp, se3_inverse, so3_exp
@@ -29,7 +29,7 @@ def _times(count: int, rate: float = 10.0) -> Tensor:
 
 
 def _moved(T_wc: Tensor, scale: float) -> Tensor:
-    """The same path in another world: scaled, turned and shifted."""
+    """The same path in another submap: scaled, turned and shifted."""
     R = so3_exp(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
     t = torch.tensor([5.0, -3.0, 1.0], dtype=torch.float64)
     return rigid(R @ T_wc[:, :3, :3], scale * T_wc[:, :3, 3] @ R.T + t)
@@ -125,7 +125,7 @@ def test_parts_that_fit_any_path_are_left_out(generator: torch.Generator) -> Non
     late = Trajectory(truth.timestamps[17:] + 0.2, truth.T_wc[17:])  # of its three poses, two have a true one
     late.timestamps[0] = 1.8
     assert ate_apart([part, late], truth) == pytest.approx(evaluate(part, truth).ate_m)
-    with pytest.raises(TrajectoryError, match="no world has 3 estimated poses"):
+    with pytest.raises(TrajectoryError, match="no submap has 3 estimated poses"):
         ate_apart([late], truth)
 
 
@@ -230,7 +230,7 @@ def _evo_figures(estimate: Trajectory, groundtruth: Trajectory, interpolate: boo
 
 
 def _noisy(T_wc: Tensor, generator: torch.Generator) -> Tensor:
-    """Poses with some noise, at a third of the scale, in another world."""
+    """Poses with some noise, at a third of the scale, in another submap."""
     spread = torch.tensor([0.02] * 3 + [0.01] * 3, dtype=torch.float64)
     return _moved(T_wc @ se3_exp(spread * torch.randn(len(T_wc), 6, generator=generator).double()), 1 / 3)
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import torchslam
+from torchslam import config
 from torchslam.cli.main import main
-from torchslam.config import builtin as named_configs
-from torchslam.utils.optional_deps import OPENCV
+from torchslam.utils.console import OPENCV
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "configs", "torchslam")
@@ -81,7 +81,7 @@ def test_configurations_are_found_by_name_outside_of_the_repository(unpacked: Pa
 
 def test_a_checkout_has_no_copy_of_the_configurations() -> None:
     assert not (ROOT / "torchslam" / "configs").exists()
-    assert named_configs.FOLDER == ROOT / "configs"
+    assert config.FOLDER == ROOT / "configs"
 
 
 def test_the_metadata_say_what_strangers_look_for(unpacked: Path) -> None:

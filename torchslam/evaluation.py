@@ -14,11 +14,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchslam.data.association import interpolate_poses, nearest
+from torchslam.data.trajectories import interpolate_poses, nearest
 from torchslam.errors import TrajectoryError
-from torchslam.geometry.similarity import umeyama
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.similarity import umeyama
 from torchslam.types import Trajectory
 
 TOLERANCE = 0.02

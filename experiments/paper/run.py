@@ -1,4 +1,4 @@
-"""The system this project started from, on every sequence at hand. See README.md.
+"""The system this project started from, on every available sequence. See README.md.
 
 python -m experiments.paper.run [SEQUENCE ...] [--output DIR]
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image
 
-from experiments.common import DATA_DIR, add_engine, figures_of_all, row_of, table, write_between
+from experiments.common import DATA_DIR, add_engine, metrics_of_runs, row_of, table, write_between
 from torchslam.batch.result_store import RUNS
 from torchslam.io.results import PLOTS
 
@@ -53,7 +53,7 @@ def main() -> None:
     ]
     rows, failures, pictures = [], [], {called(place): list[str]() for place in places}
     for (place, kind), made, figures in zip(
-        cases, runs, figures_of_all(runs, options, pictures=True), strict=True
+        cases, runs, metrics_of_runs(runs, options, plots=True), strict=True
     ):
         name = called(place)
         rows.append(row(name, kind, figures))
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def find(names: Iterable[str]) -> list[str]:
-    """Where the sequences are that are at hand: rendered, among the real ones, or downloaded; says which are not."""
+    """Paths of the available sequences: rendered, real or downloaded; report the others."""
     found = []
     for name in names:
         folders = [root / name for root in (DATA_DIR, DOWNLOADS) if (root / name).is_dir()]
@@ -105,7 +105,7 @@ def row(name: str, kind: str, figures: dict[str, Any]) -> list[str]:
 
 
 def picture(scene: Path) -> str:
-    """Put a small copy of the scene from two views beside the README; returns what shows it there."""
+    """Save a small picture of the scene from two views next to the README; return its Markdown."""
     if not scene.exists():
         return "no map"
     name = scene.parents[1].name

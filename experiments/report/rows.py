@@ -17,8 +17,8 @@ from experiments.trials.judging import extent
 from experiments.trials.outcome import timed
 from experiments.trials.trials import POSED, drone, opened
 from torchslam.config import Config, to_toml
-from torchslam.data.formats.trajectory_file import write_trajectory
 from torchslam.data.sequence import Sequence
+from torchslam.data.trajectories import write_trajectory
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.io.results import TRAJECTORY
 from torchslam.system.run import Run
@@ -26,8 +26,8 @@ from torchslam.system.slam import SLAM
 from torchslam.types import State
 
 NAMES = (*POSED, "standstill", "drone", "synthetic:room")
-"""Everything that `make report` runs; what is not at hand is left out, and named."""
-DIGEST = 16  # digits of a hash: enough to tell runs apart
+"""Everything that `make report` runs; unavailable sequences are skipped and listed."""
+DIGEST = 16  # digits of a hash, enough to distinguish runs
 
 
 def run_row(name: str) -> dict[str, Any]:

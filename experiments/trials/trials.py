@@ -16,9 +16,8 @@ from experiments.trials.faults import FAULTS, Fault
 from experiments.trials.gradient import SETTINGS as GRADIENT_SETTINGS
 from experiments.trials.gradient import Round
 from torchslam.data import open_sequence
-from torchslam.data.association import nearest
-from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.data.sequence import Sequence
+from torchslam.data.trajectories import nearest, read_trajectory
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 
 POSED = ("redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20")
@@ -43,7 +42,7 @@ LENDERS = {
 }
 HARD_LOOP = "synthetic:loop?noise=12&blur=1.5"
 STOREY = "synthetic:storey?noise=6&blur=1"
-SEEDS = (1, 2, 3)  # of textures, furniture and noise of the hard loop, beside 0
+SEEDS = (1, 2, 3)  # of textures, furniture and noise of the hard loop, in addition to 0
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Trial:
 
 
 def opened(name: str) -> Sequence:
-    """Raises SequenceError where it is not at hand."""
+    """Raises SequenceError if it is not available."""
     return open_sequence(name if name.startswith("synthetic:") else DATA_DIR / name)
 
 
@@ -95,13 +94,13 @@ def drone() -> Edited:
 
 
 def lookalike() -> Edited:
-    """Two walks through corridors that look alike, a picture every few steps; nobody knows where they were taken."""
+    """Two walks through corridors that look alike, an image every few steps, without ground truth."""
     whole = open_sequence(DATA_DIR / "lookalike" / "images", camera=LOOKALIKE_CAMERA)
     return Edited("lookalike", whole.camera, shots(whole, range(len(whole))))
 
 
 def standing(name: str) -> Edited:
-    """The camera stands still before it goes."""
+    """The camera stands still before it moves."""
     whole = opened(name)
     return Edited(name, whole.camera, shots(whole, [0] * WAITING) + shots(whole, range(*STARTS[name])))
 

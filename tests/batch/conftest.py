@@ -18,7 +18,7 @@ SETTINGS = (
     "simulated.noise_px=0.5",  # else the search for a better camera goes on for long
     *("initialization.min_matches=40", "initialization.min_points=30", "initialization.provisional_frames=0"),
 )
-OPTIONS = ["--no-pictures", *(part for setting in SETTINGS for part in ("--set", setting))]
+OPTIONS = ["--no-plots", *(part for setting in SETTINGS for part in ("--set", setting))]
 ROOM = "synthetic:room?frames=10&blank=1"
 LIST = f"""sequence,name,overrides
 {ROOM},one,
@@ -67,4 +67,4 @@ def table(output: Path) -> list[dict[str, str]]:
 
 def task(output: Path, sequence: str = ROOM, **more: object) -> Task:
     row = Row("mine", sequence, overrides=SETTINGS, **more)  # type: ignore[arg-type]
-    return Task(row, str(output), pictures=False)
+    return Task(row, str(output), plots=False)

@@ -128,12 +128,12 @@ def test_what_failed_is_tried_again(whole: Path, tmp_path: Path) -> None:
 def test_other_settings_need_overwrite(tmp_path: Path) -> None:
     assert run_row(task(tmp_path).as_dict())["is_new"]
     before = content(tmp_path)
-    other = Task(Row("mine", ROOM, overrides=(*SETTINGS, "seed=9")), str(tmp_path), pictures=False)
+    other = Task(Row("mine", ROOM, overrides=(*SETTINGS, "seed=9")), str(tmp_path), plots=False)
     refused = run_row(other.as_dict())
     assert refused["status"] == "error"
     assert "--overwrite" in refused["error"]
     assert {name: content(tmp_path)[name] for name in before} == before
-    replaced = run_row(Task(other.row, str(tmp_path), overwrite=True, pictures=False).as_dict())
+    replaced = run_row(Task(other.row, str(tmp_path), overwrite=True, plots=False).as_dict())
     assert replaced["status"] == "done"
     assert "seed = 9" in (tmp_path / RUNS / "mine" / "config.toml").read_text()
     assert [path.name for path in (tmp_path / RUNS).iterdir()] == ["mine"]
@@ -143,8 +143,8 @@ def test_other_settings_need_overwrite(tmp_path: Path) -> None:
 def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / RUNS / "mine").mkdir(parents=True)
     (tmp_path / RUNS / "mine" / "thesis.tex").write_text("years of work")
-    refused = run_row(Task(task(tmp_path).row, str(tmp_path), overwrite=True, pictures=False).as_dict())
-    assert "something else" in refused["error"]
+    refused = run_row(Task(task(tmp_path).row, str(tmp_path), overwrite=True, plots=False).as_dict())
+    assert "not results of a batch" in refused["error"]
     assert (tmp_path / RUNS / "mine" / "thesis.tex").exists()
 
 
@@ -248,7 +248,7 @@ def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
     with pytest.raises(SystemExit, match=str(status)):
         batch(listed, tmp_path)
     assert signal.getsignal(number) is before
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "run the same command to continue" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / RUNS).iterdir()] == ["one"]
     assert not (tmp_path / ERRORS).exists()
 

@@ -73,11 +73,11 @@ def test_corrupt_images_are_counted(tmp_path: Path) -> None:
     (folder / "rgb" / "1.png").write_bytes(b"no image")
     fast = ("features.kind=opencv-orb", "features.num_keypoints=300")
     row = Row("mine", str(folder), overrides=fast)
-    columns = run_row(Task(row, str(tmp_path), pictures=False).as_dict())
+    columns = run_row(Task(row, str(tmp_path), plots=False).as_dict())
     assert (columns["status"], columns["frames"], columns["skipped"]) == ("no map", 3, 1)
     for image in (folder / "rgb").iterdir():
         image.write_bytes(b"no image")
-    columns = run_row(Task(row, str(tmp_path / "all"), pictures=False).as_dict())
+    columns = run_row(Task(row, str(tmp_path / "all"), plots=False).as_dict())
     assert columns["status"] in ("error", "no map")
     assert columns["error"]
 
@@ -89,7 +89,7 @@ def test_results_are_those_of_the_content_of_the_weights(
     monkeypatch.setattr("torchslam.batch.task._run", lambda todo, folder: {"status": "done"})
     weights = tmp_path / "a.safetensors"
     row = Row("mine", "synthetic:room", overrides=(f'{setting}="{weights}"',))
-    todo = Task(row, str(tmp_path / "batch"), pictures=False)
+    todo = Task(row, str(tmp_path / "batch"), plots=False)
     statuses = []
     for content in (None, b"first", b"first", b"other"):
         if content is not None:

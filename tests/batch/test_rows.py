@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from torchslam.batch import Row, Shard, named, parse_shard, read_list
-from torchslam.batch.rows import COLUMNS, LONGEST_NAME
+from torchslam.batch import Row, Shard, assign_names, parse_shard, read_list
+from torchslam.batch.rows import COLUMNS, MAX_NAME
 from torchslam.errors import ConfigError, SequenceError
 
 
@@ -63,16 +63,16 @@ def test_a_csv_file_has_a_column_for_everything(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("l.csv", "sequence,cemera\na,b\n", "l.csv:1: no column is called `cemera`; did you mean camera?"),
+        ("l.csv", "sequence,cemera\na,b\n", "l.csv:1: unknown column `cemera`; did you mean camera?"),
         ("l.csv", "name\na\n", "l.csv:1: the header must have"),
         ("l.csv", "sequence,sequence\na,b\n", "l.csv:1: the header must have"),
         ("l.csv", "sequence,limit\na\n", "l.csv:2: 1 cells under 2 columns"),
-        ("l.csv", "sequence,limit\na,0\n", "l.csv:2: limit must be a whole number from 1 on, not `0`"),
-        ("l.csv", "sequence,stride\na,1.5\n", "l.csv:2: stride must be a whole number"),
+        ("l.csv", "sequence,limit\na,0\n", "l.csv:2: limit must be a positive integer, not `0`"),
+        ("l.csv", "sequence,stride\na,1.5\n", "l.csv:2: stride must be a positive integer"),
         ("l.csv", "sequence,fps\na,inf\n", "l.csv:2: fps must be a positive number"),
         ("l.csv", "sequence,limit\n,3\n", "l.csv:2: no sequence"),
-        ("l.csv", "sequence,name\na,../b\n", "l.csv:2: name `../b`: a folder is called so"),
-        ("l.csv", f"sequence,name\na,{'b' * (LONGEST_NAME + 1)}\n", "l.csv:2: name"),
+        ("l.csv", "sequence,name\na,../b\n", "l.csv:2: name `../b`: it names a folder"),
+        ("l.csv", f"sequence,name\na,{'b' * (MAX_NAME + 1)}\n", "l.csv:2: name"),
         ("l.csv", "sequence,name\na,x\nb,X\n", "l.csv: 2 rows are named x"),
         ("l.csv", 'sequence\n"a\n', "l.csv:2: not CSV"),
         ("l.csv", "sequence\na\0b\n", "l.csv:2"),
@@ -98,7 +98,7 @@ def test_missing_lists_and_endless_ones(tmp_path: Path) -> None:
 
 
 def test_rows_without_a_name_get_one_that_no_other_has() -> None:
-    rows = named(
+    rows = assign_names(
         [Row("", "a/rgb"), Row("rgb-2", "b"), Row("", "c/RGB/"), Row("", "..."), Row("", "d/ä ö.mp4")]
     )
     assert [row.name for row in rows] == ["rgb", "rgb-2", "RGB-3", "sequence", "sequence-2"]
@@ -138,10 +138,10 @@ def test_shards(text: str, environment: dict[str, str], expected: Shard) -> None
     ("text", "environment", "message"),
     [
         ("3/3", {}, "shards count from 0/3 to 2/3"),
-        ("1", {}, "write it as i/n"),
-        ("-1/3", {}, "write it as i/n"),
-        ("0/0", {}, "write it as i/n"),
-        ("auto", {}, "no job of an array"),
+        ("1", {}, "expected i/n"),
+        ("-1/3", {}, "expected i/n"),
+        ("0/0", {}, "expected i/n"),
+        ("auto", {}, "not a job of an array"),
         ("auto", slurm(2, 0, 7, 3), "not evenly spaced"),
         ("auto", slurm(3, 0, 4, 3), "not evenly spaced"),
         ("auto", {"JOB_COMPLETION_INDEX": "3"}, "JOB_COMPLETIONS is not set"),

@@ -12,10 +12,10 @@ import torch
 from tests.cli.test_cli import FAST, write_tum_folder
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
+from torchslam.data.calibration import check_replaceable, write_calibration
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.calibration_file import check_replaceable, write_calibration
 
 FRAMES = 14
 
@@ -71,7 +71,7 @@ def test_a_calibration_that_is_not_ours_stays(
 ) -> None:
     (tmp_path / "calibration.txt").write_text("1 1 1 1\n")
     assert main(["run", str(folder), "-o", str(tmp_path), "--camera", "auto", *FAST]) == 2
-    assert "not of an earlier run" in capsys.readouterr().err
+    assert "not written by torchslam" in capsys.readouterr().err
     assert (tmp_path / "calibration.txt").read_text() == "1 1 1 1\n"
 
 
@@ -107,5 +107,5 @@ def test_the_file_is_read_as_it_was_written(camera: Camera, tmp_path: Path) -> N
     assert "# focal length 1.5 ± 0.1 px\n" in path.read_text(encoding="utf-8")
     check_replaceable(path)
     path.write_text("1 1 1 1\n")
-    with pytest.raises(ResultsError, match="is not replaced"):
+    with pytest.raises(ResultsError, match="not replaced, since"):
         check_replaceable(path)

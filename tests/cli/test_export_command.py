@@ -148,7 +148,7 @@ def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.Capture
     assert export(copy, "colmap", tmp_path / "a") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "moved.mp4: does not exist; --sequence says where it is now" in error
+    assert "moved.mp4: does not exist; use --sequence for its new location" in error
     assert not (tmp_path / "a").exists()
     assert export(copy, "colmap", tmp_path / "a", "--sequence", ROOM) == 0
     assert export(copy, "colmap", tmp_path / "b", "--no-images") == 0

@@ -15,7 +15,7 @@ from torchslam.cli.main import main
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.given_poses import read_poses
-from torchslam.data.formats.trajectory_file import write_trajectory
+from torchslam.data.trajectories import write_trajectory
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import opengl, quaternion_wxyz
 from torchslam.io.export.nerfstudio import nerfstudio_camera
@@ -126,7 +126,12 @@ def test_what_users_get_wrong(
 ) -> None:
     poses, output = write("tum", given, tmp_path), str(tmp_path / "results")
     cases = {
-        "--refine-distortion: --fix-camera": ["--poses", str(poses), "--fix-camera", "--refine-distortion"],
+        "--refine-distortion cannot be combined with --fix-camera": [
+            "--poses",
+            str(poses),
+            "--fix-camera",
+            "--refine-distortion",
+        ],
         "nothing.txt: cannot be read": ["--poses", str(tmp_path / "nothing.txt")],
         "neither images.bin": ["--poses", str(tmp_path)],
     }
@@ -153,5 +158,5 @@ def test_images_that_make_no_map(folder: Path, given: Tensor, tmp_path: Path) ->
         str(tmp_path / "results"),
     ]
     assert main([*arguments, *FAST]) == 3
-    assert "too few" in json.loads((tmp_path / "results" / "metrics.json").read_text())["failure"]
+    assert "not enough" in json.loads((tmp_path / "results" / "metrics.json").read_text())["failure"]
     assert not (tmp_path / "results" / "refined").exists()

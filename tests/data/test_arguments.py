@@ -43,7 +43,7 @@ def test_info_without_a_camera(
     status, rows, errors = info(capsys, str(tmp_path), "--fps", "10")
     assert (status, rows["camera"]) == (0, "missing; estimated from the images unless --camera is given")
     assert rows["rate"] == "10.00 Hz over 0.20 s"
-    assert "left out what are no frames: 3 hidden files" in errors
+    assert "ignored: 3 hidden files" in errors
     assert (
         main(["run", str(tmp_path), "-o", str(tmp_path / "results")]) == 3
     )  # the intrinsics cannot be estimated from these images

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import torch
 from hypothesis import given
 
-from torchslam.data.association import interpolate_poses, nearest
+from torchslam.data.trajectories import interpolate_poses, nearest
 from torchslam.geometry.lie import se3_exp
 from torchslam.types import Trajectory
 

@@ -45,7 +45,7 @@ def test_what_is_no_frame_is_left_out_with_a_word(tmp_path: Path, write_picture:
     sequence = open_sequence(tmp_path, CAMERA)
     assert names(sequence) == ["0000.png", "0001.png"]
     (note,) = sequence.notes
-    assert note.startswith("left out what are no frames: ")
+    assert note.startswith("ignored: ")
     assert {"2 hidden files", "2 depth images", "1 masks"} == set(note.partition(": ")[2].split(", "))
 
 

@@ -14,9 +14,8 @@ from torchslam.data import open_sequence
 from torchslam.data.synthetic.building import QUARTER_TURN, corridors, rooms
 from torchslam.data.synthetic.paths import OUTWARD
 from torchslam.data.synthetic.renderer import Renderer
-from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle, wall
+from torchslam.data.synthetic.scene import COVERAGE, MIP_LEVELS, Rectangle, surface, wall
 from torchslam.data.synthetic.storey import PLAIN, storey
-from torchslam.data.synthetic.textures import COVERAGE, surface
 from torchslam.errors import SequenceError
 
 Build = Callable[[int], list[Rectangle]]

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from experiments.benchmarks.slam import run, stages
-from torchslam.io.frames_file import write_frames
+from torchslam.io.results import write_frames
 from torchslam.types import State, StepResult
 
-OURS = ["ours", "ours, one process", "ours, fast", "ours, fast, one process"]
+OURS = ["ours", "ours, one process"]
 
 
 def test_the_time_of_all_processes_counts() -> None:
@@ -26,7 +26,7 @@ def test_the_time_of_all_processes_counts() -> None:
 
 
 def test_rows_are_medians_of_their_runs() -> None:
-    first = run.Figures(160, 10.0, 50.0, 20.0, 40.0, 0.1, 160)
+    first = run.Metrics(160, 10.0, 50.0, 20.0, 40.0, 0.1, 160)
     runs = [first, replace(first, median=30.0, ate=0.3, posed=150), replace(first, median=12.0, ate=None)]
     cells = run.row(run.RECORDINGS[1], "ours", runs)
     assert cells == ["kitti07, 160", "ours", "12.0", "50", "20.0", "40", "0.2000", "160 of 160"]

@@ -15,7 +15,7 @@ from torchslam import SLAM, load_config
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.scene import scene_of
-from torchslam.io.report import metrics
+from torchslam.io.report import run_metrics
 from torchslam.io.results import write_results
 from torchslam.system.checkpoint import write_checkpoint
 from torchslam.system.run import RunProgress, run_sequence
@@ -49,7 +49,7 @@ def sample_files() -> dict[str, Files]:
         run = run_sequence(slam, WALK, settled, so_far)
         assert run.main is not None
         assert (root / "checkpoint").exists()
-        write_results(run, WALK, metrics(run) | {"source": "walk", "camera": ""}, root / "results")
+        write_results(run, WALK, run_metrics(run) | {"source": "walk", "camera": ""}, root / "results")
         (root / "graph").mkdir()
         run.graph.save(root / "graph" / "graph.safetensors")
         scene = scene_of(run.main, run.camera, 0, keyframes_alone=False)

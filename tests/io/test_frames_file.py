@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from torchslam.errors import ResultsError
-from torchslam.io.frames_file import read_frames, write_frames
+from torchslam.io.results import read_frames, write_frames
 from torchslam.types import State, StepResult
 
 

@@ -8,14 +8,15 @@ import torch
 
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
-from torchslam.io.report import metrics, quality, result_warnings, summary, table
+from torchslam.io.report import quality, result_warnings, run_metrics, summary
 from torchslam.map.atlas import Submap
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory
+from torchslam.utils.console import table
 
 
 def test_counts(run: Run) -> None:
-    figures = metrics(run)
+    figures = run_metrics(run)
     assert figures["frames"] == 31
     assert figures["posed"] == 23
     assert figures["lost"] == 4
@@ -39,7 +40,7 @@ def test_quality(run: Run) -> None:
     found = quality(run)
     assert found["reprojection_px"] == pytest.approx(expected)
     assert found["track_length"] == pytest.approx(float(seen[seen > 0].double().mean()))
-    figures = metrics(run)
+    figures = run_metrics(run)
     assert figures["uncertain"] == 0
     assert summary(figures)["quality"] == (
         f"{expected:.2f} px mean reprojection error, points seen in {found['track_length']:.1f} frames, "
@@ -54,7 +55,7 @@ def test_quality(run: Run) -> None:
     ("keyframes", "posed", "said"), [(12, 23, True), (11, 23, False), (9, 9, False), (5, 10, True)]
 )
 def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: int, said: bool) -> None:
-    found = result_warnings(metrics(run) | {"keyframes": keyframes, "posed": posed})
+    found = result_warnings(run_metrics(run) | {"keyframes": keyframes, "posed": posed})
     assert [text.partition(":")[0] for text in found] == [
         f"{keyframes} of {posed} posed frames are keyframes"
     ] * said
@@ -78,7 +79,7 @@ def test_counts_of_several_worlds_and_sessions(run: Run, submap: Submap) -> None
         )
         for result in run.results
     ]
-    figures = metrics(replace(run, submaps=(submap, other), results=results))
+    figures = run_metrics(replace(run, submaps=(submap, other), results=results))
     assert figures["submap"] == 0  # most frames of this session, not of all
     assert [counts["posed"] for counts in figures["submaps"]] == [23, 8]
     assert [counts["uncertain"] for counts in figures["submaps"]] == [5, 0]
@@ -86,13 +87,13 @@ def test_counts_of_several_worlds_and_sessions(run: Run, submap: Submap) -> None
     words = summary(figures)
     assert words["submap"] == "0, the main one of 2; submap 3: 8 frames posed, 1 keyframes"
     assert words["lost"] == "4 frames; 5 had an uncertain pose"
-    again = metrics(replace(run, submaps=(submap, other), results=results, session=1))
+    again = run_metrics(replace(run, submaps=(submap, other), results=results, session=1))
     assert again["submap"] == 3
     assert summary(again)["session"] == "1, which made 0 of the keyframes"
 
 
 def test_times(run: Run) -> None:
-    figures = metrics(run)
+    figures = run_metrics(run)
     totals = torch.tensor([result.stage_ms["total"] for result in run.results], dtype=torch.float64)
     assert figures["ms_median"] == pytest.approx(float(totals.quantile(0.5)))
     assert figures["ms_p95"] == pytest.approx(float(totals.quantile(0.95)))
@@ -103,20 +104,20 @@ def test_times(run: Run) -> None:
 
 def test_a_map_that_was_given_up_does_not_count_as_the_start(run: Run) -> None:
     given_up = [replace(run.results[0], state=State.TRACKING), *run.results[1:]]
-    assert metrics(replace(run, results=given_up))["initialized_at"] == 3
+    assert run_metrics(replace(run, results=given_up))["initialized_at"] == 3
 
 
 def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
     doubled = trajectory.T_wc.clone()
     doubled[:, :3, 3] *= 2
-    figures = metrics(run, evaluate(run.trajectory, Trajectory(trajectory.timestamps, doubled)))
+    figures = run_metrics(run, evaluate(run.trajectory, Trajectory(trajectory.timestamps, doubled)))
     assert figures["ate_m"] == pytest.approx(0.0, abs=1e-9)
     assert figures["scale"] == pytest.approx(2.0)
     assert figures["ate_se3_m"] > 0.1
     assert figures["path_length_m"] > 0
     assert "online_ate_m" not in figures
     truth = Trajectory(trajectory.timestamps, doubled)
-    both = metrics(run, evaluate(run.trajectory, truth), 1e-12)
+    both = run_metrics(run, evaluate(run.trajectory, truth), 1e-12)
     assert both == figures | {"online_ate_m": pytest.approx(0.0, abs=1e-9)}
     assert "online ATE" in summary(both)
     assert {"translation_m", "rotation_deg"} <= figures["rpe"].keys()
@@ -125,7 +126,7 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
     for part in (
         "31, 1 of them unreadable",
         "23 (74.2%)",
-        "85.2% since the start at frame 3",
+        "85.2% since initialization at frame 3",
         "2.0000 true meters",
     ):
         assert part in words
@@ -138,7 +139,7 @@ def test_a_run_without_a_map(run: Run) -> None:
         results=run.results[:3],
         failure="no map was initialized in 3 frames: the camera does not move",
     )
-    figures = metrics(failed)
+    figures = run_metrics(failed)
     assert figures["initialized_at"] is None
     assert figures["posed"] == figures["points"] == figures["keyframes"] == 0
     assert figures["failure"].endswith("the camera does not move")
@@ -146,6 +147,6 @@ def test_a_run_without_a_map(run: Run) -> None:
 
 
 def test_no_frames_at_all(run: Run) -> None:
-    figures = metrics(replace(run, results=[], skipped=[], failure="the sequence has no frames"))
+    figures = run_metrics(replace(run, results=[], skipped=[], failure="the sequence has no frames"))
     assert figures["fps"] == figures["ms_median"] == 0.0
     assert figures["stage_ms"] == {}

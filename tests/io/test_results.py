@@ -11,7 +11,7 @@ from tests.walks import Walk, arc
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
 from torchslam.io.pictures import draw
-from torchslam.io.report import metrics
+from torchslam.io.report import run_metrics
 from torchslam.io.results import read_results, results_in, write_results
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
@@ -23,7 +23,7 @@ WALK = Walk(arc(30))
 
 
 def write(run: Run, directory: Path) -> None:
-    write_results(run, WALK, metrics(run), directory)
+    write_results(run, WALK, run_metrics(run), directory)
 
 
 @pytest.fixture
@@ -64,17 +64,17 @@ def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
     """Frames 3 to 9 given in submap 5, 10 to 17 in 4; those became submap 0. Submap 7, of 22 to 24, is another one."""
     submaps = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
     results = [replace(one, submap=submaps.get(one.index, one.submap)) for one in run.results]
-    recalls = (
+    loop_closures = (
         LoopClosureRecord(30, 9, 5, 4),
         LoopClosureRecord(40, 30, 0, 0),
         LoopClosureRecord(41, 20, 4, 0),
         LoopClosureRecord(42, 2, 7, 6),
     )
-    joined = replace(run, results=results, recalls=recalls)
+    joined = replace(run, results=results, loop_closures=loop_closures)
     assert len(joined.online) == 5
     assert [len(part) for part in joined.online_parts] == [5, 8, 7]
     assert joined.online_parts[2].timestamps[0] == run.results[3].timestamp
-    assert [len(part) for part in replace(joined, recalls=()).online_parts] == [5]
+    assert [len(part) for part in replace(joined, loop_closures=()).online_parts] == [5]
     assert replace(joined, submaps=()).online_parts == []
 
 
@@ -148,5 +148,5 @@ def test_other_figures_are_refused(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
     for content in ("[]", '{"frames": 3}'):
         (tmp_path / "metrics.json").write_text(content)
-        with pytest.raises(ResultsError, match=r"metrics\.json: not the figures of a run: .*submap"):
+        with pytest.raises(ResultsError, match=r"metrics\.json: not the metrics of a run: .*submap"):
             read_results(tmp_path)

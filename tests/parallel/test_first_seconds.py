@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from torchslam.cli import arguments
-from torchslam.data.presets import PRESETS
+from torchslam.data.calibration import PRESETS
 
 HEAVY = ("torch", "numpy", "kornia", "cv2", "matplotlib", "torchslam.system.slam", "torchslam.system.run")
 CODE = f"""

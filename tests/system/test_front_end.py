@@ -12,7 +12,7 @@ from torchslam import SLAM
 from torchslam.config import Config, FeaturesConfig
 from torchslam.config.schema import enlarged
 from torchslam.data import open_sequence
-from torchslam.data.formats.transforms import resize
+from torchslam.data.transforms import resize
 from torchslam.features import match
 from torchslam.system.front_end import image_extractor
 from torchslam.system.run import Run
@@ -96,10 +96,12 @@ def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
     slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
     told = Config().for_size((1280, 960))
     assert slam.config == Config()
-    initializer = slam._states.beginning.initializer
-    assert all(one.config == told for one in (slam.mapper, slam.memory, slam.foreign, initializer))
+    initializer = slam._state_machine.initialization.initializer
+    assert all(
+        one.config == told for one in (slam.mapper, slam.loop_closer, slam.non_static_filter, initializer)
+    )
     assert slam.tracker.settings == told.tracking
-    assert slam.foreign.stillness.evidence.shape == (121, 161)
+    assert slam.non_static_filter.static_overlay.evidence.shape == (121, 161)
 
 
 def run(size: str) -> Run:

@@ -26,15 +26,15 @@ from torchslam.cli import arguments
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
-from torchslam.io.frames_file import read_frames
+from torchslam.io.results import read_frames
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.map.atlas import TrackingState
 from torchslam.map.file import read_atlas, read_tensors, write_atlas, write_tensors
-from torchslam.map.tracking_state import TrackingState
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.run import RunProgress, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
-# A system is settled once its world is no longer to be taken back. Without any noise, what a run says of its camera
+# A system is settled once its submap is no longer to be taken back. Without any noise, what a run says of its camera
 # would be looked for to the last bit, in hundreds of iterations.
 SETTINGS += ["initialization.provisional_frames=8", "simulated.noise_px=0.05"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
@@ -66,8 +66,8 @@ def half(config: Config = CONFIG) -> tuple[SLAM, RunProgress]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
-    slam.foreign.stillness.evidence[3, 4] = 1  # too little to matter
-    slam.memory.recalls.append(LoopClosureRecord(15, 3, 0, 0))
+    slam.non_static_filter.static_overlay.evidence[3, 4] = 1  # too little to matter
+    slam.loop_closer.loop_closures.append(LoopClosureRecord(15, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
 
@@ -90,17 +90,20 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert resumed.last_frame == slam.last_frame
     assert resumed.session.number == 0
     assert resumed.can_checkpoint
-    assert resumed.world is not None
-    assert slam.world is not None
-    assert torch.equal(resumed.world.T_cw, slam.world.T_cw)
+    assert resumed.submap is not None
+    assert slam.submap is not None
+    assert torch.equal(resumed.submap.T_cw, slam.submap.T_cw)
     assert resumed.state is State.TRACKING
-    assert resumed.memory.recalls == [LoopClosureRecord(15, 3, 0, 0)]
+    assert resumed.loop_closer.loop_closures == [LoopClosureRecord(15, 3, 0, 0)]
     for column in fields(TrackingState):
-        before, after = getattr(slam.world.track, column.name), getattr(resumed.world.track, column.name)
+        before, after = (
+            getattr(slam.submap.tracking, column.name),
+            getattr(resumed.submap.tracking, column.name),
+        )
         assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
             column.name
         )
-    assert torch.nonzero(resumed.foreign.stillness.evidence).tolist() == [[3, 4]]
+    assert torch.nonzero(resumed.non_static_filter.static_overlay.evidence).tolist() == [[3, 4]]
 
 
 def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:
@@ -108,7 +111,7 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
     resumed = run_sequence(slam, WALK, None, so_far)
     for name, run in (("whole", whole), ("resumed", resumed)):
-        write_atlas(tmp_path / name, run.worlds, run.camera, run.sessions)
+        write_atlas(tmp_path / name, run.submaps, run.camera, run.sessions)
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
     assert [result.index for result in resumed.results] == list(range(FRAMES))
     assert torch.equal(resumed.trajectory.T_wc, whole.trajectory.T_wc)
@@ -124,16 +127,16 @@ def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, wind
     slam, so_far = SLAM(WALK.camera, config), RunProgress()
 
     def cut(result: StepResult) -> None:
-        if slam.can_checkpoint and slam.mapper.adjusting:
+        if slam.can_checkpoint and slam.mapper.adjustment.is_pending:
             raise PowerCut
 
     with pytest.raises(PowerCut):
         run_sequence(slam, WALK, cut, so_far)
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
     resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, config)
-    assert resumed.mapper.adjusting
-    assert resumed.mapper.adjusting.due == slam.mapper.adjusting.due
-    assert resumed.mapper.adjusting.due_before_next_frame is (window == 1000)
+    assert resumed.mapper.adjustment.is_pending
+    assert resumed.mapper.adjustment.due == slam.mapper.adjustment.due
+    assert resumed.mapper.adjustment.is_due_before_next_frame is (window == 1000)
     run = run_sequence(resumed, WALK, None, loaded)
     assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
     assert torch.equal(run.online.T_wc, whole.online.T_wc)
@@ -162,12 +165,12 @@ def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: P
 
 DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
     (lambda run, tensors: run.pop("next"), "'next'"),
-    (lambda run, tensors: run.update(world=5), "not enough values"),
-    (lambda run, tensors: run["track"].update(reference=1000), "names rows beyond"),
+    (lambda run, tensors: run.update(submap=5), "not enough values"),
+    (lambda run, tensors: run["tracking"].update(reference=1000), "names rows beyond"),
     (lambda run, tensors: run.update(last_frame=[3]), "not enough values"),
     (lambda run, tensors: run["reasons"].pop(), "out of range"),
     (lambda run, tensors: tensors.pop("run.T_cw"), r"run\.T_cw"),
-    (lambda run, tensors: tensors.pop("run.track.seen_last"), "seen_last"),
+    (lambda run, tensors: tensors.pop("run.tracking.last_inlier_points"), "last_inlier_points"),
     (lambda run, tensors: tensors.update({"run.evidence": torch.zeros(3)}), "evidence|size"),
 ]
 
@@ -233,12 +236,12 @@ def test_a_power_cut_loses_nothing_before_the_last_checkpoint(
         command(folder, "--checkpoint", "2")
     assert [path.name for path in folder.iterdir()] == ["checkpoint.safetensors"]
     assert command(folder) == 2  # neither resumed nor given up
-    assert "--resume goes on with it" in capsys.readouterr().err
+    assert "--resume continues it" in capsys.readouterr().err
     cut.do = staticmethod(lambda: None)
     assert command(folder, "--resume", "--set", "seed=3") == 2
     assert "another configuration" in capsys.readouterr().err
     assert command(folder, "--resume") == 0
-    assert "going on at frame" in capsys.readouterr().err
+    assert "resuming at frame" in capsys.readouterr().err
     assert not (folder / "checkpoint.safetensors").exists()
     assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
     assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
@@ -256,7 +259,7 @@ def test_checkpoints_can_be_left_out(
     assert list(tmp_path.iterdir()) == []
     cut.do = staticmethod(lambda: None)
     assert command(tmp_path, "--resume", "--checkpoint", "0") == 0
-    assert "no checkpoint to resume: beginning with the first frame" in capsys.readouterr().err
+    assert "no checkpoint to resume from; starting with the first frame" in capsys.readouterr().err
     assert len(read_frames(tmp_path / "frames.csv")) == FRAMES
 
 
@@ -349,7 +352,7 @@ def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch:
 
     taken: list[int] = []
     slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, can_checkpoint=True)
-    state.worlds = [SimpleNamespace(map=slam_map)]
+    state.atlas = [SimpleNamespace(map=slam_map)]
     monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
     checkpoints = folder.Checkpoints(tmp_path, 10, state, RunProgress(), WALK)  # type: ignore[arg-type]
     for count in range(1, 1001):
@@ -375,9 +378,9 @@ def test_a_saved_map_is_gone_on_in_and_localised_in(
     assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration beside the map
     assert "session" in capsys.readouterr().out
     grown = read_atlas(tmp_path / "second" / "map.safetensors")
-    (world,) = grown.worlds
+    (submap,) = grown.submaps
     assert grown.sessions == 2
-    assert len(world.trajectory(0)) == len(world.trajectory(1)) == FRAMES
+    assert len(submap.trajectory(0)) == len(submap.trajectory(1)) == FRAMES
     assert len(read_trajectory(tmp_path / "second" / "trajectory.txt")) == FRAMES
     assert json.loads((tmp_path / "second" / "metrics.json").read_text())["ate_m"] < 1e-3
     file = str(tmp_path / "first" / "map.safetensors")
@@ -397,13 +400,13 @@ def test_maps_that_cannot_be_gone_on_in(
     other = WALK.camera.with_params(WALK.camera.params + 1)
     write_atlas(tmp_path / "map", [], other)
     assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 2
-    assert "made with the camera pinhole 401,401,160.5,120.5 of 320 x 240" in capsys.readouterr().err
+    assert "built with the camera pinhole 401,401,160.5,120.5 of 320 x 240" in capsys.readouterr().err
     assert command(tmp_path / "out", "--map", str(tmp_path / "nowhere")) == 2
     assert "nowhere: no map file" in capsys.readouterr().err
     assert command(tmp_path / "out", "--map", str(tmp_path / "map"), "--localize") == 2
-    assert "no world in it to localise in" in capsys.readouterr().err
+    assert "no submap in it to localize in" in capsys.readouterr().err
     assert command(tmp_path / "out", "--localize") == 2
-    assert "--localize needs a --map" in capsys.readouterr().err
+    assert "--localize requires --map" in capsys.readouterr().err
 
 
 def test_the_camera_of_a_map_is_known_to_as_many_digits_as_a_calibration_file_has(
@@ -454,7 +457,7 @@ def test_a_killed_process_is_gone_on_with(tmp_path: Path) -> None:
     again = [sys.executable, "-c", CHILD, "0", *line, "--resume"]
     done = subprocess.run(again, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "going on at frame" in done.stderr
+    assert "resuming at frame" in done.stderr
     assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
     assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
     assert not (folder / "checkpoint.safetensors").exists()

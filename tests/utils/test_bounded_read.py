@@ -15,7 +15,7 @@ from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_gray
 from torchslam.errors import LONGEST, TorchslamError
 from torchslam.features.learned import XFeat
-from torchslam.io.frames_file import read_frames
+from torchslam.io.results import read_frames
 from torchslam.map.file import read_atlas
 from torchslam.utils.bounded_read import check_regular, parse_json, read_bytes, read_text
 
@@ -62,7 +62,7 @@ def test_limits(tmp_path: Path) -> None:
         assert caught.value.errno == errno.EFBIG
         with pytest.raises(OSError, match="Is a directory"):
             read(tmp_path, 9, "a text")
-        with pytest.raises(OSError, match="a name with a NUL in it"):
+        with pytest.raises(OSError, match="file name contains a NUL character"):
             read(tmp_path / "a\0", 9, "a text")
 
 

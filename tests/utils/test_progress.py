@@ -6,8 +6,8 @@ import sys
 import pytest
 from tqdm import tqdm
 
-from torchslam.utils import progress as progress_line
-from torchslam.utils.progress import stream
+from torchslam.utils import console as progress_line
+from torchslam.utils.console import tqdm_options
 
 
 class Terminal(io.StringIO):
@@ -17,7 +17,7 @@ class Terminal(io.StringIO):
 
 def shown(monkeypatch: pytest.MonkeyPatch, file: io.StringIO) -> str:
     monkeypatch.setattr(sys, "stderr", file)
-    with tqdm(total=50, **stream()) as bar:
+    with tqdm(total=50, **tqdm_options()) as bar:
         for _ in range(50):
             bar.update()
     return file.getvalue()

@@ -1,6 +1,6 @@
-"""Many sequences: each run once, in whatever process, with one table and the same bytes however many workers there are.
+"""Run many sequences with one table of results; the bytes do not depend on the number of workers.
 
-read_list(path) -> rows; run_batch(tasks, output, engine) -> columns; what a worker does is run_row(task) -> columns.
+read_list(path) -> rows; run_batch(tasks, engine) -> columns; each worker calls run_row(task) -> columns.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchslam.batch.engines import ENGINES, RETRIES, Engine, Shard, parse_shard
 from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, store_failure
-from torchslam.batch.rows import Row, named, read_list
+from torchslam.batch.rows import Row, assign_names, read_list
 from torchslam.batch.table import write_table
 from torchslam.batch.task import Task, configuration, run_row
 
@@ -25,7 +25,7 @@ __all__ = [
     "Row",
     "Shard",
     "Task",
-    "named",
+    "assign_names",
     "parse_shard",
     "read_list",
     "run_batch",
@@ -33,8 +33,8 @@ __all__ = [
     "write_table",
 ]
 LOST = (
-    f"the process that ran it died, {RETRIES + 1} times, or could not begin: "
-    "too little memory, or no torchslam where it ran"
+    f"its process died {RETRIES + 1} times, or could not start: "
+    "not enough memory, or torchslam is not installed where it ran"
 )
 
 
@@ -44,11 +44,20 @@ def run_batch(
     shard: Shard | None = None,
     on_progress: Callable[[Columns], None] = lambda columns: None,
 ) -> list[Columns]:
-    """Run those of the tasks that are of the shard and not done yet, and write the table of all of them.
+    """Run the unfinished tasks of a shard, and write the table of all tasks.
 
-    tasks: with the same `output`; told: the columns of each task of the shard when it is done
-    Returns the columns of the shard's tasks in the order of the tasks, `is_new` whether they were run now.
-    Raises ConfigError for an engine that is not there, OSError where the table cannot be written.
+    Args:
+        tasks: All with the same `output`.
+        engine: In this process if None.
+        shard: All tasks if None.
+        on_progress: Receives the columns of each finished task of the shard.
+
+    Returns:
+        The columns of the shard's tasks in the order of the tasks; `is_new` says whether they were run now.
+
+    Raises:
+        ConfigError: The engine is not available.
+        OSError: The table cannot be written.
     """
     engine, shard = engine or Engine(), shard or Shard()
     mine = tasks[shard.index :: shard.count]

@@ -18,14 +18,21 @@ Columns = dict[str, Any]
 Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
 RETRIES = 2
-"""Of a row whose worker died, of too little memory perhaps; Ray would try for ever."""
+"""Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
 STORE_BYTES = 100 << 20
-"""Of a local cluster's store of objects: rows are small, images do not pass through it."""
+"""Size of a local cluster's object store: rows are small, and images do not pass through it."""
 
 
 @dataclass(frozen=True)
 class Engine:
-    """kind: of `ENGINES`; workers, address: of Ray, see `ray_data`; gpus: that each worker needs"""
+    """Where tasks run.
+
+    Attributes:
+        kind: One of `ENGINES`.
+        workers: Of Ray, see `ray_data`.
+        address: Of Ray, see `ray_data`.
+        gpus: Needed by each worker.
+    """
 
     kind: str = ENGINES[0]
     workers: int | None = None
@@ -39,11 +46,14 @@ class Engine:
             raise ConfigError("--workers and --address need --engine ray")
 
     def each(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
-        """The numbers of the rows with what the function made of them, as they are done.
+        """Yield the index of each row with its result as they finish; None if the process died or could not start.
 
-        work: a function of a module; rows and what is made of them are what JSON can say. None where the process that
-        had the row died, as of too little memory, or could not begin.
-        Raises ConfigError where Ray is not installed or not found at the address.
+        Args:
+            work: A function of a module; rows and results must be JSON values.
+            rows: Its arguments.
+
+        Raises:
+            ConfigError: Ray is not installed, or not found at the address.
         """
         rows = list(rows)
         if self.kind == "ray":
@@ -56,24 +66,22 @@ class Engine:
 def ray_data(
     work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
 ) -> Iterator[tuple[int, Columns | None]]:
-    """As `Engine.each`, by tasks of one row and one processor each.
+    """Run `Engine.each` as Ray tasks of one row and one processor each.
 
-    workers: at most so many at a time; None: as many as there are processors
-    address: of a cluster (`auto`, `ray://HOST:10001`), on whose nodes this package is installed and the files are at
-             the same places; None: one of this machine, for as long as this takes
+    workers: maximum number at a time; None: the number of processors
+    address: of a cluster (`auto`, `ray://HOST:10001`), whose nodes have this package and the files at the same paths;
+             None: a temporary cluster of this machine
     """
     ray, data = _import_ray()
     _start(ray, workers, address)
     try:
         context = data.DataContext.get_current()
         context.enable_progress_bars, context.max_errored_blocks = False, -1
-        # As text: Arrow would have a type for a column of None and another one for the next block.
+        # As text: Arrow would infer different types for blocks whose columns are None.
         items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
         left = set(range(len(rows)))
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # max_retries is to go in Ray 2.64, and nothing is to take its place
+            warnings.simplefilter("ignore")  # max_retries is deprecated in Ray 2.64, without a replacement
             done = data.from_items(items, override_num_blocks=len(items)).map(
                 _through_text(work),
                 num_cpus=1,
@@ -98,9 +106,7 @@ def _through_text(work: Work) -> Callable[[Columns], Columns]:
 
 
 def _import_ray() -> tuple[Any, Any]:
-    os.environ.setdefault(
-        "RAY_USAGE_STATS_ENABLED", "0"
-    )  # else it tells its makers of each cluster it starts
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
     try:
         return importlib.import_module("ray"), importlib.import_module("ray.data")
     except ImportError as error:
@@ -108,7 +114,7 @@ def _import_ray() -> tuple[Any, Any]:
 
 
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
-    logging.getLogger("ray.data").setLevel(logging.ERROR)  # says why a worker died, or could not begin
+    logging.getLogger("ray.data").setLevel(logging.ERROR)  # reports why a worker died or did not start
     options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address is None:
         options |= {
@@ -121,7 +127,7 @@ def _start(ray: Any, workers: int | None, address: str | None) -> None:
         options["address"] = address
     try:
         ray.init(**options)
-    except Exception as error:  # Ray raises what it likes
+    except Exception as error:  # Ray raises various types
         line = " ".join(str(error).split())[:500]
         where = (
             "the Ray cluster of this machine did not start"
@@ -150,21 +156,21 @@ class Shard:
 
 
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
-    """`i/n` with i from 0 to n - 1; `auto`: of a Slurm array or a Kubernetes indexed job.
+    """Parse `i/n` with i from 0 to n - 1, or `auto`, the index of a Slurm array or a Kubernetes indexed job.
 
-    Raises ConfigError for anything else, and where the environment does not say it.
+    Raises ConfigError for anything else, and if the environment lacks the index.
     """
     if text == AUTO:
         return _of_system(environment)
     index, _, count = text.partition("/")
     numbers = parse_count(index), parse_count(count)
     if numbers[0] is None or not numbers[1]:
-        raise ConfigError(f"--shard {text[:100]}: write it as i/n, the first of three is 0/3; or auto")
+        raise ConfigError(f"--shard {text[:100]}: expected i/n, the first of three is 0/3; or auto")
     return Shard(numbers[0], numbers[1])
 
 
 def _of_system(environment: Mapping[str, str]) -> Shard:
-    """SLURM_ARRAY_TASK_ID, whatever numbers the array has; or JOB_COMPLETION_INDEX, of JOB_COMPLETIONS."""
+    """The shard of SLURM_ARRAY_TASK_ID in its array, or of JOB_COMPLETION_INDEX in JOB_COMPLETIONS."""
 
     def number(name: str) -> int:
         found = parse_count(environment.get(name, ""))
@@ -180,8 +186,8 @@ def _of_system(environment: Mapping[str, str]) -> Shard:
             raise ConfigError(f"--shard auto: the {count} tasks from {first} to {last} are not evenly spaced")
         return Shard((mine - first) // step, count)
     if "JOB_COMPLETION_INDEX" in environment:
-        # Kubernetes does not tell a container how many there are.
+        # Kubernetes does not set the number of completions itself.
         return Shard(number("JOB_COMPLETION_INDEX"), number("JOB_COMPLETIONS"))
     raise ConfigError(
-        "--shard auto: neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX is set: this is no job of an array"
+        "--shard auto: neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX is set: not a job of an array"
     )

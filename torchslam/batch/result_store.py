@@ -30,7 +30,7 @@ DONE = "done"
 NO_MAP = "no map"
 ERROR = "error"
 OPEN = "open"
-"""The status of a row: with a map, without one and why, not run because of an error, not yet run."""
+"""The status of a row: with a map, without a map, failed with an error, not yet run."""
 Columns = dict[str, Any]
 
 
@@ -41,15 +41,20 @@ def run_or_reuse(
     work: Callable[[Path], Columns],
     overwrite: bool = False,
 ) -> Columns:
-    """Do the work unless its results are there; returns its columns, with `is_new` whether it was done now.
+    """Do the work unless its results exist already.
 
-    marks:     hashes of what the results depend on, `configuration` and `input`
-    work:      writes into a folder, which is given its place when all is written, and returns columns as JSON has them
-    overwrite: replace results that have other marks; otherwise they are an error
+    It raises no Exception: errors become the columns `status` and `error` and a file in `errors/`, with a traceback if
+    unexpected; the next call tries again. KeyboardInterrupt and SystemExit pass and leave nothing behind.
 
-    No Exception leaves it: it becomes the columns `status` and `error`, and is kept in `errors/`, with its traceback
-    where nobody raised it on purpose. What failed is tried again by the next call. KeyboardInterrupt and SystemExit
-    pass, and leave nothing.
+    Args:
+        output: Folder of the batch.
+        name: Of the row.
+        fingerprints_of: Returns the hashes that the results depend on, `configuration` and `input`.
+        work: Writes into a temporary folder, which is moved into place when complete, and returns JSON columns.
+        overwrite: Replace results with other fingerprints; otherwise they are an error.
+
+    Returns:
+        The columns, with `is_new` for whether the work was done now.
     """
     known: Columns = {"name": name, "configuration": ""}
     place = output / RUNS / name
@@ -59,11 +64,11 @@ def run_or_reuse(
         if record is not None and all(record.get(key) == value for key, value in known.items()):
             return record | {"is_new": False}
         if record is None and place.exists():
-            raise ResultsError(f"{place}: something else than results of a batch: move it away")
+            raise ResultsError(f"{place}: not results of a batch: move it away")
         if record is not None and not overwrite:
             raise ResultsError(
                 f"{place}: results of another configuration, input or version of the program: "
-                "--overwrite gives them up"
+                "--overwrite replaces them"
             )
         with whole_folder(place) as folder:
             columns = known | work(folder)
@@ -71,23 +76,23 @@ def run_or_reuse(
         (output / ERRORS / f"{name}.json").unlink(missing_ok=True)
         return columns | {"is_new": True}
     except Exception as error:
-        is_meant = isinstance(error, TorchslamError | OSError)
-        return store_failure(output, known, _describe(error), "" if is_meant else traceback.format_exc())
+        is_expected = isinstance(error, TorchslamError | OSError)
+        return store_failure(output, known, _describe(error), "" if is_expected else traceback.format_exc())
 
 
-def store_failure(output: Path, known: Columns, words: str, trace: str = "") -> Columns:
-    """The columns of what ended with an error, which are kept where that can be done."""
-    columns = known | {"status": ERROR, "error": words}
+def store_failure(output: Path, known: Columns, message: str, trace: str = "") -> Columns:
+    """Record an error, on disk if possible, and return its columns."""
+    columns = known | {"status": ERROR, "error": message}
     try:
         (output / ERRORS).mkdir(parents=True, exist_ok=True)
         _write(output / ERRORS / f"{known['name']}.json", columns | {"traceback": trace})
     except OSError as error:
-        columns["error"] += f"; and this could not be written: {error}"
+        columns["error"] += f"; this could not be written to errors/: {error}"
     return columns | {"is_new": True}
 
 
 def read_stored(output: Path, name: str, configuration: str) -> Columns:
-    """What is known of a name: the record of its results, or why there are none, of this configuration; else `open`."""
+    """The record of a row's results or of its error, if of this configuration; otherwise the status `open`."""
     for path in (output / RUNS / name / RECORD, output / ERRORS / f"{name}.json"):
         record = read_record(path)
         if record is not None and record.get("configuration") == configuration:
@@ -96,7 +101,7 @@ def read_stored(output: Path, name: str, configuration: str) -> Columns:
 
 
 def read_record(path: Path) -> Columns | None:
-    """The columns in a file; None where there is none. Raises ResultsError for something else."""
+    """Read the columns of a record; None if there is no file. Raises ResultsError for other content."""
     try:
         record = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
     except (FileNotFoundError, NotADirectoryError):
@@ -115,7 +120,7 @@ def _write(path: Path, columns: Columns) -> None:
 
 
 def _describe(error: Exception) -> str:
-    """One line; of an error that nobody made on purpose, its kind and where it came from."""
+    """One line; for an unexpected error with its type and location."""
     if isinstance(error, TorchslamError | OSError):
         return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1]
@@ -124,20 +129,20 @@ def _describe(error: Exception) -> str:
 
 
 MAX_FILES = 1_000_000
-"""Below the path of a sequence: a folder with more is none."""
+"""Below the path of a sequence; a folder with more is not a sequence."""
 DIGITS = 16
-"""Hexadecimal ones of a hash that are kept: two of a billion are the same by chance with 3 %."""
+"""Hexadecimal digits of a hash: among a billion, two are equal by chance with probability 3 %."""
 
 
 def hash_json(values: Mapping[str, Any]) -> str:
-    """A hash of what JSON can say."""
+    """Hash JSON values."""
     text = json.dumps(values, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 
 
 @cache
 def program_hash() -> str:
-    """Version and files of this package: another program may find something else."""
+    """Hash the version and files of this package; another version may give other results."""
     root = Path(torchslam.__file__).parent
     found = hashlib.sha256(torchslam.__version__.encode())
     for path in sorted(root.rglob("*")):
@@ -147,10 +152,10 @@ def program_hash() -> str:
 
 
 def hash_files(paths: list[str]) -> str:
-    """A hash of names, sizes and times of last change: of files, of folders with all below them, of patterns.
+    """Hash names, sizes and modification times of files, of folders with their content, and of patterns.
 
-    What is missing counts as such. The content is not read: that would take as long as reading the images of all
-    sequences at each start. Raises SequenceError for too many files, OSError for what may not be listed.
+    Missing files count as such. The content is not read: that would take as long as reading all images at each start.
+    Raises SequenceError for too many files, OSError for folders that cannot be listed.
     """
     found = hashlib.sha256()
     for path in paths:
@@ -164,9 +169,9 @@ def hash_files(paths: list[str]) -> str:
 
 
 def hash_content(path: str) -> str:
-    """A hash of what is in a file, such as one of weights: another one may be given the size and time of the last.
+    """Hash the content of a file, for example of weights, whose size and time may be the same as the last one's.
 
-    What is no file counts as in `hash_files`. Raises OSError for one that cannot be read.
+    Anything but a file counts as in `hash_files`. Raises OSError for a file that cannot be read.
     """
     if not os.path.isfile(path):
         return hash_files([path])
@@ -180,18 +185,18 @@ def _files(path: str) -> Iterator[tuple[str, os.stat_result]]:
         for name in [path] if os.path.exists(path) else sorted(glob.glob(path)):
             yield os.path.basename(name), os.stat(name)
         return
-    count, waiting = 0, [""]
-    while waiting:
-        folder = waiting.pop()
+    count, pending = 0, [""]
+    while pending:
+        folder = pending.pop()
         with os.scandir(os.path.join(path, folder)) as entries:
             for entry in sorted(entries, key=lambda entry: entry.name):
                 name = os.path.join(folder, entry.name)
                 count += 1
                 if count > MAX_FILES:
-                    raise SequenceError(f"{path}: more than {MAX_FILES} files: no sequence")
+                    raise SequenceError(f"{path}: more than {MAX_FILES} files: not a sequence")
                 if entry.is_dir(follow_symlinks=False):
-                    waiting.append(name)
-                elif os.path.exists(entry.path):  # a link may lead nowhere
+                    pending.append(name)
+                elif os.path.exists(entry.path):  # skip dangling links
                     status = entry.stat()
                     if stat.S_ISREG(status.st_mode):
                         yield name, status

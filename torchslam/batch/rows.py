@@ -1,4 +1,4 @@
-"""The list of a batch: which sequences, each with what is said of it alone."""
+"""The list of a batch: sequences with their individual settings."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from torchslam.data.synthetic import sequence as synthetic
 from torchslam.errors import SequenceError
 
 MAX_BYTES = 1 << 26
-"""Of a list: half a million rows of a hundred characters."""
-LONGEST_NAME = 100
-"""Characters of a name, of which folders are called."""
+"""Of a list: about half a million rows of a hundred characters."""
+MAX_NAME = 100
+"""Characters of a name; folders are named by it."""
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
-APART = ";"
-"""Between the settings in one cell."""
+SEPARATOR = ";"
+"""Of the settings in one cell."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One run.
+    """One run; camera, start, stop, stride, fps, limit, resize and mask are arguments of `torchslam.open_sequence`.
 
-    name:      of its folder of results, which no two rows share
-    sequence:  as it is written; groundtruth: a trajectory in TUM format instead of the one beside the images
-    camera, start, stop, stride, fps, limit, resize, mask: as `torchslam.open_sequence` takes them
-    config:    file of settings; overrides: `section.key=value`, which come after it
-    folder:    that names of files are relative to
+    Attributes:
+        name: Of its folder of results, unique in a batch.
+        sequence: Path or name, as written in the list.
+        config: File of settings.
+        overrides: `section.key=value`, applied after `config`.
+        groundtruth: A trajectory in TUM format instead of the one of the sequence.
+        folder: Base of relative paths.
     """
 
     name: str
@@ -53,24 +55,24 @@ class Row:
     folder: str = ""
 
     def path(self, name: str) -> str:
-        """Where a file or folder that the row names is."""
+        """Resolve a file or folder that the row names."""
         return name if synthetic.matches(name) else str(Path(self.folder, name))
 
     def completed(self, defaults: Mapping[str, Any]) -> Row:
-        """The row with what it does not say itself; settings of the defaults come before its own."""
-        said = {key: value for key, value in asdict(self).items() if value not in (None, ())}
+        """Fill in defaults for what the row does not set; overrides of the defaults come before its own."""
+        own = {key: value for key, value in asdict(self).items() if value not in (None, ())}
         both = (*defaults.get("overrides", ()), *self.overrides)
-        return replace(self, **{**defaults, **said, "overrides": both})
+        return replace(self, **{**defaults, **own, "overrides": both})
 
 
 COLUMNS = tuple(field.name for field in fields(Row) if field.name != "folder")
 
 
 def read_list(path: str | Path) -> list[Row]:
-    """The rows of a list: a CSV file with a header of `COLUMNS`, or a text with a path on each line, `#` for comments.
+    """Read a list: a CSV file with a header of `COLUMNS`, or a text file with a path per line and `#` for comments.
 
-    Names of files are relative to the folder of the list. A row without a name is called as the last part of its path,
-    with a number where others are called so too. Raises SequenceError that names file and line.
+    Paths are relative to the folder of the list. A row without a name is named by the last part of its path, with a
+    number if that is taken. Raises SequenceError with file and line.
     """
     path = Path(path)
     table = _cells if path.suffix.lower() == ".csv" else _lines
@@ -79,18 +81,18 @@ def read_list(path: str | Path) -> list[Row]:
     for number, cells in table(path):
         row = _row(cells, f"{path}:{number}", str(path.parent.absolute()))
         if row in seen:
-            raise SequenceError(f"{path}:{number}: the same as line {seen[row]}; give each a name of its own")
+            raise SequenceError(f"{path}:{number}: the same as line {seen[row]}; give each its own name")
         seen[row] = number
         rows.append(row)
     if not rows:
         raise SequenceError(f"{path}: no sequences in the list")
-    return named(rows, str(path))
+    return assign_names(rows, str(path))
 
 
-def named(rows: Iterable[Row], where: str = "rows") -> list[Row]:
-    """The rows with a name for each. Raises SequenceError where two are given the same one; `where`, for messages."""
+def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
+    """Give each row a unique name. Raises SequenceError, with `where` in its message, if two have the same one."""
     rows = list(rows)
-    # Folders that differ in upper and lower case alone are the same on some systems.
+    # Folders that differ only in case are the same on some systems.
     given = Counter(row.name.casefold() for row in rows if row.name)
     twice = [name for name, count in given.items() if count > 1]
     if twice:
@@ -105,10 +107,10 @@ def named(rows: Iterable[Row], where: str = "rows") -> list[Row]:
 
 
 def short_name(sequence: str) -> str:
-    """What a sequence is called by its path: letters, digits, and `-` in place of anything else."""
+    """Derive a name from the path of a sequence: letters, digits, and `-` for anything else."""
     text = sequence if synthetic.matches(sequence) else Path(sequence).stem
     text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
-    return text[:LONGEST_NAME] or "sequence"
+    return text[:MAX_NAME] or "sequence"
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -125,7 +127,7 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _cells(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """The cells of each row by their columns, with the number of the line that the row ends on."""
+    """The cells of each row by column, with the number of its last line."""
     reader = csv.reader(io.StringIO(read_text(path, SequenceError, MAX_BYTES), newline=""), strict=True)
     try:
         header = [name.strip() for name in next(reader, [])]
@@ -137,8 +139,8 @@ def _cells(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
                 raise SequenceError(
                     f"{path}:{reader.line_num}: {len(cells)} cells under {len(header)} columns"
                 )
-            said = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-            yield reader.line_num, {name: cell for name, cell in said.items() if cell}
+            stripped = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+            yield reader.line_num, {name: cell for name, cell in stripped.items() if cell}
     except csv.Error as error:
         raise SequenceError(f"{path}:{reader.line_num}: not CSV: {error}") from None
 
@@ -147,10 +149,10 @@ def _check_header(header: list[str], path: Path) -> None:
     for name in header:
         if name not in COLUMNS:
             near = difflib.get_close_matches(name, COLUMNS, n=1)
-            meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(COLUMNS)}"
-            raise SequenceError(f"{path}:1: no column is called `{name[:100]}`; {meant}")
+            hint = f"did you mean {near[0]}?" if near else f"the columns are {', '.join(COLUMNS)}"
+            raise SequenceError(f"{path}:1: unknown column `{name[:100]}`; {hint}")
     if len(set(header)) < len(header) or "sequence" not in header:
-        raise SequenceError(f"{path}:1: the header must have each column once, and `sequence` among them")
+        raise SequenceError(f"{path}:1: the header must have `sequence`, and no column twice")
 
 
 def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
@@ -161,20 +163,20 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
         if len(cell) > MAX_LINE or "\0" in cell:
             raise SequenceError(f"{where}: {name}: a NUL, or more than {MAX_LINE} characters")
     name = values.setdefault("name", "")
-    if name and (len(name) > LONGEST_NAME or NAME.fullmatch(name) is None):
+    if name and (len(name) > MAX_NAME or NAME.fullmatch(name) is None):
         raise SequenceError(
-            f"{where}: name `{name[:LONGEST_NAME]}`: a folder is called so; letters, digits and _ . + = - only, "
-            f"at most {LONGEST_NAME}"
+            f"{where}: name `{name[:MAX_NAME]}`: it names a folder; only letters, digits and _ . + = -, "
+            f"at most {MAX_NAME}"
         )
     for key in ("stride", "limit"):
         if key in values:
             count = parse_count(values[key])
             if not count:
-                raise SequenceError(f"{where}: {key} must be a whole number from 1 on, not `{values[key]}`")
+                raise SequenceError(f"{where}: {key} must be a positive integer, not `{values[key]}`")
             values[key] = count
     if "fps" in values:
         values["fps"] = _rate(values["fps"], where)
-    settings = (setting.strip() for setting in values.get("overrides", "").split(APART))
+    settings = (setting.strip() for setting in values.get("overrides", "").split(SEPARATOR))
     values["overrides"] = tuple(setting for setting in settings if setting)
     return Row(**values, folder=folder)
 

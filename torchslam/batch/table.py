@@ -1,4 +1,4 @@
-"""One table of a batch, with a picture: CSV always, Parquet too where pyarrow is installed."""
+"""The table of a batch as CSV, as a plot, and as Parquet if pyarrow is installed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PARQUET = "table.parquet"
 PICTURE = "table.png"
 TIMES_CSV = "times.csv"
 
-# Columns and their types: the same table whatever is in it.
+# Columns and their types, the same for every batch.
 COLUMNS: dict[str, type] = {
     "name": str,
     "sequence": str,
@@ -40,15 +40,15 @@ COLUMNS: dict[str, type] = {
     "configuration": str,
 }
 LARGEST = 1 << 62
-"""Of a figure: nothing that is counted or measured is larger."""
+"""Of a value: larger ones are invalid."""
 TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "ms_median", "ms_p95"), float)}
 
 
 def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
-    """Write table and picture of all rows of the list, those of other shards included; returns the rows.
+    """Write table and plot of all rows of the list, those of other shards included; return the rows.
 
-    What is not yet run stands there as `open`. Of several processes that write the same table, the last one to write
-    it has looked at all results afterwards: nothing is missing in the end. Raises ResultsError, OSError.
+    Unfinished rows have the status `open`. Each process reads all results again after writing, so the table is complete
+    in the end whichever process writes last. Raises ResultsError, OSError.
     """
     configurations = [_configuration(task) for task in tasks]
     rows: list[Columns] | None = None
@@ -63,17 +63,17 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
 
 
 def counts(rows: Sequence[Mapping[str, Any]]) -> str:
-    """How many rows have which status, in words."""
+    """Describe the number of rows per status."""
     statuses = [row["status"] for row in rows]
-    words = {DONE: "done", NO_MAP: "without a map", ERROR: "with an error", "open": "not yet run"}
-    found = [f"{statuses.count(status)} {word}" for status, word in words.items() if status in statuses]
+    labels = {DONE: "done", NO_MAP: "without a map", ERROR: "with an error", "open": "not yet run"}
+    found = [f"{statuses.count(status)} {label}" for status, label in labels.items() if status in statuses]
     return ", ".join(found)
 
 
 def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
-    """The rows of the table as the records in the folder of a batch have them; a record of something else is an error.
+    """Read the rows of the table from the records in the folder of a batch; an invalid record is an error row.
 
-    configurations: of the tasks, as by `one.configuration`; empty where there is none
+    configurations: of the tasks, by `task.configuration`; empty if that failed
     """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):
@@ -91,11 +91,11 @@ def _configuration(task: Task) -> str:
     try:
         return configuration(task)
     except TorchslamError:
-        return ""  # the row is an error, which says why
+        return ""  # the row reports the error
 
 
 def _typed(value: object, kind: type) -> Any:
-    """A value of a record; None for what is no such value, or is beyond what the table can hold."""
+    """A value of a record; None if it has another type or is out of range."""
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value) if abs(value) < LARGEST else None
     if type(value) is not kind or (isinstance(value, int) and not 0 <= value < LARGEST):
@@ -108,7 +108,7 @@ def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
 
 
 def read_times(folder: Path) -> Columns:
-    """The content of times.json; empty where there is none. Raises ResultsError."""
+    """Read times.json; empty if there is none. Raises ResultsError."""
     path = folder / TIMES
     try:
         times = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
@@ -122,7 +122,7 @@ def read_times(folder: Path) -> Columns:
 
 
 def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:
-    """As text: floats with all their digits, nothing for None."""
+    """The table as text: floats with all digits, empty cells for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -135,7 +135,7 @@ def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:
 
 
 def _parquet(rows: Sequence[Columns]) -> bytes | None:
-    """None without pyarrow."""
+    """The table as Parquet; None without pyarrow."""
     try:
         arrow = importlib.import_module("pyarrow")
         parquet = importlib.import_module("pyarrow.parquet")
@@ -165,7 +165,7 @@ def _picture(rows: Sequence[Columns]) -> bytes:
 
 
 def _put(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all, whoever else writes it at the same time."""
+    """Write a file atomically, also if other processes write it at the same time."""
     with _part(path) as part:
         part.write_bytes(content)
         part.replace(path)
@@ -173,14 +173,14 @@ def _put(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def _part(path: Path) -> Iterator[Path]:
-    """A name of nobody else's, beside a file."""
+    """A temporary file with a unique name in the same folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     os.close(number)
     part = Path(name)
     mask = os.umask(0)
     os.umask(mask)
-    part.chmod(0o666 & ~mask)  # mkstemp lets nobody else read
+    part.chmod(0o666 & ~mask)  # mkstemp restricts access to the owner
     try:
         yield part
     finally:

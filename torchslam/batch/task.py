@@ -1,4 +1,4 @@
-"""One row of a batch, from its settings to its folder of results: what an engine calls, in whatever process."""
+"""Run one row of a batch, from its settings to its folder of results; engines call it in any process."""
 
 from __future__ import annotations
 
@@ -28,58 +28,67 @@ from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
-from torchslam.data.formats.trajectory_file import read_trajectory
-from torchslam.data.given_truth import WithTruth
 from torchslam.data.opening import full_name
 from torchslam.data.readers.registry import live
 from torchslam.data.sequence import Calibrated
+from torchslam.data.trajectories import read_trajectory
+from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
-from torchslam.io.metrics import compute_metrics
+from torchslam.io.report import compute_metrics
 from torchslam.io.write_run import write_run
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 
 TIMES = "times.json"
 TIMED = ("fps", "ms_median", "ms_p95", "stage_ms")
-"""Of the figures: those that are never twice the same. They are in `times.json` alone, with `cpu_s`: seconds of the
-processor for the run, with reading of images and finding of the camera, evaluation and writing apart."""
+"""Metrics that vary between runs. Only `times.json` has them, with `cpu_s`: processor seconds of the run including
+reading of images and calibration, without evaluation and writing."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A row with what is the same for all rows of a batch.
+    """A row with the options that all rows of a batch share.
 
-    output:   folder of the batch; overwrite: results in it that are of something else
-    device:   where to compute, as torch names it
-    pictures: draw plots and write view.html
+    Attributes:
+        row: What to run.
+        output: Folder of the batch.
+        device: Of torch.
+        overwrite: Replace results of other settings, inputs or versions.
+        plots: Draw plots and write view.html.
     """
 
     row: Row
     output: str
     device: str = "cpu"
     overwrite: bool = False
-    pictures: bool = True
+    plots: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """What JSON can say and `run_row` takes."""
+        """Convert to JSON values for `run_row`."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Task:
-        """The task that `as_dict` gave, also after a way through JSON."""
+        """Restore a task from `as_dict`, also after a round trip through JSON."""
         row = dict(values["row"])
         return cls(**{**values, "row": Row(**{**row, "overrides": tuple(row["overrides"])})})
 
 
 def run_row(task: Mapping[str, Any]) -> Columns:
-    """Run a sequence, evaluate it and write its results, unless they are there; returns its row of the table.
+    """Run a sequence, evaluate it and write its results, unless they exist already.
 
-    task: a `Task` as a dictionary. The same task gives the same bytes, `times.json` apart, in any process and after any
-    other task: it runs on one thread and keeps no state. It raises no Exception, see `run_or_reuse`.
+    The same task gives the same bytes (except `times.json`) in any process and after any other task: it runs on one
+    thread and keeps no state. It raises no Exception, see `run_or_reuse`.
+
+    Args:
+        task: A `Task` as a dictionary.
+
+    Returns:
+        Its row of the table.
     """
     todo = Task.from_dict(task)
     with _one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # frames that cannot be read are counted, and named in metrics.json
+        warnings.simplefilter("ignore")  # metrics.json lists the unreadable frames
         return run_or_reuse(
             Path(todo.output),
             todo.row.name,
@@ -90,26 +99,26 @@ def run_row(task: Mapping[str, Any]) -> Columns:
 
 
 def settings_of(row: Row) -> Config:
-    """The configuration of a row. Raises ConfigError."""
+    """Load the configuration of a row. Raises ConfigError."""
     return load_config(None if row.config is None else row.path(row.config), row.overrides)
 
 
 def configuration(task: Task) -> str:
-    """A hash of all that decides about the results, the content of the files apart. Raises ConfigError."""
+    """Hash everything that the results depend on except the input files. Raises ConfigError."""
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
     return hash_json(
         {
             "row": row,
             "settings": to_toml(settings_of(task.row)),
             "device": torch.device(task.device).type,
-            "pictures": task.pictures,
+            "plots": task.plots,
             "program": program_hash(),
         }
     )
 
 
 def _input(task: Task) -> str:
-    """A hash of the files that the row reads."""
+    """Hash the files that the row reads."""
     row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
     files = hash_files([row.path(name) for name in names if name])
@@ -118,12 +127,12 @@ def _input(task: Task) -> str:
 
 
 def open_row(row: Row) -> Sequence:
-    """The sequence of a row, with the camera and the ground truth that it names.
+    """Open the sequence of a row with its camera and ground truth.
 
     Raises SequenceError, CalibrationError or TrajectoryError.
     """
     if live.matches(row.sequence) and not Path(row.path(row.sequence)).exists():
-        raise SequenceError(f"{row.sequence}: a live source has no end, and is not the same again")
+        raise SequenceError(f"{row.sequence}: a live source has no end and is not repeatable")
     camera = row.camera
     if camera is not None and Path(row.path(camera)).is_file():
         camera = row.path(camera)
@@ -139,7 +148,7 @@ def open_row(row: Row) -> Sequence:
         mask=None if row.mask is None else row.path(row.mask),
     )
     if row.groundtruth is not None:
-        sequence = WithTruth(sequence, read_trajectory(row.path(row.groundtruth)))
+        sequence = WithGroundTruth(sequence, read_trajectory(row.path(row.groundtruth)))
     return sequence
 
 
@@ -156,16 +165,16 @@ def _run(task: Task, folder: Path) -> Columns:
     seconds = time.process_time() - start
     if finished.interrupted:
         raise KeyboardInterrupt
-    figures = compute_metrics(finished, sequence, camera)
-    times = {"cpu_s": seconds} | {name: figures.pop(name) for name in TIMED}
+    metrics = compute_metrics(finished, sequence, camera)
+    times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
-    figures |= {"source": full_name(row.path(row.sequence)), "source_fps": row.fps}
-    write_run(_without_times(finished), sequence, figures, folder, plots=task.pictures, viewer=task.pictures)
+    metrics |= {"source": full_name(row.path(row.sequence)), "source_fps": row.fps}
+    write_run(_without_times(finished), sequence, metrics, folder, plots=task.plots, viewer=task.plots)
     return {
         "sequence": row.sequence,
         "status": NO_MAP if finished.failure else DONE,
         "error": finished.failure,
-        **_columns(figures),
+        **_columns(metrics),
     }
 
 
@@ -173,18 +182,18 @@ def _without_times(finished: Run) -> Run:
     return replace(finished, results=[replace(result, stage_ms={}) for result in finished.results])
 
 
-def _columns(figures: Mapping[str, Any]) -> Columns:
-    """The figures of a table: numbers and words."""
+def _columns(metrics: Mapping[str, Any]) -> Columns:
+    """The columns of a row: the numbers and strings among the metrics."""
     flat = {
-        key: value for key, value in figures.items() if value is None or isinstance(value, int | float | str)
+        key: value for key, value in metrics.items() if value is None or isinstance(value, int | float | str)
     }
-    flat |= {f"rpe_{key}": value for key, value in figures.get("rpe", {}).items()}
-    return {**flat, "submaps": len(figures["submaps"]), "skipped": len(figures["skipped"])}
+    flat |= {f"rpe_{key}": value for key, value in metrics.get("rpe", {}).items()}
+    return {**flat, "submaps": len(metrics["submaps"]), "skipped": len(metrics["skipped"])}
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Inside, torch computes on one thread: sums of several come in another order."""
+    """Restrict torch to one thread, since the order of sums depends on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -9,8 +9,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from torchslam.config import CHOICES, Config, load_config
-from torchslam.config.builtin import names
+from torchslam.config import CHOICES, Config, builtin_names, load_config
 
 if TYPE_CHECKING:
     import torch
@@ -22,7 +21,7 @@ SEQUENCE_HELP = (
     "video, zip, ROS bag (.bag, .mcap, folder), camera number, rtsp:// address, or synthetic:room"
 )
 PRESETS = "tum-fr1, tum-fr2, tum-fr3, euroc, kitti, 7-scenes, tartanair, icl"
-"""The names in `torchslam.data.presets`, which needs torch."""
+"""The names in `torchslam.data.calibration`, which needs torch."""
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
@@ -86,7 +85,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config",
         metavar="FILE|NAME",
-        help=f"TOML file of settings or built-in configuration ({', '.join(names())}); other keys keep their default",
+        help=f"TOML file of settings, or a built-in configuration: {', '.join(builtin_names())}",
     )
     parser.add_argument(
         "--set",

@@ -35,7 +35,7 @@ from typing import Any
 from torchslam.batch import DONE, ENGINES, ERROR, Columns, Engine, Task, parse_shard, read_list, run_batch
 from torchslam.batch.table import CSV, counts
 from torchslam.cli import arguments
-from torchslam.cli.signals import SIGNALS, STATUS
+from torchslam.cli.progress import SIGNALS, STATUS
 
 ERRORS = 4
 READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask")
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="replace results of other settings, files or versions, which are errors otherwise",
     )
-    parser.add_argument("--no-pictures", action="store_true", help="write no plots and no view.html")
+    parser.add_argument("--no-plots", action="store_true", help="write no plots and no view.html")
     spread = parser.add_argument_group("distribution")
     spread.add_argument(
         "--shard", metavar="I/N|auto", help="run every N-th row, starting with row I (from 0)"
@@ -81,14 +81,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     rows = [row.completed(_defaults(options)) for row in read_list(options.list)]
-    arguments.config(options)  # what is wrong with it is said once
+    arguments.config(options)  # report an invalid configuration once
     output, device = str(options.output.absolute()), options.device
-    tasks = [Task(row, output, str(device), options.overwrite, not options.no_pictures) for row in rows]
+    tasks = [Task(row, output, str(device), options.overwrite, not options.no_plots) for row in rows]
     engine = Engine(options.engine, options.workers, options.address, int(device.type == "cuda"))
     shard = None if options.shard is None else parse_shard(options.shard)
     with _stopping():
         progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
-        found = run_batch(tasks, engine, shard, progress.tell)
+        found = run_batch(tasks, engine, shard, progress.report)
     new = sum(columns["is_new"] for columns in found)
     print(f"{len(found)} sequences: {counts(found)}; {len(found) - new} of them already existed")
     print(f"table: {options.output / CSV}")
@@ -96,7 +96,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _defaults(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say for all rows; names of files are relative to where the command was called."""
+    """Return the options for all rows; file names are relative to the working directory."""
     said = {name: getattr(options, name) for name in READING}
     said["start"] = None if options.start == 0 else options.start
     said["stride"] = None if options.stride == 1 else options.stride
@@ -108,12 +108,12 @@ def _defaults(options: argparse.Namespace) -> dict[str, Any]:
 
 
 class _Progress:
-    """A line on stderr for each sequence."""
+    """Progress output: a line on stderr per sequence."""
 
     def __init__(self, count: int) -> None:
         self._count, self._done = count, 0
 
-    def tell(self, columns: Columns) -> None:
+    def report(self, columns: Columns) -> None:
         self._done += 1
         words = columns["status"]
         if columns["status"] == DONE:
@@ -131,7 +131,7 @@ class _Progress:
 
 @contextmanager
 def _stopping() -> Iterator[None]:
-    """Inside, Ctrl-C and SIGTERM end at once: what is half-written goes, what is done stays."""
+    """Context in which Ctrl-C and SIGTERM exit at once, deleting incomplete results and keeping complete ones."""
 
     def end(number: int, frame: FrameType | None) -> None:
         print("torchslam: stopped; run the same command to continue", file=sys.stderr)

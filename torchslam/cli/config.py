@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from torchslam.cli import arguments
-from torchslam.config.schema import explained
+from torchslam.config.schema import to_commented_toml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,5 +16,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    print(explained(arguments.config(options)), end="")
+    print(to_commented_toml(arguments.config(options)), end="")
     return 0

@@ -6,10 +6,11 @@ import argparse
 import json
 from pathlib import Path
 
-from torchslam.data.formats.trajectory_file import read_trajectory
+from torchslam.data.trajectories import read_trajectory
 from torchslam.evaluation import evaluate
-from torchslam.io.report import accuracy, table
+from torchslam.io.report import accuracy
 from torchslam.io.results import TRAJECTORY
+from torchslam.utils.console import table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,6 +28,6 @@ def execute(options: argparse.Namespace) -> int:
     results: Path = options.estimate
     estimate = read_trajectory(results / TRAJECTORY if results.is_dir() else results)
     groundtruth = read_trajectory(options.groundtruth)
-    figures = evaluate(estimate, groundtruth).as_dict()
-    print(json.dumps(figures, indent=2) if options.json else table(accuracy(figures)))
+    metrics = evaluate(estimate, groundtruth).as_dict()
+    print(json.dumps(metrics, indent=2) if options.json else table(accuracy(metrics)))
     return 0

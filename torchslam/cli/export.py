@@ -26,24 +26,22 @@ from typing import Any
 import torch
 
 from torchslam.cli import arguments
-from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
+from torchslam.data.trajectories import read_trajectory, write_kitti, write_trajectory
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.colmap import colmap_camera, write_colmap
-from torchslam.io.export.images import WITHOUT, Images, open_images, write_images
-from torchslam.io.export.kitti import write_kitti
+from torchslam.io.export.images import WITHOUT, Images, open_images, undistorted, write_images
 from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.export.recording import import_rerun, write_recording
 from torchslam.io.export.scene import Scene, scene_of
-from torchslam.io.export.undistortion import undistorted
-from torchslam.io.report import table
 from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.system.run import keyframe_rows, keyframe_trajectory
 from torchslam.types import Trajectory
+from torchslam.utils.console import table
 
 FOLDER = "export"  # in the folder of results
 MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats look for it
@@ -51,17 +49,17 @@ MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats l
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be exported, and where to.
+    """An export: what to write and where.
 
-    directory: of the results; figures: of the run, from there
-    submap, camera: from its map
-    source:    what the images are read from, and
-    fps:       at what rate, where the run was told; None where they are not wanted, or nothing says where they are
-    undistort: whether images and keypoints are to be as of a pinhole camera
+    Attributes:
+        directory: results folder; `metrics`: its metrics.
+        submap, camera: from its map.
+        source, fps: path and frame rate of the images; None if they are not exported.
+        undistort: convert images and keypoints to a pinhole camera.
     """
 
     directory: Path
-    figures: dict[str, Any]
+    metrics: dict[str, Any]
     submap: Submap
     camera: Camera
     output: Path
@@ -72,16 +70,16 @@ class Job:
 
     @property
     def session(self) -> int:
-        """Which run over the map it was."""
-        return int(self.figures["session"])
+        """Number of the run on the map."""
+        return int(self.metrics["session"])
 
     @property
     def R_up(self) -> torch.Tensor:
-        """(3, 3) from the map's world to the upright one: the same for every format."""
+        """(3, 3) rotation from the map frame to the upright one, the same for every format."""
         return upright_rotation(se3_inverse(self.submap.map.T_cw).double())
 
     def scene(self) -> tuple[Scene, Images | None]:
-        """What is seen, and the images if they are wanted. Raises ResultsError where they are gone."""
+        """The exported scene and its images, if requested. Raises ResultsError if they cannot be read."""
         scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone)
         images = None
         if self.source is not None:
@@ -92,17 +90,20 @@ class Job:
         """The poses of the run in the submap; those of all frames are read, since localization adds none to the map."""
         if self.keyframes_alone:
             return keyframe_trajectory(self.submap.map, self.session)
-        is_main = self.submap.number == self.figures["submap"]
+        is_main = self.submap.number == self.metrics["submap"]
         name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(self.submap.number)
         return read_trajectory(self.directory / name)
 
 
 @dataclass(frozen=True)
 class Target:
-    """write:     write it; returns what was written, label by label
-    name:         of its file or folder
-    is_of_images: whether images belong to it
-    keyframes:    whether it is of keyframes alone where nothing else is asked for
+    """An export format.
+
+    Attributes:
+        write: writes the export and returns rows for `table`.
+        name: file or folder name.
+        is_of_images: whether the format includes images.
+        keyframes: whether only keyframes are exported by default.
     """
 
     write: Callable[[Job], dict[str, str]]
@@ -151,38 +152,38 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _job(options: argparse.Namespace, target: Target) -> Job:
-    """What the arguments ask for. Raises ResultsError for results that do not have it."""
+    """Build the export from the arguments. Raises ResultsError if the results lack something."""
     directory = options.directory
     if not directory.is_dir():
-        raise ResultsError(f"{directory}: no such folder of results")
-    figures, saved = read_metrics(directory), read_atlas(directory / MAP)
-    number = figures["submap"] if options.submap is None else options.submap
+        raise ResultsError(f"{directory}: no such results folder")
+    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
+    number = metrics["submap"] if options.submap is None else options.submap
     submaps = {submap.number: submap for submap in saved.atlas}
     if not submaps:
-        raise ResultsError(f"{directory}: contains no map: {figures.get('failure', '')}")
+        raise ResultsError(f"{directory}: contains no map: {metrics.get('failure', '')}")
     if number not in submaps:
         raise ResultsError(f"{directory}: no submap {number}: there are {', '.join(map(str, submaps))}")
     keyframes_alone = options.frames == "keyframes" or (options.frames is None and target.keyframes)
     source = None
     if target.is_of_images and not options.no_images:
-        source = options.sequence or figures.get("source")
+        source = options.sequence or metrics.get("source")
         if source is None:
             raise ResultsError(f"{directory}: the location of the images is unknown: {WITHOUT}")
     return Job(
         directory=directory,
-        figures=figures,
+        metrics=metrics,
         submap=submaps[number],
         camera=saved.camera,
         output=options.output or directory / FOLDER / target.name,
         keyframes_alone=keyframes_alone,
         undistort=options.undistort or options.to == "rerun",
         source=source,
-        fps=figures.get("source_fps"),
+        fps=metrics.get("source_fps"),
     )
 
 
 def _make_way(output: Path, overwrite: bool) -> None:
-    """Make the folder that an export goes to. Raises ResultsError where it would replace something."""
+    """Create the parent folder of an export. Raises ResultsError if it would replace something."""
     is_taken = any(output.iterdir()) if output.is_dir() else output.exists()
     if is_taken and not overwrite:
         raise ResultsError(f"{output}: already exists; --overwrite replaces it")
@@ -194,7 +195,7 @@ def _colmap(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
-    return {"camera": colmap_camera(scene.camera)[0]} | _figures(job, scene)
+    return {"camera": colmap_camera(scene.camera)[0]} | _describe_scene(job, scene)
 
 
 def _nerfstudio(job: Job) -> dict[str, str]:
@@ -202,16 +203,16 @@ def _nerfstudio(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_nerfstudio(job.output, scene, job.R_up)
-    return _figures(job, scene)
+    return _describe_scene(job, scene)
 
 
 def _rerun(job: Job) -> dict[str, str]:
     scene, images = job.scene()
     write_recording(job.output, scene, job.R_up, images)
-    return _figures(job, scene)
+    return _describe_scene(job, scene)
 
 
-def _figures(job: Job, scene: Scene) -> dict[str, str]:
+def _describe_scene(job: Job, scene: Scene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
     frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
     if job.keyframes_alone:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from torchslam.cli import arguments
-from torchslam.utils.text_table import table
+from torchslam.utils.console import table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

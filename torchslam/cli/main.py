@@ -15,12 +15,12 @@ from typing import Any
 
 import torchslam
 from torchslam.errors import TorchslamError
-from torchslam.utils.optional_deps import explained
+from torchslam.utils.console import with_install_hint
 
 ERROR = 2
 INTERRUPTED = 130
 
-# Module, and the first line of its docstring: only that of the command at hand is imported.
+# Module and first docstring line of each command; only the module of the requested command is imported.
 COMMANDS = {
     "run": ("run", "run SLAM on a sequence and write trajectory, map, metrics and plots"),
     "batch": (
@@ -55,15 +55,12 @@ COMMANDS = {
     ),
 }
 
-WITHOUT_THREADS = (
-    "config",
-    "info",
-)  # compute nothing: torch is imported where a sequence is opened, if at all
+WITHOUT_THREADS = ("config", "info")  # compute nothing and import torch only where a sequence is opened
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status. Errors made on purpose become one line on stderr."""
-    # Before NumPy is imported: its threads would stand idle, and keep a second process from being a copy of this one.
+    """Run one command and return its exit status. Expected errors become one line on stderr."""
+    # Before NumPy is imported: its idle threads would prevent forking.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
@@ -75,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"torchslam: error: {error}", file=sys.stderr)
         return ERROR
     except ModuleNotFoundError as error:
-        if (reason := explained(error)) is error:
+        if (reason := with_install_hint(error)) is error:
             raise
         print(f"torchslam: error: {reason}", file=sys.stderr)
         return ERROR
@@ -85,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Version(argparse.Action):
-    """Looked up only when asked for: reading the metadata takes half as long as all the rest of the help."""
+    """Print the version; reading the package metadata is slow and done only here."""
 
     def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:
         print(f"torchslam {torchslam.__version__}")
@@ -93,15 +90,15 @@ class Version(argparse.Action):
 
 
 def _compute_in_one_thread() -> None:
-    """Unless the user says otherwise: a frame's tensors are small, threads cost more than they bring."""
-    import torch  # not before the arguments are known to be right
+    """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more."""
+    import torch  # after the arguments were checked
 
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
 
 
 def build_parser(chosen: str) -> argparse.ArgumentParser:
-    """The parser of all commands, with the arguments of the chosen one, which its module adds."""
+    """Build the parser of all commands, with the arguments of the chosen one only."""
     parser = argparse.ArgumentParser(
         prog="torchslam",
         description="Monocular visual SLAM: images in, the camera's trajectory and a sparse map out.",

@@ -1,31 +1,91 @@
-"""The progress bars of a run: over its frames, then over the iterations of the final adjustment."""
+"""Progress bars of a run, and its interruption by Ctrl-C and SIGTERM.
+
+The first signal ends the run after the current frame or iteration, with the results so far. The second one ends it at
+once and writes nothing, since the map may be in the middle of a change.
+"""
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from collections.abc import Callable
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any
 
 from tqdm import tqdm
 
-from torchslam.cli.signals import Stopping
 from torchslam.types import StepResult
-from torchslam.utils.progress import stream
+from torchslam.utils.console import tqdm_options
 
-# No thread that looks after bars which wait for their turn: a second process could not be a copy of this one.
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}  # 128 + the signal's number, as shells have it
+
+
+class Stopping:
+    """Signal handling of a run: the first signal makes `check` raise, the second one exits at once."""
+
+    def __init__(self) -> None:
+        self._signal: int | None = None
+        self._is_wanted = False
+        self._phase = ""
+
+    @property
+    def status(self) -> int:
+        """Exit status for the last signal; 0 if there was none."""
+        return 0 if self._signal is None else STATUS[signal.Signals(self._signal)]
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if `check` will raise."""
+        return self._is_wanted
+
+    def begin(self, phase: str) -> None:
+        """Enter a phase and forget earlier signals; `phase` tells the user when the run will stop."""
+        self._phase, self._is_wanted = phase, False
+        for number in SIGNALS:
+            signal.signal(number, self._wish)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal arrived in this phase."""
+        if self._is_wanted:
+            self._is_wanted = False
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Stopping:
+        self._before = {number: signal.getsignal(number) for number in SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _wish(self, number: int, frame: FrameType | None) -> None:
+        self._signal, self._is_wanted = number, True
+        for each in SIGNALS:
+            signal.signal(each, self._end)
+        tqdm.write(f"torchslam: stopping {self._phase}; again to stop at once", file=sys.stderr)
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        raise SystemExit(STATUS[signal.Signals(number)])
+
+
+# Without the monitor thread of tqdm, this process can be forked.
 tqdm.monitor_interval = 0
 
 
 class ProgressBar:
-    """Frame, rate, state and points on one line of stderr, in a log on one every few seconds; warnings are printed
-    above it.
+    """Progress line on stderr with frame, rate, state and map points; warnings are printed above it.
 
-    A signal takes effect after the frame, or the iteration, at hand, when the map is whole.
+    A signal takes effect after the current frame or iteration, when the map is consistent.
 
-    frames: how many there are, None where nobody knows
-    done:   frames that were processed before, by a run that this one goes on with
+    Args:
+        frames: number of frames; None if unknown.
+        count_points: returns the number of map points.
+        stopping: the signal handler.
+        done: number of frames that a resumed run had processed.
     """
 
     def __init__(
@@ -37,7 +97,7 @@ class ProgressBar:
             total=frames,
             initial=done,
             unit=" frames",
-            **stream(),
+            **tqdm_options(),
             bar_format="{n_fmt} frames, {rate_noinv_fmt}{postfix}"
             if frames is None
             else "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
@@ -46,19 +106,19 @@ class ProgressBar:
         self._warnings = warnings.catch_warnings()
 
     def update(self, result: StepResult) -> None:
-        """Move on to the frame of a result. Raises KeyboardInterrupt where there is a wish to stop."""
+        """Advance to the frame of a result. Raises KeyboardInterrupt after a signal."""
         self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
         self._bar.update(result.index + 1 - self._bar.n)
         self._stopping.check()
 
     def adjusting(self, iteration: int, iterations: int) -> None:
-        """Move on to an iteration of the final adjustment. Raises KeyboardInterrupt where there is a wish to stop."""
+        """Advance to an iteration of the final adjustment. Raises KeyboardInterrupt after a signal."""
         if self._adjusting is None:
             self._stopping.begin("the adjustment after this iteration")
             self._bar.close()
             self._adjusting = tqdm(
                 total=iterations,
-                **stream(),
+                **tqdm_options(),
                 bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
             )
         self._adjusting.total = iterations

@@ -23,19 +23,20 @@ from torchslam.cli import arguments
 from torchslam.cli.result_folder import prepare
 from torchslam.config import Config
 from torchslam.data import Sequence
+from torchslam.data.calibration import check_replaceable, is_found, write_calibration
 from torchslam.data.camera_argument import fit_camera, unknown_camera
 from torchslam.data.formats.given_poses import GivenPoses, read_poses
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
-from torchslam.io.calibration_file import check_replaceable, is_found, write_calibration
-from torchslam.io.report import metrics, summary, table
+from torchslam.io.report import run_metrics, summary
 from torchslam.io.results import CALIBRATION
 from torchslam.io.write_run import write_run
-from torchslam.refine import CameraChoice, Refined, refine_poses
+from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined
 from torchslam.types import Trajectory
+from torchslam.utils.console import table
 
 DONE, NO_MAP = 0, 3
 RADIAL = 2  # coefficients of the distortion that may be found
@@ -114,9 +115,9 @@ def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> in
         plan.device,
         on_progress=lambda words: print(f"torchslam: {words}", file=sys.stderr),
     )
-    figures = _write(refined, sequence, plan)
+    metrics = _write(refined, sequence, plan)
     written = {} if refined.run.failure else {"refined": str(write_refined(plan.output / REFINED, refined))}
-    rows = _describe_poses(refined, sequence) | summary(figures) | written | {"results": str(plan.output)}
+    rows = _describe_poses(refined, sequence) | summary(metrics) | written | {"results": str(plan.output)}
     rows.pop("speed", None)  # frames are not processed one by one
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
@@ -139,13 +140,13 @@ def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> S
     return sequence
 
 
-def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
+def _write(refined: RefinementResult, sequence: Sequence, plan: Plan) -> dict[str, Any]:
     """Evaluate and write the refined run; returns the metrics."""
     finished = refined.run
     before = Trajectory.empty() if finished.failure else finished.online
     after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
-    figures = metrics(finished, after, None if ate_before is None else ate_before.ate_m)
-    figures |= {
+    metrics = run_metrics(finished, after, None if ate_before is None else ate_before.ate_m)
+    metrics |= {
         "camera": _describe_camera(refined, sequence),
         "focal_px": [float(sequence.camera.focal), float(finished.camera.focal)],
         "without_pose": refined.without_pose,
@@ -157,11 +158,11 @@ def _write(refined: Refined, sequence: Sequence, plan: Plan) -> dict[str, Any]:
     }
     path = plan.output / CALIBRATION
     if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
-        write_calibration(path, finished.camera, [figures["camera"]])
+        write_calibration(path, finished.camera, [metrics["camera"]])
     elif is_found(path):
         path.unlink()
-    write_run(finished, sequence, figures, plan.output, viewer=False)
-    return figures
+    write_run(finished, sequence, metrics, plan.output, viewer=False)
+    return metrics
 
 
 def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
@@ -175,21 +176,21 @@ def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
         return None
 
 
-def _describe_camera(refined: Refined, sequence: Sequence) -> str:
+def _describe_camera(refined: RefinementResult, sequence: Sequence) -> str:
     """Return how the camera was determined."""
-    found, focal = refined.camera, float(refined.run.camera.focal)
+    found, focal = refined.intrinsics, float(refined.run.camera.focal)
     if found is None:
         return f"focal length {focal:.1f} px, as given"
     if torch.equal(refined.run.camera.params.cpu(), sequence.camera.params):
         against = contradiction(sequence.camera, found) or "the images do not contradict it"
         return f"focal length {focal:.1f} px, as given; {against}"
-    std = found.std * focal
+    std = found.focal_std * focal
     return (
         f"focal length {focal:.1f} ± {std:.1f} px from the images, given {float(sequence.camera.focal):.1f}"
     )
 
 
-def _describe_poses(refined: Refined, sequence: Sequence) -> dict[str, str]:
+def _describe_poses(refined: RefinementResult, sequence: Sequence) -> dict[str, str]:
     """Return the number of given poses and of those not used, as a row for `table`."""
     words = f"{len(refined.given)} from {refined.given.path}"
     if refined.without_image:

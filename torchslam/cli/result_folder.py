@@ -1,4 +1,4 @@
-"""The folder that a run writes to: free, or to be overwritten, or that of a run to go on with."""
+"""Results folder of a run: overwrite protection and checkpoints."""
 
 from __future__ import annotations
 
@@ -12,15 +12,23 @@ from torchslam.system.run import RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.utils.atomic_write import write_whole
 
-GROWTH = 0.05  # checkpoints come as seldom as every so many of the keyframes so far: all of them together cost O(n)
+GROWTH = (
+    0.05  # minimum interval as a ratio of the keyframes so far, so that all checkpoints together cost O(n)
+)
 PROBE = ".torchslam-can-write"
 
 
 def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
-    """Make the folder and see that it can be written to: better now than after an hour's run.
+    """Create the results folder and check that it can be written to, before the run.
 
-    overwrite: what a run left there is given up, its checkpoint at once; resume: it is needed.
-    Raises ResultsError where there are results that must stay, OSError where nothing can be written.
+    Args:
+        folder: the results folder.
+        overwrite: replace existing results; their checkpoint is deleted at once.
+        resume: continue from the checkpoint in the folder.
+
+    Raises:
+        ResultsError: if the folder has results that would be lost.
+        OSError: if the folder cannot be written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / PROBE, b"")
@@ -29,18 +37,17 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
     if overwrite:
         checkpoint.unlink(missing_ok=True)
     elif checkpoint.exists() and not resume:
-        raise ResultsError(
-            f"{checkpoint}: a run that did not finish: --resume goes on with it, --overwrite gives it up"
-        )
+        raise ResultsError(f"{checkpoint}: an unfinished run: --resume continues it, --overwrite replaces it")
     elif there and not checkpoint.exists():
-        what = "and there is no checkpoint to resume" if resume else "which would be replaced"
-        raise ResultsError(f"{there[0]}: results of an earlier run, {what}: --overwrite gives them up")
+        what = "but no checkpoint to resume from" if resume else "which would be lost"
+        raise ResultsError(f"{there[0]}: results of an earlier run, {what}: --overwrite replaces them")
 
 
 class Checkpoints:
-    """Takes a checkpoint every so many keyframes, when the system is settled.
+    """Writes a checkpoint every few keyframes, whenever the system state allows it.
 
-    every: keyframes from one to the next, at least, and 5 % of those that there are; 0: none is taken
+    Args:
+        every: minimum number of keyframes between checkpoints, which is at least 5 % of all; 0: no checkpoints.
     """
 
     def __init__(self, folder: Path, every: int, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
@@ -50,7 +57,7 @@ class Checkpoints:
         self._last = self._keyframes()
 
     def offer(self, at_once: bool = False) -> None:
-        """After a frame: take a checkpoint if it is time for one, or because the run is to end."""
+        """Write a checkpoint after a frame if one is due, or `at_once` before the run ends."""
         slam, so_far, sequence = self._run
         if not self._every or not slam.mapping or not slam.can_checkpoint:
             return
@@ -60,7 +67,7 @@ class Checkpoints:
             self._last = keyframes
 
     def remove(self) -> None:
-        """The run has finished."""
+        """Delete the checkpoint of a finished run."""
         self._path.unlink(missing_ok=True)
 
     def _keyframes(self) -> int:

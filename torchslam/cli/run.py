@@ -19,20 +19,18 @@ import torch
 
 from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.cli import arguments
-from torchslam.cli.progress import ProgressBar
+from torchslam.cli.progress import ProgressBar, Stopping
 from torchslam.cli.result_folder import Checkpoints, prepare
-from torchslam.cli.signals import Stopping
 from torchslam.config import Config
 from torchslam.data import Sequence
+from torchslam.data.calibration import is_found
 from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.calibration_file import is_found
 from torchslam.io.export.recording import import_rerun
-from torchslam.io.metrics import compute_metrics
-from torchslam.io.report import result_warnings, summary, table
+from torchslam.io.report import compute_metrics, result_warnings, summary
 from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
@@ -43,6 +41,7 @@ from torchslam.system.front_end import source
 from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
+from torchslam.utils.console import table
 
 DONE = 0
 NO_MAP = 3
@@ -51,16 +50,16 @@ CHECKPOINT_EVERY = 20  # keyframes
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a run reads and writes.
+    """Inputs, outputs and options of a run.
 
-    source:     what the sequence was opened from, for those that need its images again; fps: with how many a second,
-                where that was said
-    output:     folder of the results; `overwrite` what is there, or `resume` it from its checkpoint
-    map:        file of a saved map to go on in, without `mapping` only to localize in it
-    checkpoint: keyframes from one checkpoint to the next; 0: none
-    refine:     improve the given camera by the images first; distortion: its distortion, too
-    processes:  how many; None: what is best
-    view:       show the run live in rerun; video: write a film of what is tracked
+    Attributes:
+        source, fps: path and frame rate with which the sequence was opened, for exports that read it again.
+        output: results folder; `overwrite` it, or `resume` from its checkpoint.
+        map: saved map to continue; without `mapping` only to localize in it.
+        checkpoint: keyframes between two checkpoints; 0: none.
+        refine: refine the given camera from the images first; `distortion`: also its distortion.
+        processes: number of processes; None: chosen automatically.
+        view: show the run live in rerun; `video`: write a video of the tracked frames.
     """
 
     source: str
@@ -152,7 +151,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _sequence(options: argparse.Namespace) -> Sequence:
-    """The sequence; without a calibration, as with `--camera auto`."""
+    """Open the sequence, with an initial guess of the camera if it has no calibration."""
     found = arguments.sequence(options)
     if found.calibrated is not Calibrated.MISSING or found.known_length is None:
         return found
@@ -170,12 +169,12 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     slam, so_far = _begin(sequence, config, plan)
     sequence = source(sequence, config, slam.camera)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
-    processes = 1 if plan.view or plan.video else plan.processes  # images are wanted here, not elsewhere
+    processes = (
+        1 if plan.view or plan.video else plan.processes
+    )  # the viewers need the images in this process
     with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
-        is_live, latencies = (
-            not len(sequence.timestamps),
-            list[float](),
-        )  # of a live source: from the capture of a frame to its pose
+        is_live = not len(sequence.timestamps)
+        latencies: list[float] = []  # of a live source, in milliseconds from capture to pose
         bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
         with bar as progress:
 
@@ -191,13 +190,13 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
         stopping.begin("when the results are written")
-        figures = _write(finished, sequence, plan, found, latencies)
+        metrics = _write(finished, sequence, plan, found, latencies)
         watching.end(finished)
     written = {"results": plan.output, "view": plan.output / VIEW}
     written |= {"video": plan.output / VIDEO} if plan.video else {}
-    words = summary(figures) | {label: str(path) for label, path in written.items()}
+    words = summary(metrics) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
-    for warning in result_warnings(figures):
+    for warning in result_warnings(metrics):
         print(f"torchslam: warning: {warning}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results so far were written", file=sys.stderr)
@@ -210,7 +209,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
 
 
 def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:
-    """The sequence with the camera of the run, and what there is to say of it where the images found it."""
+    """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
     is_guess = sequence.calibrated is Calibrated.GUESSED and sequence.known_length is not None
     if plan.map is not None or not (plan.refine or is_guess):
         if not plan.resume and is_found(plan.output / CALIBRATION):
@@ -230,7 +229,7 @@ def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequen
 
 
 def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunProgress]:
-    """The system before the first frame, or after the last one that a checkpoint knows."""
+    """Return a new system, or one restored from a checkpoint or a saved map, with its progress."""
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
         slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
@@ -255,7 +254,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunPro
 
 
 def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> FrameViewers:
-    """What shows the frames as they pass; a film of an earlier run goes."""
+    """Return the viewers of the run; delete the video of an earlier run."""
     (plan.output / VIDEO).unlink(missing_ok=True)
     screens: list[FrameViewer] = [LiveView.spawn(slam)] if plan.view else []
     if plan.video:
@@ -273,14 +272,16 @@ def _write(
 ) -> dict[str, object]:
     """Evaluate and write the run; returns the metrics.
 
-    camera: what there is to say of it before the run; latencies: milliseconds, of a live source
+    Args:
+        camera: remark on the estimated camera.
+        latencies: milliseconds from capture to pose, of a live source.
     """
-    figures = compute_metrics(
+    metrics = compute_metrics(
         finished, sequence, camera, lambda words: print(f"torchslam: warning: {words}", file=sys.stderr)
     )
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
-        figures["latency_ms"] = {"median": median, "p95": p95}
-    figures |= {"source": full_name(plan.source), "source_fps": plan.fps}
-    write_run(finished, sequence, figures, plan.output)
-    return figures
+        metrics["latency_ms"] = {"median": median, "p95": p95}
+    metrics |= {"source": full_name(plan.source), "source_fps": plan.fps}
+    write_run(finished, sequence, metrics, plan.output)
+    return metrics

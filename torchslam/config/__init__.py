@@ -9,17 +9,24 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchslam.config.builtin import find
-from torchslam.config.dynamic import IndependentMotionConfig, StaticOverlayConfig
-from torchslam.config.features import FeaturesConfig, MatchingConfig, MeasurementConfig, SimulatedConfig
-from torchslam.config.mapping import BundleAdjustmentConfig, KeyframesConfig, LoopClosingConfig, MappingConfig
-from torchslam.config.schema import Settings, choices, enlarged, merged, setting, to_toml
-from torchslam.config.tracking import (
+from torchslam.config.schema import Settings, choices, merge_settings, scale_pixel_settings, setting, to_toml
+from torchslam.config.sections import (
+    BundleAdjustmentConfig,
+    FeaturesConfig,
+    IndependentMotionConfig,
     InitializationConfig,
+    KeyframesConfig,
+    LoopClosingConfig,
+    MappingConfig,
+    MatchingConfig,
+    MeasurementConfig,
     PoseValidationConfig,
     RelocalizationConfig,
+    SimulatedConfig,
+    StaticOverlayConfig,
     TrackingConfig,
 )
+from torchslam.errors import ConfigError
 
 __all__ = [
     "CHOICES",
@@ -45,10 +52,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Config(Settings):
-    """All settings, section by section: `Config(loop_closing=LoopClosingConfig(enabled=False))`, or by `load_config`.
+    """All settings by section, for example `Config(loop_closing=LoopClosingConfig(enabled=False))`.
 
-    Frozen, like its sections: `dataclasses.replace` makes another one. Raises ConfigError for a value that is not
-    allowed, however it is made.
+    Frozen, like its sections; `dataclasses.replace` returns a changed copy. Every way of building it raises ConfigError
+    for a value that is not allowed.
     """
 
     seed: int = setting(0, "Seed of the random number generators.", low=0, high=2**63 - 1)
@@ -73,22 +80,54 @@ class Config(Settings):
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
 
     def for_size(self, size: tuple[int, int]) -> Config:
-        """The configuration for images (width, height): what is said in pixels of reduced ones grows with them.
+        """Return the configuration for images of a size (width, height).
 
-        What is said in units of a keypoint's scale does not: the scale has grown already.
+        Settings in pixels refer to the reduced images and are scaled to the given size. Settings in units of the
+        keypoint scale are not, since the scale itself is larger.
         """
-        return enlarged(self, self.features.reduction(size))
+        return scale_pixel_settings(self, self.features.reduction(size))
 
 
 CHOICES = choices(Config)
-"""The settings that are one of a few words, by full name."""
+"""Allowed values of the settings that have a fixed set of them, by full name."""
+
+
+_PACKAGE = Path(__file__).parents[1]
+FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
+"""Folder of the built-in configurations: in the package of a wheel (`setup.py`), in the root of a checkout."""
+
+
+def builtin_names() -> list[str]:
+    """Return the names of the built-in configurations."""
+    return sorted(file.stem for file in FOLDER.glob("*.toml"))
+
+
+def find_config(file: str | Path) -> Path:
+    """Return the path of a configuration file, given as a path or as the name of a built-in configuration.
+
+    Raises:
+        ConfigError: if a string without folder and suffix is neither a name nor a file.
+    """
+    if not isinstance(file, str) or not file or Path(file).suffix or Path(file).name != file:
+        return Path(file)
+    if file in builtin_names():
+        return FOLDER / f"{file}.toml"
+    if not Path(file).exists():
+        raise ConfigError(
+            f"configuration file {file} does not exist, nor a configuration of that name; "
+            f"there are {', '.join(builtin_names())}"
+        )
+    return Path(file)
 
 
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
-    """The defaults, changed by a TOML file, changed by overrides of the form `section.key=value`.
+    """Load a configuration: the defaults, changed by a TOML file, then by overrides.
 
-    path: of the file, or as a string the name of one of `configs/`, such as "paper"
+    Args:
+        path: the file, or as a string the name of a built-in configuration, such as "paper".
+        overrides: changes of the form `section.key=value`.
 
-    Raises ConfigError for a missing or malformed file, an unknown key, or a value of the wrong type or not allowed.
+    Raises:
+        ConfigError: for a missing or malformed file, an unknown key, or a value that is not allowed.
     """
-    return merged(Config(), None if path is None else find(path), overrides)
+    return merge_settings(Config(), None if path is None else find_config(path), overrides)

@@ -1,8 +1,7 @@
-"""What a configuration is made of: frozen dataclasses that check themselves, read from TOML and written back.
+"""Self-validating configuration dataclasses, read from and written to TOML.
 
-A setting is declared with its type, its default and what it allows; whatever builds a section - a constructor,
-`dataclasses.replace`, a TOML file, an override - goes through the same check. An unknown key in a file is an error
-that names the nearest known one.
+A setting declares its type, default and allowed values. Constructors, `dataclasses.replace`, TOML files and overrides
+all run the same validation. An unknown key is an error that suggests the most similar known one.
 """
 
 from __future__ import annotations
@@ -23,22 +22,23 @@ from torchslam.utils.bounded_read import read_text
 Value = TypeVar("Value", bool, int, float, str)
 Section = TypeVar("Section", bound="Settings")
 MAX_BYTES = 1 << 16
-"""Of a file of settings: all of them with all that there is to say of them are a quarter of that."""
+"""Size limit of a configuration file; all settings with their descriptions take a quarter of it."""
 SHOWN = 200
-"""Characters of a value in a message."""
+"""Maximum number of characters of a value in a message."""
 MAX_LINE = 1 << 12
-"""Characters of a line: the time that a key of many parts takes grows with the square of their number."""
+"""Maximum line length: the time to parse a dotted key grows with the square of its parts."""
 
 
 @dataclass(frozen=True)
 class Allowed:
-    """What a setting may be, beside its type; `str` says it in words.
+    """Allowed values of a setting; `str` describes them.
 
-    low, high: the range of a number, both ends in it
-    above:     a lower end that is not in the range
-    also:      a number outside of the range that means something else
-    choices:   of a string; empty for any
-    group:     of entry points, whose names are choices as well, and so is PACKAGE:NAME
+    Attributes:
+        low, high: inclusive range of a number.
+        above: exclusive lower bound of a number.
+        also: special value outside of the range.
+        choices: allowed strings; empty for any.
+        group: entry-point group whose names are allowed as well, like PACKAGE:NAME.
     """
 
     low: float = 0
@@ -80,10 +80,11 @@ def setting(
     grows: bool = False,
     group: str = "",
 ) -> Value:
-    """A field of a Settings class with what it allows, as in `Allowed`: without `low`, no negative number.
+    """Declare a field of a Settings class with its allowed values, see `Allowed`; non-negative without `low`.
 
-    about: what it is, in words, for `explained`
-    grows: whether it is a length in the image, for `enlarged`
+    Args:
+        about: description, for `to_commented_toml` and the documentation.
+        grows: whether the value is an image length that `scale_pixel_settings` scales.
     """
     allowed = Allowed(low, high, above, choices, also, group)
     return field(default=default, metadata={"allowed": allowed, "about": about, "grows": grows})
@@ -91,10 +92,10 @@ def setting(
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of the frozen dataclasses of a configuration: bool, int, float and str, and further sections.
+    """Base class of configuration dataclasses with fields of type bool, int, float, str or Settings.
 
-    The argument `section` of the class is its place in the configuration, for messages; none for the outermost one.
-    Raises ConfigError for a value of the wrong type or not allowed. An integer serves as a float.
+    The class argument `section` is its name in the configuration, for messages. Raises ConfigError for a value of the
+    wrong type or not allowed. Integers are accepted as floats.
     """
 
     _prefix: ClassVar[str] = ""
@@ -110,14 +111,15 @@ class Settings:
 
 
 def choices(kind: type[Settings]) -> dict[str, tuple[str, ...]]:
-    """The choices of every setting that has some, by its full name."""
+    """Return the allowed strings of every setting that has a fixed set of them, by full name."""
     return {name: allowed.choices for name, allowed in _everything(kind) if allowed.choices}
 
 
-def merged(config: Section, path: Path | str | None = None, overrides: Iterable[str] = ()) -> Section:
-    """The configuration changed by a TOML file, changed by overrides of the form `section.key=value`.
+def merge_settings(config: Section, path: Path | str | None = None, overrides: Iterable[str] = ()) -> Section:
+    """Return the configuration changed by a TOML file, then by overrides of the form `section.key=value`.
 
-    Raises ConfigError for a missing or malformed file, an unknown key, or a value of the wrong type or not allowed.
+    Raises:
+        ConfigError: for a missing or malformed file, an unknown key, or a value that is not allowed.
     """
     if path is not None:
         config = _merge(config, _read_toml(Path(path)), str(path), type(config))
@@ -126,13 +128,13 @@ def merged(config: Section, path: Path | str | None = None, overrides: Iterable[
     return config
 
 
-def enlarged(config: Section, factor: float) -> Section:
-    """The configuration with every setting that `grows` multiplied by a factor, as far as its range allows."""
+def scale_pixel_settings(config: Section, factor: float) -> Section:
+    """Return the configuration with every setting that `grows` multiplied by a factor, clipped to its range."""
     changes: dict[str, Any] = {}
     for name in _declared(type(config)):
         value = getattr(config, name)
         if isinstance(value, Settings):
-            changes[name] = enlarged(value, factor)
+            changes[name] = scale_pixel_settings(value, factor)
     changes |= {
         f.name: min(factor * getattr(config, f.name), f.metadata["allowed"].high)
         for f in fields(config)
@@ -142,7 +144,7 @@ def enlarged(config: Section, factor: float) -> Section:
 
 
 def to_toml(config: Settings) -> str:
-    """The configuration as TOML, every value written out."""
+    """Return the configuration as TOML with all values."""
     values = {name: getattr(config, name) for name in _declared(type(config))}
     sections = {name: value for name, value in values.items() if isinstance(value, Settings)}
     lines = [f"{name} = {_toml_value(value)}" for name, value in values.items() if name not in sections]
@@ -151,8 +153,8 @@ def to_toml(config: Settings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def explained(config: Settings) -> str:
-    """The configuration as TOML, above every value what it is, what it may be and what it is by default."""
+def to_commented_toml(config: Settings) -> str:
+    """Return the configuration as TOML with the description, range and default of every setting as comments."""
     lines, inner = [], []
     for declared in fields(config):
         value, about = getattr(config, declared.name), declared.metadata.get("about", "")
@@ -164,7 +166,7 @@ def explained(config: Settings) -> str:
                 *(f"# {line.strip()}" for line in words[:1] if "(" not in line),
                 f"[{declared.name}]",
             ]
-            inner.append(explained(value).rstrip("\n"))
+            inner.append(to_commented_toml(value).rstrip("\n"))
             continue
         allowed = _declared(type(config))[declared.name][1]
         is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
@@ -175,13 +177,13 @@ def explained(config: Settings) -> str:
 
 
 def _declared(kind: type[Settings]) -> dict[str, tuple[type, Allowed]]:
-    """Type and constraint of each setting, by name."""
+    """Return type and constraint of each setting, by name."""
     hints = get_type_hints(kind)
     return {f.name: (hints[f.name], f.metadata.get("allowed", Allowed())) for f in fields(kind)}
 
 
 def _everything(kind: type[Settings]) -> Iterator[tuple[str, Allowed]]:
-    """Full name and constraint of each setting, and of each section before what is in it."""
+    """Yield full name and constraint of each setting and section, sections before their content."""
     for name, (inner, allowed) in _declared(kind).items():
         yield kind._prefix + name, allowed
         if issubclass(inner, Settings):
@@ -189,7 +191,7 @@ def _everything(kind: type[Settings]) -> Iterator[tuple[str, Allowed]]:
 
 
 def _checked(name: str, value: Any, kind: type, allowed: Allowed) -> Any:
-    """The value, an integer as a float where a float is wanted. Raises ConfigError."""
+    """Return the value, converted from int to float if required. Raises ConfigError."""
     number = value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         try:
@@ -225,9 +227,8 @@ def _toml_value(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace(
-            "\x7f", "\\u007f"
-        )  # the one JSON leaves and TOML forbids
+        # JSON leaves this character as it is, TOML forbids it.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
 
@@ -268,7 +269,7 @@ def _parse_override(text: str) -> dict[str, Any]:
 
 
 def _merge(config: Section, values: Mapping[str, Any], source: str, root: type[Settings]) -> Section:
-    """The section with some values changed; `root`, the outermost one, is for suggestions."""
+    """Return the section with some values changed; `root` is the outermost one, for suggestions."""
     changes: dict[str, Any] = {}
     for key, value in values.items():
         name = config._prefix + key

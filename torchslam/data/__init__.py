@@ -3,9 +3,9 @@
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import parse_camera
 from torchslam.data.formats.calibration_files import read_calibration
-from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
 from torchslam.data.opening import open_sequence
 from torchslam.data.sequence import Calibrated, EndOfSequence, Sequence
+from torchslam.data.trajectories import read_trajectory, write_trajectory
 
 __all__ = [
     "Calibrated",

@@ -1,16 +1,17 @@
-"""Cameras whose image size is not known yet: numbers that are checked, focal lengths that are guessed, presets."""
+"""Cameras before the image size is known: calibrations, focal-length guesses, dataset presets, and calibration.txt."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from torchslam.data.formats.text_file import numbered_lines, parse_floats
-from torchslam.errors import CalibrationError
+from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
+from torchslam.utils.atomic_write import write_whole
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
@@ -22,11 +23,12 @@ Size = tuple[int, int]
 class Calibration:
     """A camera whose image size may not be known yet.
 
-    model:   "pinhole", "radial_tangential" or "fisheye"
-    params:  fx fy cx cy, pixels, and all of the model's distortion coefficients
-    source:  where the numbers come from, for messages
-    size:    (width, height) of the images it is for, where the source says
-    guessed: whether it is only near the truth
+    Attributes:
+        model: "pinhole", "radial_tangential" or "fisheye".
+        params: fx fy cx cy in pixels, and all distortion coefficients of the model.
+        source: origin of the numbers, for messages.
+        size: (width, height) of the images, if known.
+        guessed: True if only approximate.
     """
 
     model: str
@@ -39,7 +41,7 @@ class Calibration:
     def from_numbers(
         numbers: list[float], source: str, model: str | None = None, size: Size | None = None
     ) -> Calibration:
-        """Checked numbers; the model follows from how many there are unless it is named.
+        """Build a calibration from numbers; without `model`, their count determines it.
 
         Raises CalibrationError for a wrong count or a focal length that is not positive.
         """
@@ -59,7 +61,7 @@ class Calibration:
         return Calibration(model, tuple(numbers), source, size)
 
     def camera(self, size: Size) -> Camera:
-        """The camera for images of `size`. Raises CalibrationError where it is for another one."""
+        """Return the camera for images of `size`. Raises CalibrationError if it is for another size."""
         if self.size not in (None, size):
             raise CalibrationError(
                 f"{self.source}: the camera is for images of {size_text(self.size or size)}, "
@@ -70,10 +72,11 @@ class Calibration:
 
 @dataclass(frozen=True)
 class FocalGuess:
-    """A focal length alone: square pixels, no distortion, the principal point in the middle.
+    """A guessed focal length: square pixels, no distortion, centered principal point.
 
-    focal:  in units of `unit`: "px" pixels, "w" widths of the image, "diagonal" diagonals of it
-    source: what it comes from, for messages
+    Attributes:
+        focal: in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
+        source: origin of the guess, for messages.
     """
 
     focal: float
@@ -90,7 +93,7 @@ class FocalGuess:
 
 @dataclass(frozen=True)
 class Preset:
-    """The published cameras of a dataset, told apart by the size of their images."""
+    """Published cameras of a dataset, selected by the image size."""
 
     name: str
     cameras: tuple[Calibration, ...]
@@ -100,7 +103,7 @@ class Preset:
         return any(camera.guessed for camera in self.cameras)
 
     def camera(self, size: Size) -> Camera:
-        """The one for images of `size`. Raises CalibrationError where there is none."""
+        """Return the camera for images of `size`. Raises CalibrationError if there is none."""
         for calibration in self.cameras:
             if calibration.size == size:
                 return calibration.camera(size)
@@ -111,7 +114,7 @@ class Preset:
 
 
 def parse_numbers(text: str, source: str) -> Calibration:
-    """A calibration from `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
+    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
 
     Raises CalibrationError naming `source`.
     """
@@ -129,7 +132,7 @@ def size_text(size: Size) -> str:
 
 
 def read_numbers(path: Path) -> Calibration:
-    """A calibration from the first line of a file; the distortion may stand in a `distortion.txt` beside it.
+    """Read a calibration from the first line of a file, and the distortion from a `distortion.txt` next to it.
 
     Raises CalibrationError naming file and line.
     """
@@ -150,3 +153,75 @@ def _first_line(path: Path) -> tuple[int, str]:
     for number, line in numbered_lines(path, CalibrationError):
         return number, line
     raise CalibrationError(f"{path}: no numbers; expected {NUMBERS}")
+
+
+VGA = (640, 480)
+
+
+def _published(size: Size, *numbers: float) -> Calibration:
+    return Calibration.from_numbers(list(numbers), "preset", size=size)
+
+
+_CAMERAS: dict[str, tuple[Calibration, ...]] = {
+    # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, calibration of the color cameras;
+    # the images of fr3 are undistorted already.
+    "tum-fr1": (_published(VGA, 517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),),
+    "tum-fr2": (_published(VGA, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),),
+    "tum-fr3": (_published(VGA, 535.4, 539.2, 320.1, 247.6),),
+    # sensor.yaml of cam0 in every sequence of https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
+    "euroc": (
+        _published(
+            (752, 480),
+            *(458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+        ),
+    ),
+    # P0 in calib.txt of the odometry benchmark, by the size of its images: sequences 00-02 (and 13-21), 03, 04-12.
+    "kitti": (
+        _published((1241, 376), 718.856, 718.856, 607.1928, 185.2157),
+        _published((1242, 375), 721.5377, 721.5377, 609.5593, 172.854),
+        _published((1226, 370), 707.0912, 707.0912, 601.8873, 183.1104),
+    ),
+    # The dataset gives no calibration of the color camera: 525 is the Kinect's nominal focal length.
+    "7-scenes": (replace(_published(VGA, 525.0, 525.0, 319.5, 239.5), guessed=True),),
+    # https://github.com/castacks/tartanair_tools/blob/master/data_type.md (90 degrees over 640 pixels); the second
+    # version of the dataset has the same angle over square images.
+    "tartanair": (
+        _published(VGA, 320.0, 320.0, 320.0, 240.0),
+        _published((640, 640), 320.0, 320.0, 320.0, 320.0),
+    ),
+    # https://www.doc.ic.ac.uk/~ahanda/VaFRIC/codes.html; there fy is -480, as its camera's y axis points up.
+    "icl": (_published(VGA, 481.2, 480.0, 319.5, 239.5),),
+}
+
+PRESETS = {name: Preset(name, cameras) for name, cameras in _CAMERAS.items()}
+
+ESTIMATED_HEADER = "# torchslam: camera estimated from the images"
+PARAMETER_NAMES = {
+    "pinhole": "fx fy cx cy",
+    "radial_tangential": "fx fy cx cy k1 k2 p1 p2 k3",
+    "fisheye": "fx fy cx cy k1 k2 k3 k4",
+}
+
+
+def is_found(path: Path) -> bool:
+    """True for a file that `write_calibration` wrote."""
+    return path.exists() and path.read_text(encoding="utf-8", errors="replace").startswith(ESTIMATED_HEADER)
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise ResultsError if a file exists that `write_calibration` did not write."""
+    if path.exists() and not is_found(path):
+        raise ResultsError(f"{path}: not replaced, since this calibration was not written by torchslam")
+
+
+def write_calibration(path: Path, camera: Camera, remarks: list[str]) -> None:
+    """Write an estimated camera as a calibration file, with remarks as comments."""
+    model = "" if camera.model != "fisheye" else "fisheye "
+    numbers = " ".join(f"{number:.9g}" for number in camera.params.tolist())
+    lines = [
+        ESTIMATED_HEADER,
+        *(f"# {remark}" for remark in remarks),
+        f"# {PARAMETER_NAMES[camera.model]}",
+        model + numbers,
+    ]
+    write_whole(path, ("\n".join(lines) + "\n").encode())

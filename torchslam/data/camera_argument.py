@@ -1,36 +1,82 @@
-"""What `--camera` may say. `parse_camera` is the one way from such an argument to a camera."""
+"""The `--camera` argument: numbers, calibration files, presets, EXIF and focal-length guesses."""
 
 from __future__ import annotations
 
 import difflib
+import io
 import math
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
-from torchslam.data.calibration import COUNTS, Calibration, FocalGuess, Preset, Size, parse_numbers, size_text
+from PIL import Image
+
+from torchslam.data.calibration import (
+    COUNTS,
+    PRESETS,
+    Calibration,
+    FocalGuess,
+    Preset,
+    Size,
+    parse_numbers,
+    size_text,
+)
 from torchslam.data.formats.calibration_files import read_calibration
-from torchslam.data.formats.exif import FromExif, read_focal
+from torchslam.data.formats.image_file import MAX_BYTES
 from torchslam.data.formats.text_file import parse_floats
-from torchslam.data.presets import PRESETS
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
+from torchslam.utils import bounded_read as regular_file
+
+EXIF_BLOCK = 0x8769
+FOCAL_LENGTH_35MM = 0xA405
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimeters
+
+
+@dataclass(frozen=True)
+class FromExif:
+    """Placeholder for the focal length in the EXIF block of the first image."""
+
+    guessed: bool = True
+
+    def camera(self, size: Size) -> Camera:
+        raise CalibrationError("--camera exif: only image files have an EXIF block")
+
+
+def read_focal(path: Path) -> FocalGuess:
+    """Read the 35 mm equivalent focal length of an image file (EXIF 2.32, tag 0xA405), relative to the diagonal.
+
+    Raises CalibrationError for a file without one.
+    """
+    try:
+        content = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
+        with Image.open(io.BytesIO(content)) as image:
+            found = image.getexif().get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH_35MM)
+    except Exception as cause:  # a damaged block fails in any way
+        raise CalibrationError(f"{path}: its EXIF block cannot be read: {cause}") from cause
+    if not isinstance(found, int | float) or not 0 < found < math.inf:
+        raise CalibrationError(
+            f"{path}: no 35 mm focal length in its EXIF block; give --camera f=0.8w or fov=65 instead"
+        )
+    return FocalGuess(found / FILM_DIAGONAL, "diagonal", f"EXIF of {path.name}, {found:g} mm")
+
 
 AUTO = "auto"
 EXIF = "exif"
-USUAL_FOCAL = 0.85  # widths of the image: of most phones and webcams it is 0.7 to 1
+USUAL_FOCAL = 0.85  # image widths; phones and webcams have 0.7 to 1
 FOCAL = re.compile(r"f=([^wpx,\s]+)(w|px)?")
 FIELD_OF_VIEW = re.compile(r"fov=([^,\s]+)")
 
 UNKNOWN = FocalGuess(USUAL_FOCAL, "w", AUTO)
-"""Where nothing is known."""
+"""Guess for an unknown camera."""
 
 GivenCamera = Camera | Calibration | FocalGuess | Preset | FromExif
-"""A camera as a reader takes it: whole, or as soon as the size of the images is known."""
+"""Camera argument of the readers: complete, or to be completed with the image size."""
 
 
 def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
-    """The camera that a `--camera` argument means, for images of `size` (width, height).
+    """Parse a `--camera` argument for images of `size` (width, height).
 
     text:    `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w` (widths
              of the image) or `f=500` (pixels), `fov=65` (horizontal, degrees), a preset such as `tum-fr1`, `exif`,
@@ -43,7 +89,7 @@ def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
 
 
 def parse_calibration(text: str, source: str = "--camera") -> Calibration | FocalGuess | Preset | FromExif:
-    """What a `--camera` argument means, before the size of the images is known; see `parse_camera`.
+    """Parse a `--camera` argument before the image size is known; see `parse_camera`.
 
     Raises CalibrationError naming `source`.
     """
@@ -66,7 +112,7 @@ def parse_calibration(text: str, source: str = "--camera") -> Calibration | Foca
 
 
 def fit_camera(camera: GivenCamera, size: Size, where: str, example: Path | None = None) -> Camera:
-    """The camera for images of `size`. Raises CalibrationError at `where` for one that is for another size.
+    """Return the camera for images of `size`. Raises CalibrationError at `where` for a camera of another size.
 
     example: an image file of the sequence, for its EXIF block
     """
@@ -82,12 +128,12 @@ def fit_camera(camera: GivenCamera, size: Size, where: str, example: Path | None
 
 
 def unknown_camera(size: Size) -> Camera:
-    """A first guess for images of `size` where nothing is known."""
+    """Return the initial guess of an unknown camera."""
     return UNKNOWN.camera(size)
 
 
 def is_guessed(camera: GivenCamera | None) -> bool:
-    """Whether a camera is only near the truth."""
+    """True if a camera is only approximate."""
     return camera is not None and not isinstance(camera, Camera) and camera.guessed
 
 

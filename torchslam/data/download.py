@@ -26,7 +26,7 @@ from tqdm import tqdm
 from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
 from torchslam.utils import bounded_read as regular_file
-from torchslam.utils.progress import stream
+from torchslam.utils.console import tqdm_options
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
@@ -210,7 +210,7 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
             unit_scale=True,
             desc=url.rsplit("/", 1)[-1],
             disable=not progress,
-            **stream(),
+            **tqdm_options(),
         )
         with bar, part.open("ab" if resumed else "wb") as file:
             since, waited = 0, time.monotonic()

@@ -1,20 +1,25 @@
-"""One way into every kind of sequence: `open_sequence(path)` looks at what is there."""
+"""`open_sequence`: one entry point for folders, files, archives and streams, with suggestions for wrong paths."""
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import math
+import tempfile
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, parse_calibration
-from torchslam.data.formats import archive
-from torchslam.data.formats.transforms import cut, resize, thin
-from torchslam.data.masks import Masked
-from torchslam.data.readers.registry import find_reader, live
+from torchslam.data.download import unpack
+from torchslam.data.formats.frame_names import folder_kind, other_kind, subfolder
+from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.readers.registry import READERS, bag, find_reader, live, video
 from torchslam.data.sequence import Sequence
-from torchslam.data.suggestions import why_nothing
 from torchslam.data.synthetic import sequence as synthetic
-from torchslam.errors import SequenceError
+from torchslam.data.transforms import Masked, cut, resize, thin
+from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.geometry.camera import Camera
 
 
@@ -29,21 +34,23 @@ def open_sequence(
     resize_to: str | None = None,
     mask: str | Path | None = None,
 ) -> Sequence:
-    """A sequence of whatever kind lies at `path`.
+    """Open a sequence of any supported kind.
 
-    path:   a folder of ETH3D, TUM, KITTI (odometry, raw), EuRoC, 7-Scenes, TartanAir or ICL-NUIM, a folder of images or
-            one with them in `images/` or `rgb/`, a pattern of files, a video, a zip of any of these, a ROS bag, the
-            number of a camera, the address of a stream, or `synthetic:room`
-    camera: a Camera, or what `parse_camera` takes; overrides the calibration found at `path`. Where there is none
-            either, the sequence has no camera (`Sequence.calibrated`)
-    fps:    frames per second: at most so many are taken; images without times are taken to be so many a second
-            (otherwise 30)
-    start, stop: from this frame, to before that one; numbers, or times after the first frame as `12.5s` and `1:30`
-    stride, limit: of these every `stride`-th one, and at most `limit`
-    resize_to: `640x480`, `640` (width) or `0.5`: the images, and the camera with them
-    mask:   an image, black where no features are wanted, or a folder of them (`Masked`); of the size before resizing
+    Args:
+        path: a folder of ETH3D, TUM, KITTI (odometry, raw), EuRoC, 7-Scenes, TartanAir or ICL-NUIM, a folder of images
+            (also in `images/` or `rgb/`), a file pattern, a video, a zip of any of these, a ROS bag, the number of a
+            camera, the address of a stream, or `synthetic:room`.
+        camera: a Camera, or text for `parse_camera`; overrides the calibration found at `path`. If there is neither,
+            the sequence has no camera (`Sequence.calibrated`).
+        fps: maximum number of frames per second; also the frame rate of images without timestamps (default: 30).
+        limit: maximum number of frames.
+        stride: use every `stride`-th frame.
+        start, stop: first frame and end of the range, as numbers or times such as `12.5s` and `1:30`.
+        resize_to: new size `640x480`, `640` (width) or `0.5`; the camera is adapted.
+        mask: mask image, black where no features are wanted, or a folder of masks (`Masked`), in the original size.
 
-    Raises SequenceError, CalibrationError or TrajectoryError that name file and line.
+    Raises:
+        SequenceError, CalibrationError, TrajectoryError: naming file and line.
     """
     if fps is not None and not 0 < fps < math.inf:
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
@@ -52,7 +59,7 @@ def open_sequence(
         sequence = _open(str(path), given, fps)
         if mask is not None:
             sequence = Masked(sequence, mask)
-    except OSError as cause:  # a folder that may not be listed, a name that is too long
+    except OSError as cause:  # an unreadable folder, or a name that is too long
         raise SequenceError(f"{cause.filename or path}: cannot be read: {cause.strerror or cause}") from cause
     sequence = cut(sequence, start, stop)
     if fps is not None:
@@ -63,15 +70,120 @@ def open_sequence(
 
 
 def full_name(path: str | Path) -> str:
-    """What opens the same sequence from another folder too."""
+    """Return a path that opens the sequence from any working directory."""
     path = str(path)
     return path if synthetic.matches(path) or live.matches(path) else str(Path(path).absolute())
 
 
 def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
-    if archive.matches(path):
-        return archive.open(path, lambda folder: _open(folder, camera, rate))
+    if _is_archive(path):
+        return _open_archive(path, lambda folder: _open(folder, camera, rate))
     reader = find_reader(path)
     if reader is None:
-        raise SequenceError(why_nothing(path))
+        raise SequenceError(_not_found_message(path))
     return reader.open(path, camera, rate)
+
+
+OpenFolder = Callable[[str], Sequence]
+
+
+def _is_archive(path: str) -> bool:
+    """True for a file with the suffix of a zip archive."""
+    return Path(path).suffix.lower() == ".zip" and Path(path).is_file()
+
+
+def _open_archive(path: str, open_folder: OpenFolder) -> Sequence:
+    """Open the sequence in an archive with `open_folder`.
+
+    Raises SequenceError for an archive that is damaged, unsafe or too large for the disk.
+    """
+    archive = Path(path)
+    holder = tempfile.TemporaryDirectory(prefix="torchslam-")
+    folder = Path(holder.name) / archive.stem
+    try:
+        unpack(archive, folder)
+        sequence = open_folder(str(folder))
+    except BaseException as error:
+        holder.cleanup()
+        if isinstance(error, DownloadError):
+            raise SequenceError(str(error)) from error
+        if isinstance(error, TorchslamError):
+            raise type(error)(str(error).replace(str(folder), path)) from error
+        raise
+    sequence.holder = holder  # the files are deleted with the sequence
+    return sequence
+
+
+MAX_ENTRIES = 10_000
+"""Maximum number of folder entries searched for suggestions."""
+MAX_FOLDERS = 200
+"""Maximum number of subfolders searched for suggestions."""
+SHOWN = 6
+
+
+def _not_found_message(path: str) -> str:
+    """Return a one-line message for a path that no reader accepts, with a suggestion."""
+    target = Path(path)
+    if target.is_dir():
+        return _why_no_folder(target)
+    if not target.exists():
+        near = difflib.get_close_matches(target.name, _names(target.parent), n=1, cutoff=0.6)
+        return f"{path}: does not exist" + _meant([target.parent / name for name in near])
+    suffixes = ", ".join(sorted(video.SUFFIXES | bag.SUFFIXES | {".zip"}))
+    return f"{path}: a file that is neither a video nor a recording ({suffixes})" + _meant(_around(target))
+
+
+def _why_no_folder(folder: Path) -> str:
+    entries = _entries(folder)
+    kinds = Counter(
+        other_kind(entry) or folder_kind(folder) or "images"
+        for entry in entries
+        if entry.is_file() and entry.suffix.lower() in SUFFIXES
+    )
+    inner = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:MAX_FOLDERS]
+    below = [entry for entry in inner if find_reader(str(entry))]
+    files = [entry for entry in entries if entry.is_file() and find_reader(str(entry))]
+    files += [entry for entry in entries if _is_archive(str(entry))]
+    looked = "; ".join(reader.LOOKS_FOR for reader in READERS[2:])
+    if kinds:
+        wrong = (
+            f"there are no frames, only {' and '.join(f'{count} {kind}' for kind, count in kinds.items())}"
+        )
+    elif below:
+        wrong = f"no sequence, but {len(below)} folder{'s' if len(below) > 1 else ''} with one"
+    elif not entries:
+        wrong = "no images: the folder is empty"
+    else:
+        wrong = f"no images ({', '.join(sorted(SUFFIXES))}) and no other sequence; looked for {looked}"
+    frames_beside = [] if below or files or not kinds else _around(folder)
+    return f"{folder}: {wrong}" + _meant(below or files or frames_beside)
+
+
+def _around(path: Path) -> list[Path]:
+    """Return the sequence to which a file or a part of a dataset belongs."""
+    beside = subfolder(path.parent)
+    if find_reader(str(path.parent)):
+        return [path.parent]
+    return [beside] if beside is not None else []
+
+
+def _meant(proposals: list[Path]) -> str:
+    """Return `; did you mean A?`, `; which of A, B or C?` or an empty string."""
+    shown = [str(proposal) for proposal in sorted(proposals)[:SHOWN]]
+    if not shown:
+        return ""
+    if len(shown) == 1:
+        return f"; did you mean {shown[0]}?"
+    more = f" ... ({len(proposals)} in all)" if len(proposals) > SHOWN else ""
+    return f"; which of {', '.join(shown[:-1])} or {shown[-1]}{more}?"
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(itertools.islice(folder.iterdir(), MAX_ENTRIES))
+    except OSError:  # an unreadable folder gives no suggestions
+        return []
+
+
+def _names(folder: Path) -> list[str]:
+    return [entry.name for entry in _entries(folder)]

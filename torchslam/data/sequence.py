@@ -1,4 +1,4 @@
-"""A sequence: images in the order of time, the camera that took them and, where known, the true path."""
+"""Image sequence: images in temporal order, their camera and, if known, the ground truth."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchslam.data.association import interpolate_poses
+from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
 
 GROUNDTRUTH_TOLERANCE = 0.02
-"""Seconds between an image and the nearest ground-truth pose beyond which the image counts as without one."""
+"""Maximum time in seconds between an image and its ground-truth pose."""
 
 
 class EndOfSequence(IndexError):
-    """A sequence whose length was not known in advance, a live source, has no more frames."""
+    """A sequence of unknown length (a live source) has ended."""
 
 
 class Calibrated(Enum):
-    """What is known of a sequence's camera."""
+    """How the camera of a sequence is known."""
 
     GIVEN = "given"
-    """By the user, with the data, or found out by the images."""
+    """Given by the user or the data, or estimated from the images."""
     GUESSED = "guessed"
-    """Only near the truth: a field of view, the focal length of EXIF."""
+    """Approximate: a field of view, or the focal length of EXIF."""
     MISSING = "missing"
-    """The images decide."""
+    """Unknown, to be estimated from the images."""
 
 
 class Sequence(ABC):
-    """Frames by index, read when asked for; a reader supplies `image` and `image_name`.
+    """Frames by index, read on access; readers implement `image` and `image_name`.
 
-    name:        what the sequence is called
-    kind:        what it was read from, in words
-    size:        (width, height) of the images, pixels
-    calibrated:  whether the camera was given, by the user or with the data, or guessed (a focal length from EXIF or a
-                 field of view), or is missing
-    timestamps:  (N,) float64 seconds, strictly increasing
-    groundtruth: the true trajectory at its own rate, or None
-    notes:       what a user should know about how it was read: one line each
+    Attributes:
+        name: name of the sequence.
+        kind: description of its source.
+        size: (width, height) of the images, in pixels.
+        calibrated: whether the camera is given, guessed or missing.
+        timestamps: (N,) float64 seconds, strictly increasing.
+        groundtruth: the true trajectory at its own rate, or None.
+        notes: remarks for the user on how it was read, one line each.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Sequence(ABC):
         guessed: bool = False,
         notes: Iterable[str] = (),
     ) -> None:
-        """size: of the images; needed where there is no camera; guessed: whether the camera is only near the truth."""
+        """Args: `size` of the images, required without a camera; `guessed`: the camera is approximate."""
         self.name = name
         self.kind = kind
         known = size if camera is None else camera.size
@@ -112,13 +112,13 @@ class Sequence(ABC):
         return len(self)
 
     def indices(self, start: int = 0) -> Iterable[int]:
-        """The indices of the frames from `start` on; of a live source without an end they do not end either."""
+        """Return the frame indices from `start` on; endless for a live source."""
         length = self.known_length
         return itertools.count(start) if length is None else range(start, length)
 
     @property
     def dropped(self) -> int:
-        """Frames that a live source had and nobody had time for."""
+        """Number of frames of a live source that were dropped because processing was too slow."""
         return 0
 
     @property
@@ -128,38 +128,38 @@ class Sequence(ABC):
 
     @abstractmethod
     def image(self, index: int) -> Tensor:
-        """(1, 1, H, W) float32 in [0, 1]. Raises FrameError where it cannot be read or has another size."""
+        """Return the gray image (1, 1, H, W), float32 in [0, 1]. Raises FrameError if unreadable or of another size."""
 
     def color(self, index: int) -> Tensor:
-        """(H, W, 3) uint8 red, green, blue; three times the same where the sequence is gray. Raises FrameError."""
+        """Return the RGB image (H, W, 3), uint8; three equal channels for a gray sequence. Raises FrameError."""
         return (self.image(index)[0, 0, :, :, None] * 255.0).round().to(torch.uint8).expand(-1, -1, 3)
 
     @abstractmethod
     def image_name(self, index: int) -> str:
-        """What the image is called in messages."""
+        """Return the name of an image, for messages."""
 
     def mask(self, index: int) -> Tensor | None:
-        """(1, 1, H, W) bool, True where features may be found in frame `index`; None: everywhere."""
+        """Return the mask (1, 1, H, W) of a frame, True where features are allowed; None: everywhere."""
         return None
 
     @property
     def brings_features(self) -> bool:
-        """Whether its frames bring their features: then nobody looks at the images."""
+        """True if the frames come with features; the images are not used then."""
         return False
 
     def features(self, index: int) -> Features | None:
-        """Those of frame `index`, a batch of one, where the sequence brings them."""
+        """Return the features of a frame as a batch of one, if the sequence provides them."""
         return None
 
     def timestamp(self, index: int) -> float:
-        """Seconds of frame `index`; of a live source, of the frame that `image` gave."""
+        """Return the time of a frame in seconds; for a live source, of the last frame from `image`."""
         return float(self.timestamps[index])
 
     def __len__(self) -> int:
         return int(self.timestamps.shape[0])
 
     def __getitem__(self, index: int) -> Frame:
-        """Frame `index`. Raises FrameError where its image cannot be read, IndexError beyond the end."""
+        """Return a frame. Raises FrameError if its image cannot be read, IndexError beyond the end."""
         length = self.known_length
         if length is not None:
             if not -length <= index < length:
@@ -186,16 +186,13 @@ class Sequence(ABC):
             yield frame
 
     def pose(self, index: int) -> Tensor | None:
-        """(4, 4) float64 true T_cw of frame `index` without reading its image; None where it is unknown."""
+        """Return the true T_cw (4, 4) of a frame without reading its image; None if unknown."""
         if self._T_cw is None or not self._has_pose[index]:
             return None
         return self._T_cw[index]
 
     def part(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Sequence:
-        """Every `stride`-th frame from `start` to before `stop`, numbered from 0 again.
-
-        Raises SequenceError where that leaves none.
-        """
+        """Return every `stride`-th frame of [start, stop) as a sequence. Raises SequenceError if that is empty."""
         if stride < 1:
             raise SequenceError(f"{self.name}: the stride must be positive, not {stride}")
         indices = range(len(self))[start:stop:stride]
@@ -204,20 +201,20 @@ class Sequence(ABC):
         return Transformed(self, indices)
 
     def with_camera(self, camera: Camera, calibrated: Calibrated = Calibrated.GIVEN) -> Sequence:
-        """The same frames, taken with another camera. Raises CalibrationError for another size."""
+        """Return the sequence with another camera. Raises CalibrationError for another image size."""
         same = Transformed(self)
         same.camera, same.calibrated = camera, calibrated
         return same
 
     @property
     def frame_rate(self) -> float:
-        """Frames per second, from the median interval; 0 for a single frame."""
+        """Frames per second by the median interval; 0 for a single frame."""
         if len(self) < 2:
             return 0.0
         return 1.0 / float(self.timestamps.diff().median())
 
     def describe(self) -> dict[str, str]:
-        """What `torchslam info` prints, label by label."""
+        """Return the rows that `torchslam info` prints."""
         duration = float(self.timestamps[-1] - self.timestamps[0])
         truth = "none"
         if self.groundtruth is not None:
@@ -245,11 +242,14 @@ class Sequence(ABC):
 
 
 class Transformed(Sequence):
-    """Another sequence's frames, some of them, perhaps changed: what a transformation leaves alone is passed on.
+    """Base class of transformed sequences: passes everything on that a subclass does not override.
 
-    indices: which frames; None: all
-    camera:  for images of another size than `whole` has; `size` alone where the camera is missing
-    groundtruth: another one; then `pose` is to be that of `Sequence`
+    Args:
+        whole: the original sequence.
+        indices: its selected frames; None: all.
+        camera, size: for images of another size; `size` alone if there is no camera.
+        notes: additional notes.
+        groundtruth: replacement of the ground truth; subclasses then override `pose`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""All pictures of a run, from its results."""
+"""Plots of a run, drawn from its results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def draw(results: Results, directory: Path) -> list[Path]:
-    """Draw every picture that the results allow into the folder `plots`; returns the files.
+    """Draw all plots that the results allow into the folder `plots` and return the files.
 
     With ground truth, path and map are aligned to it by a similarity.
     """
@@ -51,7 +51,7 @@ def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
 def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     evaluation, truth = _evaluation(results), None
     trajectory, keyframes = results.trajectory, results.keyframes
-    title = f"Path and map{_which(results)}"
+    title = f"Path and map{_title_suffix(results)}"
     S = torch.eye(4, dtype=trajectory.T_wc.dtype)
     if evaluation is not None:
         yield "errors", _errors(evaluation, results)
@@ -68,7 +68,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
             results.map.points["covariances_w"][ids],
         )
     ]
-    shown = keyframes if len(keyframes) else None  # a run that only localized: its frames' axes instead
+    shown = keyframes if len(keyframes) else None  # a run that only localized shows the axes of its frames
     yield "scene", plots.plot_scene(trajectory, points_w, truth, shown, unit, title)
     yield (
         "top_view",
@@ -85,15 +85,15 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     )
 
 
-def _which(results: Results) -> str:
-    """Which of several submaps, or which session, a picture shows; nothing where there is one of each."""
-    figures, submaps = results.metrics, len(results.metrics["submaps"])
-    of = f" of submap {figures['submap']}, the main one of {submaps}" if submaps > 1 else ""
+def _title_suffix(results: Results) -> str:
+    """Return which of several submaps and sessions a plot shows; empty if there is one of each."""
+    metrics, submaps = results.metrics, len(results.metrics["submaps"])
+    of = f" of submap {metrics['submap']}, the main one of {submaps}" if submaps > 1 else ""
     return of + (f", session {results.session}" if results.session else "")
 
 
 def _truth(results: Results) -> Trajectory | None:
-    """The ground truth from the first frame to the last, of the submap that is shown: elsewhere it may go far away."""
+    """Return the ground truth between the first and the last frame of the plotted submap."""
     truth, frames = results.groundtruth, results.frames
     if truth is None:
         return None
@@ -123,14 +123,14 @@ def aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
 
 
 def _evaluation(results: Results) -> Evaluation | None:
-    """The errors against ground truth where the run was evaluated when it ended."""
+    """Return the errors against ground truth if metrics.json has them."""
     if results.groundtruth is None or "ate_m" not in results.metrics:
         return None
     return evaluate(results.trajectory, results.groundtruth)
 
 
 def _example(slam_map: Map, session: int, image: Tensor) -> Iterator[tuple[str, Figure]]:
-    """The keypoints of the example keyframe; tails lead back to the keyframe before it."""
+    """Plot the keypoints of the example keyframe, with tails to the previous keyframe."""
     keyframe = example_keyframe(slam_map, session)
     if keyframe is None:
         return

@@ -3,23 +3,57 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from statistics import mean, median
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
-from torchslam.evaluation import Evaluation
+from torchslam.calibration.find_camera import camera_remark
+from torchslam.data import Sequence
+from torchslam.errors import TrajectoryError
+from torchslam.evaluation import Evaluation, ate_apart, evaluate
 from torchslam.geometry import transform
 from torchslam.system.run import Run
-from torchslam.types import State, StepResult
-from torchslam.utils.text_table import table as table
+from torchslam.types import State, StepResult, Trajectory
+
+Errors = TypeVar("Errors")
+
+
+def compute_metrics(
+    finished: Run, sequence: Sequence, camera: str, log: Callable[[str], None] = lambda words: None
+) -> dict[str, Any]:
+    """Compute the content of metrics.json, with the errors if there are ground truth and poses to compare.
+
+    Args:
+        finished: the run.
+        sequence: its images, with the ground truth if known.
+        camera: remark on the estimated camera, from `find_camera`.
+        log: receives the reason if the evaluation is impossible.
+    """
+
+    def measured(measure: Callable[[Trajectory], Errors]) -> Errors | None:
+        if sequence.groundtruth is None or finished.failure:
+            return None
+        try:
+            return measure(sequence.groundtruth)
+        except TrajectoryError as error:
+            log(f"no evaluation: {error}")
+            return None
+
+    metrics = run_metrics(
+        finished,
+        measured(lambda truth: evaluate(finished.trajectory, truth)),
+        measured(lambda truth: ate_apart(finished.online_parts, truth)),
+    )
+    return metrics | {"camera": camera_remark(finished, camera), "dropped": sequence.dropped}
+
 
 FEW = 10
-"""Posed frames of which it says nothing how many are keyframes."""
+"""Minimum number of posed frames for the warning about too many keyframes."""
 
 
-def metrics(
+def run_metrics(
     run: Run, evaluation: Evaluation | None = None, online_ate_m: float | None = None
 ) -> dict[str, Any]:
     """Compute the metrics of a run, the content of metrics.json.
@@ -35,10 +69,10 @@ def metrics(
     """
     totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
     start = None if run.failure else _start(run.results)
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
-        "posed_ratio_after_initialization": _posed_share(run, start),
+        "posed_ratio_after_initialization": _posed_ratio(run, start),
         "uncertain": sum(result.state is State.UNCERTAIN for result in run.results),
         "lost": sum(result.state is State.LOST for result in run.results),
         "initialized_at": None if start is None else start.index,
@@ -57,18 +91,18 @@ def metrics(
         "failure": run.failure,
     }
     if evaluation is not None:
-        figures |= evaluation.as_dict()
+        metrics |= evaluation.as_dict()
     if online_ate_m is not None:
-        figures["online_ate_m"] = online_ate_m
-    return figures
+        metrics["online_ate_m"] = online_ate_m
+    return metrics
 
 
 @torch.no_grad()
 def quality(run: Run) -> dict[str, float | None]:
-    """How well the map explains what this run's frames saw of it; None where they saw nothing.
+    """Compute the quality of the map over the frames of this run; None without observations.
 
-    reprojection_px: mean distance of the points' projections from the observed pixels
-    track_length:    in how many of the frames a point was seen, in the mean
+    - `reprojection_px`: mean reprojection error.
+    - `track_length`: mean number of frames that observe a point.
     """
     found: dict[str, float | None] = {"reprojection_px": None, "track_length": None}
     if run.main is None or run.map.num_points == 0:
@@ -83,14 +117,14 @@ def quality(run: Run) -> dict[str, float | None]:
     return found
 
 
-def result_warnings(figures: Mapping[str, Any]) -> list[str]:
-    """What speaks against a run that went well, in words."""
-    keyframes, posed = figures["keyframes"], figures["posed"]
+def result_warnings(metrics: Mapping[str, Any]) -> list[str]:
+    """Return warnings about a successful run."""
+    keyframes, posed = metrics["keyframes"], metrics["posed"]
     if posed < FEW or 2 * keyframes < posed:
         return []
     return [
-        f"{keyframes} of {posed} posed frames are keyframes: from frame to frame too little is found again; "
-        "take the frames closer together (--stride, --fps), or more keypoints (features.num_keypoints)"
+        f"{keyframes} of {posed} posed frames are keyframes: too few points are tracked between frames; "
+        "use a higher frame rate (--stride, --fps) or more keypoints (features.num_keypoints)"
     ]
 
 
@@ -118,8 +152,8 @@ def submap_counts(run: Run) -> list[dict[str, int]]:
     ]
 
 
-def stage_times(results: Sequence[StepResult]) -> dict[str, dict[str, float]]:
-    """Per stage the median and mean milliseconds over the frames in which it ran, and in how many it ran."""
+def stage_times(results: list[StepResult]) -> dict[str, dict[str, float]]:
+    """Return median and mean milliseconds and the number of frames of every stage."""
     times: dict[str, list[float]] = {}
     for result in results:
         for stage, milliseconds in result.stage_ms.items():
@@ -130,73 +164,73 @@ def stage_times(results: Sequence[StepResult]) -> dict[str, dict[str, float]]:
     }
 
 
-def summary(figures: Mapping[str, Any]) -> dict[str, str]:
-    """The metrics of a run in words, label by label, for `table`."""
-    frames, skipped = figures["frames"], len(figures["skipped"])
+def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Describe the metrics of a run as rows for `table`."""
+    frames, skipped = metrics["frames"], len(metrics["skipped"])
     rows = {"frames": f"{frames}" + (f", {skipped} of them unreadable and skipped" if skipped else "")}
-    if figures.get("dropped"):
-        rows["dropped"] = f"{figures['dropped']} frames (processing too slow)"
-    if latency := figures.get("latency_ms"):
+    if metrics.get("dropped"):
+        rows["dropped"] = f"{metrics['dropped']} frames (processing too slow)"
+    if latency := metrics.get("latency_ms"):
         rows["latency"] = f"{latency['median']:.0f} ms in the median, {latency['p95']:.0f} ms at 95 %"
-    if figures["initialized_at"] is None:
+    if metrics["initialized_at"] is None:
         return rows | {"map": "none"}
     rows |= {
-        "posed": f"{figures['posed']} ({figures['posed'] / frames:.1%}), "
-        f"{figures['posed_ratio_after_initialization']:.1%} since the start at frame {figures['initialized_at']}",
-        "lost": f"{figures['lost']} frames; {figures['uncertain']} had an uncertain pose",
-        "map": f"{figures['keyframes']} keyframes, {figures['points']} points",
+        "posed": f"{metrics['posed']} ({metrics['posed'] / frames:.1%}), "
+        f"{metrics['posed_ratio_after_initialization']:.1%} since initialization at frame {metrics['initialized_at']}",
+        "lost": f"{metrics['lost']} frames; {metrics['uncertain']} had an uncertain pose",
+        "map": f"{metrics['keyframes']} keyframes, {metrics['points']} points",
     }
-    if figures.get("reprojection_px") is not None:
+    if metrics.get("reprojection_px") is not None:
         rows["quality"] = (
-            f"{figures['reprojection_px']:.2f} px mean reprojection error, points seen in "
-            f"{figures['track_length']:.1f} frames, {figures['uncertain'] / frames:.1%} of the frames uncertain"
+            f"{metrics['reprojection_px']:.2f} px mean reprojection error, points seen in "
+            f"{metrics['track_length']:.1f} frames, {metrics['uncertain'] / frames:.1%} of the frames uncertain"
         )
-    rows |= _beside(figures)
-    rows |= {"camera": figures["camera"]} if figures.get("camera") else {}
+    rows |= _describe_submaps(metrics)
+    rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
     rows |= {
-        "speed": f"{figures['fps']:.1f} frames/s; {figures['ms_median']:.0f} ms a frame (median), "
-        f"{figures['ms_p95']:.0f} ms (95th percentile)",
+        "speed": f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
+        f"{metrics['ms_p95']:.0f} ms (95th percentile)",
     }
-    return rows | accuracy(figures)
+    return rows | accuracy(metrics)
 
 
-def _beside(figures: Mapping[str, Any]) -> dict[str, str]:
+def _describe_submaps(metrics: Mapping[str, Any]) -> dict[str, str]:
     """The submaps beside the main one, and the sessions before this one, in words; nothing where there are none."""
     rows = {}
-    if figures["session"]:
-        (main,) = (submap for submap in figures["submaps"] if submap["submap"] == figures["submap"])
+    if metrics["session"]:
+        (main,) = (submap for submap in metrics["submaps"] if submap["submap"] == metrics["submap"])
         rows["map"] = f"{main['keyframes']} keyframes, {main['points']} points"
-        rows["session"] = f"{figures['session']}, which made {figures['keyframes']} of the keyframes"
+        rows["session"] = f"{metrics['session']}, which made {metrics['keyframes']} of the keyframes"
     others = [
         f"submap {submap['submap']}: {submap['posed']} frames posed, {submap['keyframes']} keyframes"
-        for submap in figures["submaps"]
-        if submap["submap"] != figures["submap"]
+        for submap in metrics["submaps"]
+        if submap["submap"] != metrics["submap"]
     ]
     if others:
         rows["submap"] = (
-            f"{figures['submap']}, the main one of {len(figures['submaps'])}; {'; '.join(others)}"
+            f"{metrics['submap']}, the main one of {len(metrics['submaps'])}; {'; '.join(others)}"
         )
     return rows
 
 
-def accuracy(figures: Mapping[str, Any]) -> dict[str, str]:
-    """The figures of an evaluation in words; nothing where there was no ground truth."""
-    if "ate_m" not in figures:
+def accuracy(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Describe the errors of a run as rows for `table`; empty without ground truth."""
+    if "ate_m" not in metrics:
         return {}
-    length = figures["path_length_m"]
-    share = f" ({figures['ate_m'] / length:.2%} of the path)" if length > 0 else ""
-    online = {"online ATE": f"{figures['online_ate_m']:.4f} m RMSE"} if "online_ate_m" in figures else {}
+    length = metrics["path_length_m"]
+    share = f" ({metrics['ate_m'] / length:.2%} of the path)" if length > 0 else ""
+    online = {"online ATE": f"{metrics['online_ate_m']:.4f} m RMSE"} if "online_ate_m" in metrics else {}
     return {
-        "ATE": f"{figures['ate_m']:.4f} m RMSE{share}, Sim(3)-aligned; {figures['ate_se3_m']:.4f} m without the scale",
+        "ATE": f"{metrics['ate_m']:.4f} m RMSE{share}, Sim(3)-aligned; {metrics['ate_se3_m']:.4f} m without the scale",
         **online,
-        "RPE": f"{figures['rpe']['translation_m']:.4f} m, {figures['rpe']['rotation_deg']:.3f}° a frame",
-        "scale": f"{figures['scale']:.4f} true meters per map unit",
+        "RPE": f"{metrics['rpe']['translation_m']:.4f} m, {metrics['rpe']['rotation_deg']:.3f}° a frame",
+        "scale": f"{metrics['scale']:.4f} true meters per map unit",
         "path length": f"{length:.2f} m",
     }
 
 
-def _start(results: Sequence[StepResult]) -> StepResult | None:
-    """The frame that started the map that the run ended with, a map given up before does not count, or found it."""
+def _start(results: list[StepResult]) -> StepResult | None:
+    """Return the frame that initialized the final map, or the first posed frame of a run on a saved map."""
     states = [State.INITIALIZING, *(result.state for result in results)]
     starts = [
         result
@@ -207,8 +241,8 @@ def _start(results: Sequence[StepResult]) -> StepResult | None:
     return starts[-1] if starts else next(found, None)
 
 
-def _posed_share(run: Run, start: StepResult | None) -> float:
-    """Posed frames among those from the start of the map on."""
+def _posed_ratio(run: Run, start: StepResult | None) -> float:
+    """Return the ratio of posed frames among those since initialization."""
     if start is None:
         return 0.0
     since = sum(result.index >= start.index for result in run.results)

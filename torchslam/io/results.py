@@ -1,7 +1,9 @@
-"""The folder of results: what a run writes, and what the pictures are drawn from."""
+"""The results folder of a run: its files, written and read."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 from collections.abc import Callable
@@ -15,17 +17,16 @@ from torch import Tensor
 
 from torchslam.config import to_toml
 from torchslam.data.formats.image_file import read_gray
-from torchslam.data.formats.trajectory_file import read_trajectory, write_trajectory
 from torchslam.data.sequence import Sequence
+from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.ply import write_map_cloud
-from torchslam.io.frames_file import read_frames, write_frames
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run, keyframe_rows
-from torchslam.types import StepResult, Trajectory
+from torchslam.types import State, StepResult, Trajectory
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
 
 TRAJECTORY = "trajectory.txt"
@@ -47,16 +48,17 @@ NEEDED = ("submap", "submaps", "session", "posed", "keyframes")  # of metrics.js
 
 @dataclass(frozen=True)
 class Results:
-    """What a results folder holds, as far as pictures need it.
+    """Content of a results folder, for plots and viewer.
 
-    trajectory, keyframes: of the main submap, camera to world, in the units of its map; without poses where none is
-    groundtruth:           in meters, where the sequence had it
-    others:                of the other submaps in which the run has poses, by their numbers
-    map:                   of the main submap; empty where there is none
-    submaps, camera:        all of them, with their camera
-    frames:                one per frame, without poses
-    metrics:               the content of metrics.json
-    example_image:         (H, W) in [0, 1] of keyframe `example_keyframe(map, session)`, where it could be read
+    Attributes:
+        trajectory, keyframes: camera to world in the main submap, in its units; possibly empty.
+        groundtruth: in meters, if the sequence has it.
+        others: trajectories in the other submaps, by submap number.
+        map: map of the main submap; empty if there is none.
+        submaps, camera: all submaps and their camera.
+        frames: one result per frame, without poses.
+        metrics: the content of metrics.json.
+        example_image: (H, W) in [0, 1], of keyframe `example_keyframe(map, session)`, if readable.
     """
 
     trajectory: Trajectory
@@ -72,14 +74,18 @@ class Results:
 
     @property
     def session(self) -> int:
-        """Which run over the map it was."""
+        """Number of the run on the map."""
         return int(self.metrics["session"])
 
 
-def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directory: Path) -> None:
-    """Write everything that a run leaves behind, pictures apart, into a folder that is made if need be.
+def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:
+    """Write the results of a run, except plots and viewer, into a folder; existing results are replaced.
 
-    figures: of the run, for metrics.json. What an earlier run wrote there is replaced.
+    Args:
+        run: the finished run.
+        sequence: its images.
+        metrics: the content of metrics.json.
+        directory: the results folder, created if missing.
     """
     directory.mkdir(parents=True, exist_ok=True)
     stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE)]
@@ -98,49 +104,51 @@ def write_results(run: Run, sequence: Sequence, figures: dict[str, Any], directo
     write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
     write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
-    (directory / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    (directory / METRICS).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     write_frames(directory / FRAMES, run.results)
     _write_example_image(directory / EXAMPLE_IMAGE, run, sequence)
 
 
 def read_results(directory: Path) -> Results:
-    """The results in a folder. Raises ResultsError, TrajectoryError or FrameError for what is missing or damaged."""
+    """Read a results folder. Raises ResultsError, TrajectoryError or FrameError for missing or damaged files."""
     if not directory.is_dir():
-        raise ResultsError(f"{directory}: no such folder of results")
-    saved, figures = read_atlas(directory / MAP), read_metrics(directory)
-    main = [submap.map for submap in saved.atlas if submap.number == figures["submap"]]
+        raise ResultsError(f"{directory}: no such results folder")
+    saved, metrics = read_atlas(directory / MAP), read_metrics(directory)
+    main = [submap.map for submap in saved.atlas if submap.number == metrics["submap"]]
     beside = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
-        trajectory=read_trajectory(directory / TRAJECTORY) if figures["posed"] else Trajectory.empty(),
-        keyframes=read_trajectory(directory / KEYFRAMES) if figures["keyframes"] else Trajectory.empty(),
+        trajectory=read_trajectory(directory / TRAJECTORY) if metrics["posed"] else Trajectory.empty(),
+        keyframes=read_trajectory(directory / KEYFRAMES) if metrics["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
         others={number: read_trajectory(path) for number, path in beside.items() if path.exists()},
         map=main[0] if main else Map(),
         submaps=tuple(saved.atlas),
         camera=saved.camera,
         frames=read_frames(directory / FRAMES),
-        metrics=figures,
+        metrics=metrics,
         example_image=read_gray(example, str(example))[0, 0] if example.exists() else None,
     )
 
 
 def read_metrics(directory: Path) -> dict[str, Any]:
-    """The content of metrics.json. Raises ResultsError where it is missing or something else."""
+    """Read metrics.json. Raises ResultsError if it is missing or invalid."""
     path = directory / METRICS
     try:
-        figures = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
+        metrics = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    missing = [name for name in NEEDED if not isinstance(figures, dict) or name not in figures]
+    missing = [name for name in NEEDED if not isinstance(metrics, dict) or name not in metrics]
     if missing:
-        raise ResultsError(f"{path}: not the figures of a run: {', '.join(missing)} missing")
-    wrong = [name for name, is_right in _FIGURES.items() if name in figures and not is_right(figures[name])]
+        raise ResultsError(f"{path}: not the metrics of a run: {', '.join(missing)} missing")
+    wrong = [
+        name for name, is_right in _METRIC_CHECKS.items() if name in metrics and not is_right(metrics[name])
+    ]
     if wrong:
-        raise ResultsError(f"{path}: not the figures of a run: {wrong[0]} is {repr(figures[wrong[0]])[:100]}")
-    return figures
+        raise ResultsError(f"{path}: not the metrics of a run: {wrong[0]} is {repr(metrics[wrong[0]])[:100]}")
+    return metrics
 
 
 def _is_count(value: object) -> bool:
@@ -157,8 +165,8 @@ def _are_submaps(value: object) -> bool:
     )
 
 
-# What is read of metrics.json again, and what it must be.
-_FIGURES: dict[str, Callable[[Any], bool]] = {
+# Validation of the entries that are read from metrics.json.
+_METRIC_CHECKS: dict[str, Callable[[Any], bool]] = {
     "submap": lambda value: value is None or _is_count(value),
     "submaps": _are_submaps,
     "ate_m": _is_number,
@@ -169,7 +177,7 @@ _FIGURES: dict[str, Callable[[Any], bool]] = {
 
 
 def results_in(directory: Path) -> list[Path]:
-    """The files in a folder that `write_results` would replace."""
+    """Return the files in a folder that `write_results` would replace."""
     names = (
         METRICS,
         TRAJECTORY,
@@ -186,7 +194,7 @@ def results_in(directory: Path) -> list[Path]:
 
 
 def example_keyframe(slam_map: Map, session: int) -> int | None:
-    """The keyframe that is drawn as an example: in the middle of the session; None where it has none."""
+    """Return the keyframe in the middle of the session, for the example plot; None if there is none."""
     rows = keyframe_rows(slam_map, session)
     return int(rows[len(rows) // 2]) if len(rows) else None
 
@@ -201,3 +209,76 @@ def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
     except FrameError:  # simulated features need no image; then there is nothing to draw
         return
     cv2.imwrite(str(path), (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy())
+
+
+FRAME_COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason")
+STAGE_SUFFIX = "_ms"
+MAX_FRAMES_BYTES = 1 << 28
+"""Size limit of frames.csv, enough for two million frames."""
+
+
+def write_frames(path: str | Path, results: list[StepResult]) -> None:
+    """Write one row per frame; a missing submap or stage is an empty cell. The poses are in online.txt."""
+    stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*FRAME_COLUMNS, *(stage + STAGE_SUFFIX for stage in stages)])
+        for result in results:
+            times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
+            submap = "" if result.submap is None else result.submap
+            row = [result.index, repr(result.timestamp), result.state.value, submap]
+            writer.writerow(
+                [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, *times]
+            )
+
+
+def read_frames(path: str | Path) -> list[StepResult]:
+    """Read the rows of frames.csv, without poses. Raises ResultsError naming file and line."""
+    try:
+        reader = csv.DictReader(
+            io.StringIO(read_text(path, MAX_FRAMES_BYTES, "a list of frames"), newline="")
+        )
+        return [_frame_result(row, f"{path}:{reader.line_num}") for row in reader]
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ResultsError(f"{path}: not a list of frames: {error}") from None
+
+
+def _frame_result(row: dict[str, str], where: str) -> StepResult:
+    try:
+        _check_counts(row)
+        return StepResult(
+            index=int(row["index"]),
+            timestamp=_finite(row["timestamp"]),
+            state=State(row["state"]),
+            T_cw=None,
+            submap=int(row["submap"]) if row["submap"] else None,
+            is_keyframe=bool(int(row["keyframe"])),
+            matches=int(row["matches"]),
+            inliers=int(row["inliers"]),
+            reason=row["reason"],
+            stage_ms={
+                name.removesuffix(STAGE_SUFFIX): _finite(value)
+                for name, value in row.items()
+                if name.endswith(STAGE_SUFFIX) and value
+            },
+        )
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise ResultsError(f"{where}: not a row of frames.csv: {error}") from None
+
+
+def _check_counts(row: dict[str, str]) -> None:
+    """Raise ValueError for impossible counts and missing columns."""
+    for name in ("index", "submap", "keyframe", "matches", "inliers"):
+        if row[name] and not 0 <= int(row[name]) < 1 << 31:
+            raise ValueError(f"{name} is {int(row[name])}")
+    if row["reason"] is None:
+        raise ValueError("it is too short")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"`{text}` is not a finite number")
+    return number

@@ -1,4 +1,4 @@
-"""The refined poses in the form in which they were given: a TUM trajectory, a COLMAP model, a transforms.json."""
+"""Write refined poses in their original format: TUM trajectory, COLMAP model or transforms.json."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from torch import Tensor
 
 from torchslam.data.formats.given_poses import COLMAP, NERFSTUDIO
 from torchslam.data.formats.text_file import read_text
-from torchslam.data.formats.trajectory_file import write_trajectory
+from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.geometry import se3_inverse
-from torchslam.geometry.conventions import opengl
+from torchslam.geometry.transforms import opengl
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.io.export.scene import Scene, scene_of
-from torchslam.refine.pose_refinement import Refined
+from torchslam.refine.pose_refinement import RefinementResult
 from torchslam.types import Trajectory
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json
 
 COVARIANCES = "covariances.txt"
-# What a transforms.json says of a camera: all of it is replaced.
+# Keys of a camera in a transforms.json; all of them are replaced.
 CAMERA_KEYS = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"),
     *("camera_angle_x", "camera_angle_y"),
@@ -33,7 +33,7 @@ CAMERA_KEYS = (
 
 @dataclass(frozen=True)
 class NamedScene(Scene):
-    """A scene whose images are called as another program calls them: names by number of the frame."""
+    """A scene with the image names of another program, by frame number."""
 
     names: dict[int, str]
 
@@ -42,11 +42,8 @@ class NamedScene(Scene):
         return [self.names[index] for index in self.frame_ids.tolist()]
 
 
-def write_refined(folder: Path, refined: Refined) -> Path:
-    """Write the poses, and the covariances of those of the keyframes, into a folder that is made if need be.
-
-    Poses that were not refined are left out. Returns the file, of COLMAP the folder.
-    """
+def write_refined(folder: Path, refined: RefinementResult) -> Path:
+    """Write the refined poses, and the covariances of the keyframes, into a folder; return the file or folder."""
     folder.mkdir(parents=True, exist_ok=True)
     frames, T_cw = refined_poses(refined)
     given = refined.given
@@ -60,27 +57,27 @@ def write_refined(folder: Path, refined: Refined) -> Path:
         return path
     path = folder / (given.path.name or "trajectory.txt")
     assert given.timestamps is not None
-    times = given.timestamps[refined.rows[frames]]
+    times = given.timestamps[refined.pose_rows[frames]]
     write_trajectory(path, Trajectory(times, se3_inverse(T_cw)))
     return path
 
 
-def refined_poses(refined: Refined) -> tuple[Tensor, Tensor]:
-    """(n,) the frames of the sequence that have a refined pose, ascending, and (n, 4, 4) T_cw."""
+def refined_poses(refined: RefinementResult) -> tuple[Tensor, Tensor]:
+    """The frames (n,) with a refined pose, ascending, and their T_cw (n, 4, 4)."""
     posed_frames, slam_map = refined.run.posed_frames, refined.run.map
     frames = posed_frames.frames["frame_index"].cpu()
     order = torch.argsort(frames)
     return frames[order], posed_frames.T_cw(slam_map).cpu()[order]
 
 
-def _name(refined: Refined, frame: int) -> str:
-    """What the image of a frame is called where its pose came from: its name, or its time."""
-    row, given = int(refined.rows[frame]), refined.given
+def _name(refined: RefinementResult, frame: int) -> str:
+    """The image of a frame in the given poses: its name, or its time."""
+    row, given = int(refined.pose_rows[frame]), refined.given
     return given.names[row] if given.timestamps is None else repr(float(given.timestamps[row]))
 
 
-def _write_covariances(path: Path, refined: Refined) -> None:
-    """A line for each keyframe: its image and the upper triangle of the covariance of its pose, row by row."""
+def _write_covariances(path: Path, refined: RefinementResult) -> None:
+    """Write a line per keyframe: image and upper triangle of the covariance of its pose, row by row."""
     keyframes = refined.run.map.keyframes
     upper = torch.triu_indices(6, 6)
     lines = [
@@ -95,8 +92,8 @@ def _write_covariances(path: Path, refined: Refined) -> None:
     path.write_text("".join(lines), encoding="utf-8")
 
 
-def _write_colmap(folder: Path, refined: Refined) -> None:
-    """The model with the map's points; images are numbered anew, in the order of the frames."""
+def _write_colmap(folder: Path, refined: RefinementResult) -> None:
+    """Write the model with the map's points; images are renumbered in the order of the frames."""
     assert refined.run.main is not None
     scene = scene_of(refined.run.main, refined.run.camera, refined.run.session, keyframes_alone=False)
     names = {frame: _name(refined, frame) for frame in scene.frame_ids.tolist()}
@@ -104,17 +101,17 @@ def _write_colmap(folder: Path, refined: Refined) -> None:
     write_colmap(folder, NamedScene(names=names, **columns))
 
 
-def _write_transforms(path: Path, refined: Refined, frames: Tensor, T_cw: Tensor) -> None:
-    """The file as it was, with other poses and the camera; what else it says of its frames stays."""
+def _write_transforms(path: Path, refined: RefinementResult, frames: Tensor, T_cw: Tensor) -> None:
+    """Write the original file with new poses and camera; other content stays."""
     content = parse_json(read_text(refined.given.path, TrajectoryError, JSON_BYTES))
-    rows = refined.rows[frames].tolist()
+    rows = refined.pose_rows[frames].tolist()
     poses = dict(zip(rows, opengl(se3_inverse(T_cw)).tolist(), strict=True))
-    kept = [
+    written_frames = [
         {key: value for key, value in frame.items() if key not in CAMERA_KEYS}
         | {"transform_matrix": poses[row]}
         for row, frame in enumerate(content["frames"])
         if row in poses
     ]
     about = {key: value for key, value in content.items() if key not in CAMERA_KEYS}
-    written = nerfstudio_camera(refined.run.camera) | about | {"frames": kept}
+    written = nerfstudio_camera(refined.run.camera) | about | {"frames": written_frames}
     path.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

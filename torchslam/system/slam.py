@@ -1,7 +1,9 @@
-"""Monocular SLAM, the way of a frame:
+"""Monocular SLAM: the pipeline of one frame.
 
-frame -> features -> follow the world at hand (track, judge) -> keyframe? -> map -> seen before? -> StepResult
-                  -> or find one: a known place, or the beginning of a new world
+check -> extract features -> mask out what does not belong to the static scene, then
+
+- with an active map: track the frame in it -> validate the pose -> keyframe? -> map it -> close loops -> `StepResult`
+- without one: relocalize in a known submap, or initialize a new one -> `StepResult`
 """
 
 from __future__ import annotations
@@ -14,23 +16,20 @@ import numpy as np
 import torch
 
 from torchslam.config import Config
-from torchslam.data.arrays import image_tensor
+from torchslam.data.formats.image_file import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
 from torchslam.loop_closing.loop_closer import LoopCloser
-from torchslam.map.atlas import Atlas
-from torchslam.map.map import Map
+from torchslam.map.atlas import Atlas, Submap
+from torchslam.map.map import Map, feature_mismatch
 from torchslam.map.posed_frames import PosedFrames
-from torchslam.map.submap import Submap
-from torchslam.map.validation import why_not_alike
 from torchslam.mapping.mapper import Mapper
 from torchslam.parallel.workers import with_workers
-from torchslam.system.context import ActiveMap, Outcome, SystemContext
 from torchslam.system.front_end import FrontEnd, check_order, check_size, image_extractor, source
 from torchslam.system.run import Run, run_sequence
-from torchslam.system.session import Session
-from torchslam.system.state_machine import StateMachine
+from torchslam.system.session import ActiveMap, Session, SystemContext
+from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
 from torchslam.tracking.matcher import Matcher, make_matcher, prepare_view
 from torchslam.tracking.pose_confirmation import PoseConfirmation
@@ -41,16 +40,18 @@ from torchslam.utils.timing import Stopwatch
 
 
 class SLAM:
-    """Give it frames one after the other; ask it for the map and the trajectory at any time.
+    """A monocular SLAM system, which processes one frame after the other.
 
-    It works on the device of the camera: SLAM(camera.to("cuda")) runs on the GPU, wherever the images are.
-    `save` keeps its worlds in a file; `SLAM.load` goes on in them with a session of its own.
+    It works on the device of the camera: `SLAM(camera.to("cuda"))` runs on the GPU, wherever the images are.
+    `save` writes the atlas to a map file; `SLAM.load` starts a further session in it.
 
-    Settings in pixels are those of images as `features.max_image_pixels` reduces them, and grow with larger ones.
-
-    extractor: front end, from images to `Features`, such as ORB(); the configured one if None. Frames that bring
-               features of their own, as those of `front_end.Simulated`, are not shown to it.
-    matcher:   who matches two views, see `tracking.matcher.Matcher`; the configured one if None
+    Args:
+        camera: The camera of all frames.
+        config: The configuration; the default one if None. Settings in pixels are those of images as
+            `features.max_image_pixels` reduces them, and are scaled for larger ones.
+        extractor: The front end, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
+            bring their own features, as those of `front_end.Simulated`, are not passed to it.
+        matcher: The matcher of two views, see `tracking.matcher.Matcher`; the configured one if None.
     """
 
     def __init__(
@@ -65,9 +66,11 @@ class SLAM:
         self.extractor = None  # where frames bring their features
         if extractor is not None or self.config.features.kind != "simulated":
             self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
-        self.has_own_parts = extractor is not None or matcher is not None  # which other processes do not have
+        self.has_custom_components = (
+            extractor is not None or matcher is not None
+        )  # unknown to worker processes
         self.clock = Stopwatch()
-        scaled = self.scaled = self.config.for_size(camera.size)  # what is told to the stages
+        scaled = self.scaled_config = self.config.for_size(camera.size)
         self.matcher = make_matcher(scaled.matching, matcher)
         self.tracker = Tracker(self.camera, scaled, self.matcher)
         undistorted = self.tracker.localizer.undistorted
@@ -75,7 +78,7 @@ class SLAM:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything and wait for a new start."""
+        """Forget all submaps, and wait for a new initialization."""
         self.start_session(Session(self.camera, Atlas(self.camera.params)))
 
     @classmethod
@@ -88,11 +91,16 @@ class SLAM:
         device: torch.device | str = "cpu",
         matcher: Matcher | None = None,
     ) -> SLAM:
-        """Go on in the worlds of a file that `save` wrote, with its camera: lost at first, in a session of its own.
+        """Start a further session in the atlas of a map file, with its camera; the first frame is relocalized.
 
-        mapping: without it, frames are only localised: no keyframe, point or world is made, none is changed
+        Args:
+            path: A file written by `save`.
+            config, extractor, matcher: As for `SLAM`.
+            mapping: If False, frames are only localized: no keyframe, point or submap is created or changed.
+            device: Where the system works.
 
-        Raises ResultsError for a file that is missing, damaged, or without a world to localise in.
+        Raises:
+            ResultsError: If the file is missing, damaged, or has no submap to localize in.
         """
         session = Session.load(path, mapping, device)
         slam = cls(session.camera, config, extractor, matcher)
@@ -100,84 +108,90 @@ class SLAM:
         return slam
 
     def save(self, path: str | Path) -> None:
-        """Write worlds and camera to a file, whole or not at all; frames that were only localised are left out."""
+        """Write atlas and camera to a map file, atomically; frames that were only localized are left out."""
         self.session.save(path)
 
     def start_session(
-        self, session: Session, world: Submap | None = None, last_frame: tuple[int, float] | None = None
+        self, session: Session, submap: Submap | None = None, last_frame: tuple[int, float] | None = None
     ) -> None:
-        """Begin a session, lost at first; or go on in one of its worlds, from where the camera was in `last_frame`.
-
-        last_frame: index and timestamp
-        """
-        self.session, self.worlds, self.mapping = session, session.worlds, session.mapping
+        """Start a session: lost at first, or tracking in a submap after `last_frame` (index and timestamp)."""
+        self.session, self.atlas, self.mapping = session, session.atlas, session.mapping
         self.last_frame = last_frame
-        self.tracker.counts = session.mapping
-        self.mapper.adjusting.drop()
-        self.memory = LoopCloser(self.camera, self.scaled, self.worlds)
-        self.foreign = NonStaticFilter(self.camera, self.scaled)
-        state = State.LOST if len(self.worlds) else State.INITIALIZING
-        self._here = ActiveMap(world, state if world is None else State.TRACKING)
-        self._probation = PoseConfirmation(self.scaled)
-        self._states = StateMachine(
+        self.last_features: FrameFeatures | None = None  # of the last frame, before masking
+        self.tracker.set_counting(session.mapping)
+        self.mapper.adjustment.drop()
+        self.loop_closer = LoopCloser(self.camera, self.scaled_config, self.atlas)
+        self.non_static_filter = NonStaticFilter(self.camera, self.scaled_config)
+        state = State.LOST if len(self.atlas) else State.INITIALIZING
+        self._active_map = ActiveMap(submap, state if submap is None else State.TRACKING)
+        self._confirmation = PoseConfirmation(self.scaled_config)
+        self._state_machine = StateMachine(
             SystemContext(
                 camera=self.camera,
-                config=self.scaled,
+                config=self.scaled_config,
                 clock=self.clock,
                 matcher=self.matcher,
                 tracker=self.tracker,
                 mapper=self.mapper,
                 session=session,
-                memory=self.memory,
-                foreign=self.foreign,
-                probation=self._probation,
-                here=self._here,
+                loop_closer=self.loop_closer,
+                non_static_filter=self.non_static_filter,
+                confirmation=self._confirmation,
+                active_map=self._active_map,
             )
         )
 
     @property
-    def world(self) -> Submap | None:
-        """The one that is followed; None where none is."""
-        return self._here.world
+    def submap(self) -> Submap | None:
+        """The active submap; None while there is none."""
+        return self._active_map.submap
 
     @property
     def state(self) -> State:
-        """After the last frame."""
-        return self._here.state
+        """State after the last frame."""
+        return self._active_map.state
 
     @property
-    def youth(self) -> ProvisionalMap | None:
-        """Of the world that is followed, while it is on trial."""
-        return self._states.beginning.youth
+    def provisional_map(self) -> ProvisionalMap | None:
+        """The active submap while later frames may still show that it was initialized wrongly."""
+        return self._state_machine.initialization.provisional
 
     @property
     def can_checkpoint(self) -> bool:
-        """Whether a world is followed that has proved itself, and no frame is held back."""
-        return self.world is not None and self.youth is None and not self._probation
+        """Whether the active submap is confirmed, and no frame is held back."""
+        is_confirmed = self.submap is not None and self.provisional_map is None
+        return is_confirmed and not self._confirmation.is_holding
 
-    # --- the way of a frame ----------------------------------------------------------------------------------
+    # --- pipeline --------------------------------------------------------------------------------------------
 
     @torch.inference_mode()
     def step(self, frame: Frame) -> StepResult:
         """Process one frame. A frame without a pose is no error: the result says why there is none.
 
-        Raises FrameError for an image of another size and for a frame that does not come after the last one.
+        Raises:
+            FrameError: If the image has another size than the camera, or the frame does not come after the last one.
         """
         with self.clock.rest("rest"):
-            view, outcome = self._process(frame)
+            self._check(frame)
+            with self.clock("features"):
+                view = self._extract(frame)
+                view = self.non_static_filter.mask_out(view)
+            if self.submap is not None:
+                outcome = self._state_machine.track(view)  # pose, keyframe, mapping, loop closing
+            else:
+                outcome = self._state_machine.relocalize_or_initialize(view)
         return self._result(view, outcome)
 
-    def _process(self, frame: Frame) -> tuple[FrameFeatures, Outcome]:
-        self._check(frame)
-        view = self._look(frame)
-        return view, self._states.step(view)
-
     def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
-        """Process an image of one's own loop: the frame after the last one.
+        """Process an image as the frame after the last one.
 
-        image: (H, W) or (H, W, C), uint8, or floats in [0, 1]; channels: their order, `channel_orders`
+        Args:
+            image: (H, W) or (H, W, C), uint8, or floats in [0, 1].
+            timestamp: Seconds.
+            channels: Order of the channels, one of `channel_orders`.
 
-        Raises FrameError for an image that cannot be taken, and as `step` does.
+        Raises:
+            FrameError: If the image is of another type or shape, and as `step` does.
         """
         index = 0 if self.last_frame is None else self.last_frame[0] + 1
         return self.step(Frame(index, float(timestamp), image_tensor(image, channels), f"image {index}"))
@@ -190,33 +204,23 @@ class SLAM:
     ) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end.
 
-        processes: how many, this one included; None: what is best, as on the command line. The result is the same.
+        Args:
+            sequence: The frames.
+            progress: Called after every frame.
+            processes: Number of processes, this one included; None: the best number. The result is the same.
         """
         sequence = source(sequence, self.config, self.camera)
         with with_workers(sequence, self, processes) as frames:
             return run_sequence(self, sequence, progress, frames=frames)
 
-    def trajectory(self) -> Trajectory:
-        """Every posed frame of this session in its main world, by the map as it is now."""
-        world = self.worlds.main(self.session.number)
-        return Trajectory.empty() if world is None else world.trajectory(self.session.number)
-
-    @property
-    def map(self) -> Map:
-        """Of the world that is followed, or else of the one with most frames; empty where there is none."""
-        world = self.world or self.worlds.main(self.session.number)
-        return Map() if world is None else world.map
-
-    @property
-    def history(self) -> PosedFrames:
-        """The posed frames of the same world as `map`."""
-        world = self.world or self.worlds.main(self.session.number)
-        return PosedFrames() if world is None else world.history
-
     @torch.inference_mode()
     def warm_up(self) -> None:
-        """Look at an image without anything in it, so that no frame waits for what ORB and torch make on first use."""
-        if self.extractor is not None and self.config.features.kind == "orb" and not self.has_own_parts:
+        """Extract features of an empty image, so that no frame waits for the initialization of ORB and PyTorch."""
+        if (
+            self.extractor is not None
+            and self.config.features.kind == "orb"
+            and not self.has_custom_components
+        ):
             width, height = self.camera.size
             self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
 
@@ -227,13 +231,32 @@ class SLAM:
 
     @torch.inference_mode()
     def confirm_map(self) -> None:
-        """Believe a young world as it is: the frames from before its start get their poses."""
-        self._states.confirm_map()
+        """Confirm a provisional map as it is: the frames from before its first keyframe get their poses."""
+        self._state_machine.confirm_map()
 
     @torch.inference_mode()
     def finalize(self) -> None:
-        """The last frame has come: what is held back keeps its pose, uncertain as it is."""
-        self._states.finalize()
+        """End the session: frames that are held back keep their poses, uncertain as they are."""
+        self._state_machine.finalize()
+
+    # --- results ---------------------------------------------------------------------------------------------
+
+    def trajectory(self) -> Trajectory:
+        """Every posed frame of this session in its main submap, by the map as it is now."""
+        submap = self.atlas.main(self.session.number)
+        return Trajectory.empty() if submap is None else submap.trajectory(self.session.number)
+
+    @property
+    def map(self) -> Map:
+        """The map of the active submap, or else of the main one; empty without submaps."""
+        submap = self.submap or self.atlas.main(self.session.number)
+        return Map() if submap is None else submap.map
+
+    @property
+    def posed_frames(self) -> PosedFrames:
+        """The posed frames of the same submap as `map`."""
+        submap = self.submap or self.atlas.main(self.session.number)
+        return PosedFrames() if submap is None else submap.posed_frames
 
     def _check(self, frame: Frame) -> None:
         if self.extractor is None and frame.features is None:
@@ -241,43 +264,43 @@ class SLAM:
                 "simulated features need true poses: use SLAM.run(sequence), or frames that bring features"
             )
         check_order(frame, self.last_frame)
-        is_whole = frame.image.numel() > 0 or frame.features is None  # else only its features came
-        if is_whole:
+        has_image = frame.image.numel() > 0 or frame.features is None
+        if has_image:
             check_size(frame, self.camera)
 
-    def _look(self, frame: Frame) -> FrameFeatures:
-        with self.clock("features"):
-            features = frame.features
-            if features is None:
-                assert self.extractor is not None  # as `_check` saw to
-                features = self.extractor(frame)
-            view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
-            self.seen = replace(view, session=self.session.number)
-            if self.last_frame is None:
-                self._check_kind(self.seen)
-            self.last_frame = frame.index, frame.timestamp
-            return self.foreign.clear_of(self.seen)
+    def _extract(self, frame: Frame) -> FrameFeatures:
+        """The features of the frame, as the matcher needs them."""
+        features = frame.features
+        if features is None:
+            assert self.extractor is not None  # see `_check`
+            features = self.extractor(frame)
+        view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+        self.last_features = view = replace(view, session=self.session.number)
+        if self.last_frame is None:
+            self._check_kind(view)
+        self.last_frame = frame.index, frame.timestamp
+        return view
 
     def _check_kind(self, view: FrameFeatures) -> None:
-        """Raises ConfigError where the front end is another one than that of the worlds."""
-        for world in self.worlds:
-            wrong = why_not_alike(world.map, view, to_map=self.mapping)
+        """Raises ConfigError if the submaps were made with another front end."""
+        for submap in self.atlas:
+            wrong = feature_mismatch(submap.map, view, to_map=self.mapping)
             if wrong:
                 raise ConfigError(f"the map was made with another front end: {wrong}")
 
     @torch.inference_mode(False)  # poses that leave may become part of a graph
-    def _result(self, view: FrameFeatures, outcome: Outcome) -> StepResult:
-        world, tracked = outcome.world, outcome.tracked
+    def _result(self, view: FrameFeatures, outcome: FrameOutcome) -> StepResult:
+        submap, estimate = outcome.submap, outcome.estimate
         return StepResult(
             index=view.index,
             timestamp=view.timestamp,
             state=self.state,
-            T_cw=None if world is None else world.T_cw,
-            world=None if world is None else world.number,
-            covariance=None if tracked is None else tracked.covariance.clone(),
+            T_cw=None if submap is None else submap.T_cw,
+            submap=None if submap is None else submap.number,
+            covariance=None if estimate is None else estimate.covariance.clone(),
             is_keyframe=outcome.is_keyframe,
-            matches=tracked.matches if tracked else 0,
-            inliers=tracked.inliers if tracked else 0,
+            matches=estimate.matches if estimate else 0,
+            inliers=estimate.inliers if estimate else 0,
             reason=outcome.reason,
             stage_ms=self.clock.take(),
         )

@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all, whatever ends the program while they are written."""
+"""Atomic writes: a file or folder appears complete or not at all, even if the program is killed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART = ".part"  # of the name of a file that is being written; what a killed program left is written over
+PART = ".part"  # suffix of a file that is being written; leftovers of a killed program are overwritten
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
-    """Put the content under a name beside `path`, make sure that it is on the disk, and rename it.
+    """Write a file under a temporary name, sync it to disk, and rename it to `path`.
 
-    Until then, a file that was there before stays as it was. Raises OSError.
+    An existing file stays unchanged until then. Raises OSError.
     """
     path = Path(path)
     part = path.with_name(path.name + PART)
@@ -32,10 +32,10 @@ def write_whole(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into, which gets its name `path` when the block ends well; else nothing of it stays.
+    """Context manager that yields a temporary folder, renamed to `path` on success and deleted on an exception.
 
-    What a killed program left half-written under this name goes first, what was there under the name last. Nobody
-    else may write the same folder meanwhile. Raises OSError.
+    Leftovers of a killed program are deleted first; an existing folder is replaced last. Only one process may write the
+    folder at a time. Raises OSError.
     """
     part, old = path.with_name(f".{path.name}{PART}"), path.with_name(f".{path.name}.old")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def _sync_file(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Let the new name survive a loss of power; where folders cannot be opened, the system does it when it likes."""
+    """Sync the directory entry, so that a rename survives a power loss; not possible on every system."""
     try:
         number = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -1,6 +1,6 @@
-"""Reading what strangers wrote: regular files only, and never more of one than there may be of its kind.
+"""Bounded reading of untrusted files: regular files only, up to a size limit for each kind.
 
-A pipe or a device has no end, and a name in a list may be that of one.
+A file name in a list may be that of a pipe or a device, which have no end.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 
 CHUNK = 1 << 20
 JSON_BYTES = 1 << 25
-"""A JSON file above this size is not read: as objects of Python it takes twenty times as much."""
+"""Size limit of JSON files; the Python objects take about twenty times as much."""
 
 
 def check_regular(path: str | Path, limit: int, what: str) -> None:
-    """For readers that open a file by its name themselves. Raises OSError as `read_bytes` does."""
+    """Check a file that a library opens by name. Raises OSError as `read_bytes`."""
     try:
         _check(os.stat(path), path, limit, what)
     except ValueError:
@@ -26,13 +26,18 @@ def check_regular(path: str | Path, limit: int, what: str) -> None:
 
 
 def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
-    """The content of a regular file.
+    """Read the content of a regular file.
 
-    Raises OSError, whose `strerror` says why: anything but a regular file, more bytes than `limit`, a name that no
-    file has; `what` a file of this kind is called, as in "more than the 100 bytes of a text".
+    Args:
+        path: the file.
+        limit: maximum number of bytes.
+        what: name of this kind of file, for the message "more than the 100 bytes of a text".
+
+    Raises:
+        OSError: for a missing file, anything but a regular file, or more bytes than `limit`.
     """
     try:
-        # Without O_NONBLOCK, opening a pipe waits for somebody who writes.
+        # Without O_NONBLOCK, opening a pipe waits for a writer.
         number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except ValueError:
         raise _nul(path) from None
@@ -42,7 +47,7 @@ def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
         while chunk := os.read(number, CHUNK):
             chunks.append(chunk)
             size += len(chunk)
-            if size > limit:  # grows, or is one of those of the system that do not know their size
+            if size > limit:  # the file grows, or is a system file of unknown size
                 raise _too_large(path, size, limit, what)
     finally:
         os.close(number)
@@ -50,14 +55,13 @@ def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
 
 
 def read_text(path: str | Path, limit: int, what: str) -> str:
-    """The text of a regular file in UTF-8, lines ending in `\\n`. Raises OSError as `read_bytes` does, ValueError for
-    what is no UTF-8."""
+    """Read a regular UTF-8 file, with line ends `\\n`. Raises OSError as `read_bytes`, ValueError for invalid UTF-8."""
     text = read_bytes(path, limit, what).decode("utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def parse_json(text: str) -> Any:
-    """Raises ValueError for what is no JSON, and for what is nested deeper than any that we write."""
+    """Parse JSON. Raises ValueError for invalid or too deeply nested text."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -77,4 +81,4 @@ def _too_large(path: str | Path, size: int, limit: int, what: str) -> OSError:
 
 
 def _nul(path: str | Path) -> OSError:
-    return OSError(errno.EINVAL, "a name with a NUL in it", str(path))
+    return OSError(errno.EINVAL, "file name contains a NUL character", str(path))

@@ -1,6 +1,6 @@
-"""Sets of whole numbers, such as the rows of points and keyframes, by a flag for each from the lowest to the highest.
+"""Set operations on dense row numbers, by a flag per number between the lowest and the highest.
 
-Several times as fast as sorting, as `torch.unique` and `torch.isin` do, where the numbers are as dense as rows are.
+For dense numbers this is several times faster than the sorting of `torch.unique` and `torch.isin`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from torch import Tensor
 
 
 def true_indices(mask: Tensor) -> Tensor:
-    """Positions (K,) int64 where a flat boolean mask is true, ascending."""
-    if mask.is_cpu:  # where few are true numpy takes half the time
+    """Return the positions (K,) int64 at which a flat boolean mask is true, ascending."""
+    if mask.is_cpu:  # twice as fast in NumPy for sparse masks
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.nonzero().squeeze(1)
 
 
 def distinct(ids: Tensor) -> Tensor:
-    """(m,) the distinct ones of ids (n,), ascending: `torch.unique`."""
+    """Return the distinct values (m,) of ids (n,), ascending, as `torch.unique`."""
     if len(ids) == 0:
         return ids
     low, flags = _flags(ids)
@@ -26,7 +26,7 @@ def distinct(ids: Tensor) -> Tensor:
 
 
 def ranks_among(ids: Tensor, ascending: Tensor) -> Tensor:
-    """(n,) where each of ids (n,) stands among distinct ones (m,), ascending, which hold them all."""
+    """Return the position (n,) of each of ids (n,) in distinct ascending ids (m,) that contain all of them."""
     if len(ids) == 0:
         return ids
     low, high = int(ascending[0]), int(ascending[-1])
@@ -36,7 +36,7 @@ def ranks_among(ids: Tensor, ascending: Tensor) -> Tensor:
 
 
 def is_among(ids: Tensor, others: Tensor) -> Tensor:
-    """(n,) bool, whether each of ids (n,) is one of others (m,): `torch.isin`."""
+    """Return (n,) bool: membership of each of ids (n,) in others (m,), as `torch.isin`."""
     if len(ids) == 0 or len(others) == 0:
         return torch.zeros_like(ids, dtype=torch.bool)
     low, flags = _flags(others)
@@ -46,7 +46,7 @@ def is_among(ids: Tensor, others: Tensor) -> Tensor:
 
 
 def _flags(ids: Tensor) -> tuple[int, Tensor]:
-    """The lowest of ids (n,), and for each number from there on whether it is one of them."""
+    """Return the lowest of ids (n,) and a flag for each number from there on."""
     low, high = (int(end) for end in ids.aminmax())
     flags = torch.zeros(high - low + 1, dtype=torch.bool, device=ids.device)
     return low, flags.index_fill_(0, ids - low, True)

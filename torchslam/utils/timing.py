@@ -23,7 +23,7 @@ class Stopwatch:
 
     @contextmanager
     def rest(self, stage: str) -> Iterator[None]:
-        """What is done here beside the stages inside is a stage as well."""
+        """Time the rest of a block, without the stages inside it, as a stage."""
         start, before = time.perf_counter(), sum(self.ms.values())
         try:
             yield

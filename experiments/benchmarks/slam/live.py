@@ -1,4 +1,4 @@
-"""Does a live run keep up? A recording is played at the rate of its camera, whether anybody looks or not.
+"""Does a live run keep up? A recording is played at the rate of its camera, and late frames are dropped.
 
 python -m experiments.benchmarks.slam.live redkitchen
 """
@@ -26,7 +26,7 @@ from torchslam.types import StepResult, Trajectory
 
 
 class Player:
-    """The images of a recording as a camera gives them: one that is not taken when it is due is gone."""
+    """The images of a recording at the rate of its camera: a frame that is not read in time is lost."""
 
     def __init__(self, sequence: Sequence, rate: float) -> None:
         self.paths = [sequence.image_name(index) for index in range(len(sequence))]
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def ate(trajectory: Trajectory, recording: Sequence, begin: float, rate: float) -> float:
-    """ATE of poses at the times of the player, in metres; NaN without ground truth."""
+    """ATE of poses at the times of the player, in meters; NaN without ground truth."""
     if recording.groundtruth is None:
         return float("nan")
     frames = ((trajectory.timestamps - begin) * rate).round().long()

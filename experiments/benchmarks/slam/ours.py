@@ -1,4 +1,4 @@
-"""One run of a sequence, in a process of its own; prints its figures as JSON. For `run.py`, which measures it.
+"""One run of a sequence in its own process; prints its metrics as JSON for `run.py`.
 
 python -m experiments.benchmarks.slam.ours SEQUENCE TRAJECTORY --processes 2 --limit 160
 """
@@ -15,7 +15,7 @@ import torch
 
 from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.data.formats.trajectory_file import write_trajectory
+from torchslam.data.trajectories import write_trajectory
 from torchslam.parallel.workers import with_workers
 from torchslam.system.run import run_sequence
 from torchslam.system.slam import SLAM
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def cpu_seconds() -> float:
-    """What this process has taken of the processors."""
+    """Processor seconds of this process."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

@@ -1,4 +1,4 @@
-"""How fast and how well does the whole system run, beside ORB-SLAM3 on the same machine? See README.md."""
+"""How fast and accurate is the whole system compared with ORB-SLAM3 on the same machine? See README.md."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from experiments.benchmarks.problems import PEERS
 from experiments.common import DATA_DIR, table, write_between
 from torchslam.data import open_sequence
-from torchslam.data.formats.trajectory_file import read_trajectory
+from torchslam.data.trajectories import read_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 
@@ -25,7 +25,7 @@ HEADER = ["sequence", "system", "ms, median", "ms, 95 %", "frames/s", "CPU ms a 
 
 @dataclass(frozen=True)
 class Recording:
-    """What is run: the first frames of a sequence, at the rate of its camera; `features` for ORB-SLAM3."""
+    """The first frames of a sequence at the rate of its camera; `features` for ORB-SLAM3."""
 
     name: str
     frames: int
@@ -43,8 +43,8 @@ RECORDINGS = (
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Of one run: times per frame, frames/s, CPU time of all its processes per frame; ATE, where there is a path."""
+class Metrics:
+    """Metrics of one run: times per frame, frames/s, CPU time of all processes per frame; ATE, if there is a path."""
 
     frames: int
     median: float
@@ -67,9 +67,9 @@ def main() -> None:
         if recording.name not in arguments.names:
             continue
         if not (DATA_DIR / recording.name).is_dir():
-            print(f"{recording.name}: not at {DATA_DIR}, left out")
+            print(f"{recording.name}: not in {DATA_DIR}, skipped")
             continue
-        runs: dict[str, list[Figures]] = {}
+        runs: dict[str, list[Metrics]] = {}
         for _ in range(arguments.rounds):
             for system in systems(peer is not None):
                 runs.setdefault(system, []).append(measured(system, recording, peer))
@@ -82,23 +82,23 @@ def main() -> None:
 
 
 def systems(with_peer: bool) -> list[str]:
-    """Which ones run a recording."""
+    """The systems that run a recording."""
     ours = [OURS, ALONE]
     return [*ours, PEER] if with_peer else ours
 
 
 def find_peer() -> list[str] | None:
-    """What starts ORB-SLAM3: the interpreter that ORB_SLAM3_PYTHON names, with the script beside the data."""
+    """The command of ORB-SLAM3: the interpreter in ORB_SLAM3_PYTHON with the script next to the data."""
     python, script = os.environ.get("ORB_SLAM3_PYTHON"), PEERS / "run_orbslam.py"
     if not script.is_file():
         script = DATA_DIR.parent / "peers" / "run_orbslam.py"
     if python is None or not script.is_file():
-        print(f"ORB-SLAM3: left out; set ORB_SLAM3_PYTHON to the interpreter that has it, for {script}")
+        print(f"ORB-SLAM3: skipped; set ORB_SLAM3_PYTHON to the interpreter that has it, for {script}")
         return None
     return [python, str(script)]
 
 
-def measured(system: str, recording: Recording, peer: list[str] | None) -> Figures:
+def measured(system: str, recording: Recording, peer: list[str] | None) -> Metrics:
     """One run of a system, with the CPU time of all its processes."""
     source = DATA_DIR / recording.name
     with tempfile.TemporaryDirectory() as temporary:
@@ -110,8 +110,8 @@ def measured(system: str, recording: Recording, peer: list[str] | None) -> Figur
             line = [sys.executable, "-m", "experiments.benchmarks.slam.ours", str(source)]
             line += [str(folder / "trajectory.txt"), "--limit", str(recording.frames)]
             line += ["--processes", "1"] if system == ALONE else []
-        said, seconds = with_cpu_time(line)
-        figures = json.loads(said.strip().split("\n")[-1])
+        printed, seconds = with_cpu_time(line)
+        figures = json.loads(printed.strip().split("\n")[-1])
         ate, posed = accuracy(folder / "trajectory.txt", source, recording.frames)
     frames = figures["frames"]
     if system == PEER:
@@ -119,24 +119,24 @@ def measured(system: str, recording: Recording, peer: list[str] | None) -> Figur
     else:
         rate, start_up = figures["frames_per_s"], figures["start_up_s"]
     cpu = 1e3 * (seconds - start_up) / frames
-    return Figures(frames, figures["ms_median"], figures["ms_p95"], rate, cpu, ate, posed)
+    return Metrics(frames, figures["ms_median"], figures["ms_p95"], rate, cpu, ate, posed)
 
 
 def with_cpu_time(line: list[str]) -> tuple[str, float]:
-    """What a command prints, and the seconds that it and its own processes took of the processors."""
+    """Run a command; return its output and the processor seconds of it and its children."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with tempfile.TemporaryFile("w+") as said:
-        child = subprocess.Popen(line, stdout=said, env=environment)
+    with tempfile.TemporaryFile("w+") as printed:
+        child = subprocess.Popen(line, stdout=printed, env=environment)
         _, status, used = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
         if child.returncode:
             raise SystemExit(f"{' '.join(line)}: ended with {child.returncode}")
-        said.seek(0)
-        return said.read(), used.ru_utime + used.ru_stime
+        printed.seek(0)
+        return printed.read(), used.ru_utime + used.ru_stime
 
 
 def accuracy(path: Path, source: Path, frames: int) -> tuple[float | None, int]:
-    """ATE in metres, where it can be told, and the number of poses."""
+    """ATE in meters, if it can be computed, and the number of poses."""
     truth = open_sequence(source, limit=frames).groundtruth
     try:
         trajectory = read_trajectory(path)
@@ -145,7 +145,7 @@ def accuracy(path: Path, source: Path, frames: int) -> tuple[float | None, int]:
         return None, 0
 
 
-def row(recording: Recording, system: str, runs: list[Figures]) -> list[str]:
+def row(recording: Recording, system: str, runs: list[Metrics]) -> list[str]:
     """The medians of some runs."""
     ates = [run.ate for run in runs if run.ate is not None]
     return [

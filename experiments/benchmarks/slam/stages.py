@@ -9,9 +9,8 @@ import argparse
 from pathlib import Path
 
 from experiments.common import table
-from torchslam.io.frames_file import read_frames
 from torchslam.io.report import stage_times
-from torchslam.io.results import FRAMES
+from torchslam.io.results import FRAMES, read_frames
 
 HEADER = ["stage", "frames", "ms where it ran", "ms a frame", "ms a keyframe", "share"]
 

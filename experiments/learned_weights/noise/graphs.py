@@ -12,8 +12,8 @@ from experiments.common import DATA_DIR
 from experiments.learned_weights.noise.cues import Cues, describe
 from experiments.trials.trials import drone
 from torchslam import ORB, SLAM, Config, Features, open_sequence
-from torchslam.data.association import interpolate_poses
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
+from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import se3_inverse
 from torchslam.map.posed_frames import RunGraph
 from torchslam.optim.run_graph import ObservationGraph
@@ -26,7 +26,7 @@ KITTI_CAMERA = "685,685,601.887,183.110"
 
 
 def opened(name: str) -> Sequence:
-    """A sequence of the experiment. Raises SequenceError where it is not at hand."""
+    """A sequence of the experiment. Raises SequenceError if it is not available."""
     if name == "drone":
         return drone()
     place = name if name.startswith("synthetic:") else DATA_DIR / name
@@ -67,12 +67,12 @@ class Example:
 
 
 def keyframes_of(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Tensor]:
-    """The graph of the keyframes of the largest world alone; (K,) these frames and (O,) the observations kept."""
-    largest = int(torch.bincount(graph.world).argmax())
-    chosen = graph.is_keyframe & (graph.world == largest)
+    """The graph of the keyframes of the largest submap alone; (K,) these frames and (O,) the observations kept."""
+    largest = int(torch.bincount(graph.submap).argmax())
+    chosen = graph.is_keyframe & (graph.submap == largest)
     frames = chosen.nonzero().squeeze(-1)
     rows = chosen[graph.frame_index].nonzero().squeeze(-1)
-    slots = torch.full_like(graph.world, -1)
+    slots = torch.full_like(graph.submap, -1)
     slots[frames] = torch.arange(len(frames))
     points, point_index = torch.unique(graph.point_index[rows], return_inverse=True)
     part = ObservationGraph(
@@ -90,11 +90,11 @@ def keyframes_of(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Ten
 
 
 def truth_of(graph: ObservationGraph, sequence: Sequence) -> tuple[Tensor, Tensor]:
-    """(F, 4, 4) true T_cw of a graph's frames, and (F,) where they are known; in the largest world alone."""
+    """(F, 4, 4) true T_cw of a graph's frames, and (F,) where they are known; in the largest submap alone."""
     assert sequence.groundtruth is not None
-    largest = int(torch.bincount(graph.world).argmax())
+    largest = int(torch.bincount(graph.submap).argmax())
     T_wc, known = interpolate_poses(sequence.groundtruth, graph.timestamps, GROUNDTRUTH_TOLERANCE)
-    return se3_inverse(T_wc), known & (graph.world == largest)
+    return se3_inverse(T_wc), known & (graph.submap == largest)
 
 
 def example_of(sequence: Sequence, config: Config) -> Example:

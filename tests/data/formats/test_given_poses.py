@@ -112,7 +112,7 @@ def test_images_are_known_by_their_times() -> None:
         (
             "transforms.json",
             json.dumps({"frames": [{"file_path": "a", "transform_matrix": (2 * torch.eye(4)).tolist()}]}),
-            "no rotation",
+            "not a rigid transformation",
         ),
         ("images.txt", "1 1 0 0 0 0 0 0 1\n", "expected `id qw"),
         ("images.txt", "1 3 0 0 0 0 0 0 1 a.png\n\n", "unit length"),

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from torchslam.data.formats.image_file import AS_GRAY, decode_pixels
-from torchslam.data.formats.png import decode_gray
+from torchslam.data.formats.image_file import AS_GRAY, decode_pixels, decode_png_gray
 
 
 def by_opencv(data: bytes) -> np.ndarray | None:
@@ -34,7 +33,7 @@ def test_same_pixels_as_opencv(shape: tuple[int, ...], dtype: type, seed: int) -
     noise = np.random.default_rng(seed).integers(0, np.iinfo(dtype).max + 1, shape)
     image: np.ndarray = noise.astype(dtype)
     data = encoded(image)
-    gray = decode_gray(data)
+    gray = decode_png_gray(data)
     assert gray is not None
     assert gray.dtype == dtype
     np.testing.assert_array_equal(gray, by_opencv(data))
@@ -44,14 +43,14 @@ def test_every_mixture_of_colors_is_the_gray_that_opencv_makes_of_it() -> None:
     levels = np.arange(0, 256, 5, dtype=np.uint8)
     colors = np.stack(np.meshgrid(levels, levels, np.arange(256, dtype=np.uint8), indexing="ij"), -1)
     data = encoded(colors.reshape(len(levels), -1, 3))
-    np.testing.assert_array_equal(decode_gray(data), by_opencv(data))
+    np.testing.assert_array_equal(decode_png_gray(data), by_opencv(data))
 
 
 def test_text_in_front_of_the_pixels_changes_nothing() -> None:
     text = PngImagePlugin.PngInfo()
     text.add_text("camera", "left")
     image = np.arange(256, dtype=np.uint8).reshape(8, 32)
-    np.testing.assert_array_equal(decode_gray(encoded(image, pnginfo=text, dpi=(72, 72))), image)
+    np.testing.assert_array_equal(decode_png_gray(encoded(image, pnginfo=text, dpi=(72, 72))), image)
 
 
 def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
@@ -65,7 +64,7 @@ def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
         cv2.imencode(".jpg", colors)[1].tobytes(),
         b"",
     ):
-        assert decode_gray(data) is None
+        assert decode_png_gray(data) is None
     data = encoded(colors, pnginfo=gamma)
     np.testing.assert_array_equal(decode_pixels(data), by_opencv(data))
 
@@ -75,7 +74,7 @@ def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
 def test_damage_is_never_read_as_something_else(at: int, value: int, lost: int) -> None:
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[at % len(data)] = value
-    gray = decode_gray(bytes(data[: len(data) - lost % len(data)]))
+    gray = decode_png_gray(bytes(data[: len(data) - lost % len(data)]))
     if gray is not None:
         theirs = by_opencv(bytes(data))
         assert theirs is None or np.array_equal(gray, theirs)
@@ -87,7 +86,7 @@ def test_headers_that_promise_something_else_are_left_to_opencv(width: int, heig
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[16:29] = width.to_bytes(4, "big") + height.to_bytes(4, "big") + kind
     data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
-    gray, theirs = decode_gray(bytes(data)), by_opencv(bytes(data))
+    gray, theirs = decode_png_gray(bytes(data)), by_opencv(bytes(data))
     assert gray is None or theirs is None or np.array_equal(gray, theirs)
 
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from tests.walks import Walk, arc
 from torchslam.errors import FrameError
-from torchslam.io.export.colors import colorize_points
+from torchslam.io.write_run import colorize_points
 from torchslam.map.map import Map
 
 SIZE = (160, 120)

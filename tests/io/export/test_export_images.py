@@ -11,9 +11,8 @@ import torch
 from torchslam.data import open_sequence
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.images import open_images, write_images
+from torchslam.io.export.images import Undistorter, open_images, write_images
 from torchslam.io.export.scene import Scene
-from torchslam.io.export.undistortion import Undistorter
 
 FRAMES = 7
 
@@ -92,7 +91,7 @@ def test_images_have_the_size_that_the_run_saw(seen: Scene, folder: Path) -> Non
 
 
 def test_a_sequence_that_is_gone_is_named(seen: Scene, tmp_path: Path) -> None:
-    with pytest.raises(ResultsError, match=r"nowhere: does not exist; --sequence.*--no-images"):
+    with pytest.raises(ResultsError, match=r"nowhere: does not exist; use --sequence.*--no-images"):
         open_images(str(tmp_path / "nowhere"), seen)
 
 

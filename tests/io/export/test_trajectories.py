@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchslam.data.formats.trajectory_file import write_trajectory
-from torchslam.io.export.kitti import write_kitti
+from torchslam.data.trajectories import write_kitti, write_trajectory
 from torchslam.types import Trajectory
 
 

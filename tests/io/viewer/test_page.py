@@ -18,9 +18,8 @@ import torch
 from tests.io.test_results import two, write
 from torchslam.geometry import transform
 from torchslam.io.results import Results, read_results
-from torchslam.io.viewer import data as view_data
-from torchslam.io.viewer.data import decoded, encoded
-from torchslam.io.viewer.page import page, write_view
+from torchslam.io.viewer import page as view_data
+from torchslam.io.viewer.page import decoded, encoded, page, write_view
 from torchslam.system.run import Run
 from torchslam.types import State, Trajectory
 

@@ -1,7 +1,7 @@
 """Calibration files of other programs: OpenCV, ROS, Kalibr, EuRoC, ORB-SLAM3, COLMAP, nerfstudio.
 
-Pixel (0, 0) is the center of the top left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3; COLMAP and nerfstudio put its
-corner there, so that their principal points are half a pixel larger.
+Pixel (0, 0) is the center of the top left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3. COLMAP and nerfstudio use its
+corner, so their principal points are larger by half a pixel.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any
 
 from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.formats.text_file import numbered_lines, parse_floats, read_text
-from torchslam.data.formats.yaml_text import yaml_numbers, yaml_value
 from torchslam.errors import CalibrationError
 from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json
@@ -244,3 +243,54 @@ def _from_corner(values: dict[str, float], fisheye: bool, source: str, size: Siz
 
 def _size(width: list[float] | None, height: list[float] | None) -> Size | None:
     return (int(width[0]), int(height[0])) if width and height and min(width[0], height[0]) >= 1 else None
+
+
+def yaml_value(text: str, key: str) -> str | None:
+    """What stands behind the first `key:` as words; of a matrix its `data`; None where the key is missing."""
+    found = re.search(rf"^([ \t]*(?:- )?){re.escape(key)}[ \t]*:", text, re.MULTILINE)
+    if found is None:
+        return None
+    rest = text[found.end() :]
+    line, _, below = rest.partition("\n")
+    line = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
+    if line.startswith("["):
+        return _bracketed(rest.lstrip(" \t"))
+    if line and not line.startswith("!!"):
+        return line.strip("\"'")
+    block = _block(below, len(found[1]))
+    data = yaml_value(block, "data")
+    return (
+        " ".join(re.findall(r"^[ \t]*-[ \t]*([^\s:]+)[ \t]*$", block, re.MULTILINE)) if data is None else data
+    )
+
+
+def yaml_numbers(text: str, keys: tuple[str, ...], where: str) -> list[float] | None:
+    """The numbers of the first of the keys that is there. Raises CalibrationError at `where` for anything else."""
+    for key in keys:
+        value = yaml_value(text, key)
+        if value is not None:
+            return parse_floats(value, f"{where}: {key}", CalibrationError)
+    return None
+
+
+def _bracketed(text: str) -> str:
+    """The words of a list in brackets, which may hold lists, over as many lines as it takes."""
+    depth, words = 0, []
+    for part in re.findall(r"\[|\]|#[^\n]*|[^\[\]#]+", text):
+        depth += (part == "[") - (part == "]")
+        if depth == 0:
+            break
+        if part not in "[]" and not part.startswith("#"):
+            words.append(part)
+    return " ".join(words)
+
+
+def _block(text: str, indent: int) -> str:
+    """The lines up to one that is not further in than `indent`; dashes may stand where their key does."""
+    lines = []
+    for line in text.splitlines():
+        inner = len(line) - len(line.lstrip())
+        if line.strip() and (inner < indent or (inner == indent and not line.lstrip().startswith("-"))):
+            break
+        lines.append(line)
+    return "\n".join(lines)

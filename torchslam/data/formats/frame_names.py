@@ -1,4 +1,4 @@
-"""Which files of a folder are frames, told by their names: hidden ones, depth images and masks are not."""
+"""Selection of the frames in a folder by file name, without hidden files, depth images and masks."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torchslam.data.formats.image_file import SUFFIXES
 from torchslam.errors import SequenceError
 
 MAX_FILES = 1_000_000
-"""Files of a folder that are looked at."""
+"""Maximum number of files in a folder."""
 FOLDERS = ("images", "rgb", "image", "color", "colour", "frames", "imgs", "img", "image_0", "image_2")
-"""Folders inside another one in which frames are looked for."""
+"""Subfolders that are searched for frames."""
 
 # Words of a name, set off by anything but letters, that say what an image is when it is no frame.
 OTHER_KINDS = {
@@ -49,7 +49,7 @@ class Found:
     def notes(self) -> list[str]:
         """What was left out, in words."""
         kinds = ", ".join(f"{count} {kind}" for kind, count in self.left_out.items())
-        return [f"left out what are no frames: {kinds}"] if kinds else []
+        return [f"ignored: {kinds}"] if kinds else []
 
 
 def natural(name: str) -> list[tuple[bool, int, str]]:

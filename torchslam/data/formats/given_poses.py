@@ -12,12 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchslam.data.association import nearest
 from torchslam.data.calibration import Calibration
 from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
 from torchslam.data.formats.text_file import parse_floats, read_text
-from torchslam.data.formats.trajectory_file import read_trajectory
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
+from torchslam.data.trajectories import nearest, read_trajectory
 from torchslam.errors import CalibrationError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
@@ -214,7 +213,7 @@ def _read_transforms(path: Path) -> GivenPoses:
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
     if not bool(T_wc.isfinite().all() & ((R @ R.mT - torch.eye(3, dtype=R.dtype)).abs() < _ORTHOGONAL).all()):
-        raise TrajectoryError(f"{path}: a transform_matrix that is no rotation and translation")
+        raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it
     calibration = read_calibration(path) if is_shared else None

@@ -11,15 +11,15 @@ from torchslam.errors import TorchslamError
 from torchslam.utils import bounded_read as regular_file
 
 MAX_BYTES = 1 << 27
-"""A text file above this size is not read: lists and poses of a million frames are smaller."""
+"""Size limit of text files; a million poses are smaller."""
 MAX_DIGITS = 19
-"""Of a whole number: nanoseconds since 1970 have 19, until 2286."""
+"""Maximum number of digits of an integer; nanoseconds since 1970 have 19."""
 MAX_LINE = 1 << 16
-"""Characters of a line of numbers."""
+"""Maximum length of a line of numbers."""
 
 
 def read_text(path: str | Path, error: type[TorchslamError], limit: int | None = None) -> str:
-    """The text of a file. Raises `error` where it does not exist, is not text or is too large.
+    """Read a text file. Raises `error` if it is missing, not text or too large.
 
     limit: bytes; None: MAX_BYTES
     """
@@ -32,7 +32,7 @@ def read_text(path: str | Path, error: type[TorchslamError], limit: int | None =
 
 
 def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
-    """The lines of a file that say something, with their numbers from 1; `#` after a space starts a comment.
+    """Yield the non-empty lines of a file with their numbers from 1; `#` after a space starts a comment.
 
     Raises `error` where the file does not exist, is not text or is too large.
     """
@@ -43,7 +43,7 @@ def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tu
 
 
 def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[float]:
-    """The finite numbers of a line, apart by spaces or commas. Raises `error` at `where` otherwise."""
+    """Parse finite numbers separated by spaces or commas. Raises `error` at `where` otherwise."""
     if len(text) > MAX_LINE:
         raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
     numbers = []
@@ -59,12 +59,12 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
 
 
 def parse_count(text: str) -> int | None:
-    """A whole number from 0 on, of at most 19 digits; None for anything else."""
+    """Parse a non-negative integer of at most 19 digits; None for anything else."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
 
 
 def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:
-    """Raises `error` at `where` unless a timestamp is later than the one before it."""
+    """Raise `error` at `where` unless a timestamp is later than the previous one."""
     if timestamp <= before:
         relation = "repeats" if timestamp == before else "is earlier than"
         raise error(f"{where}: timestamp {timestamp!r} {relation} the one before")

@@ -9,13 +9,12 @@ import math
 import re
 from pathlib import Path
 
-from torchslam.data.calibration import Calibration
+from torchslam.data.calibration import PRESETS, Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.text_file import numbered_lines
-from torchslam.data.formats.trajectory_file import read_trajectory
-from torchslam.data.presets import PRESETS
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.trajectories import read_trajectory
 from torchslam.errors import SequenceError
 
 CALIBRATION_FILES = ("calibration.txt", "calib.txt")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import torch
 
+from torchslam.data.calibration import PRESETS
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.text_file import parse_count
-from torchslam.data.formats.trajectory_file import read_trajectory
-from torchslam.data.presets import PRESETS
 from torchslam.data.readers.folder import DEFAULT_RATE
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.trajectories import read_trajectory
 from torchslam.errors import SequenceError
 from torchslam.types import Trajectory
 

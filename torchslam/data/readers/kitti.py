@@ -14,8 +14,8 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.text_file import numbered_lines, parse_floats
-from torchslam.data.formats.trajectory_file import checked_poses
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.types import Trajectory
 

@@ -18,8 +18,8 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
-from torchslam.data.formats.trajectory_file import checked_poses
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import torch
 
+from torchslam.data.calibration import PRESETS
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.text_file import numbered_lines, parse_floats
-from torchslam.data.formats.trajectory_file import checked_poses
-from torchslam.data.presets import PRESETS
 from torchslam.data.readers.folder import DEFAULT_RATE, at_rate
 from torchslam.data.readers.image_sequence import ImageSequence
+from torchslam.data.trajectories import checked_poses
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory

@@ -1,12 +1,110 @@
-"""Scenes of textured rectangles: a furnished room, a single wall."""
+"""Scenes of textured rectangles: procedural textures with corners at every scale, a furnished room, a wall."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from torchslam.data.synthetic.textures import COVERAGE, surface
+FINEST = 0.02
+"""Meters: about the smallest shape drawn."""
+COVERAGE = 0.25
+"""The part of a surface that the largest shapes cover."""
+KINDS = ("polygon", "bar", "ellipse", "letter")
+MIN_CONTRAST = 30
+"""Gray levels between a shape and what is below its center."""
+FRACTION_BITS = 4
+"""Of the coordinates of polygons, so that their corners lie off the pixel grid."""
+
+
+def surface(
+    rng: np.random.Generator,
+    size: tuple[float, float],
+    texel: float,
+    multiple: int,
+    coverage: float = COVERAGE,
+) -> np.ndarray:
+    """A painted surface: shapes of every size from a third of it down to two centimeters, over smooth noise.
+
+    size: (width, height) meters; texel: meters, at most; multiple: of which rows and columns are to be
+    coverage: the part of the surface that the largest shapes cover
+    Returns (rows, columns) uint8.
+    """
+    columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
+    image = _noise(rng, rows, columns, texel)
+    extent = largest = min(size) / 3
+    while extent > FINEST:
+        # The small ones leave more room, so that what is below them stays visible.
+        share = coverage * (extent / largest) ** 0.5
+        count = int(share * size[0] * size[1] / (0.3 * extent**2)) + 1
+        _draw_shapes(rng, image, count, extent / texel)
+        extent /= 1.7
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def _noise(rng: np.random.Generator, rows: int, columns: int, texel: float) -> np.ndarray:
+    """Noise of several octaves around a tone of the surface's own, (rows, columns) uint8."""
+    total = np.full((rows, columns), rng.uniform(105, 165), np.float32)
+    for wavelength, amplitude in ((0.9, 30.0), (0.2, 15.0), (0.05, 10.0), (0.015, 8.0)):
+        cells = (max(2, int(rows * texel / wavelength)), max(2, int(columns * texel / wavelength)))
+        coarse = rng.uniform(-amplitude, amplitude, cells).astype(np.float32)
+        total += cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    return total.clip(0, 255).astype(np.uint8)
+
+
+def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent: float) -> None:
+    """Draw `count` random shapes of about `extent` texels, each lighter or darker than what is below it."""
+    rows, columns = image.shape
+    kinds = rng.choice(len(KINDS), count, p=(0.45, 0.25, 0.15, 0.15))
+    centers = rng.uniform((0, 0), (columns, rows), (count, 2))
+    radii = 0.5 * extent * rng.uniform(0.6, 1.4, count)
+    contrasts = rng.uniform(35, 95, count) * rng.choice((-1, 1), count)
+    turns = rng.uniform(0, 2 * np.pi, count)
+    aspects = rng.uniform(0.3, 1.0, count)
+    letters = rng.integers(ord("A"), ord("Z") + 1, count)
+    corners = rng.integers(3, 7, count)
+    jitters = rng.uniform(-0.35, 0.35, (count, 6))
+    for i in range(count):
+        x, y = centers[i]
+        gray = _standing_out(int(image[int(y), int(x)]), contrasts[i])
+        kind, radius = KINDS[kinds[i]], radii[i]
+        if kind == "letter":
+            _draw_letter(image, chr(letters[i]), (x, y), radius, gray)
+        elif kind == "ellipse":
+            axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
+            cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), gray, -1, cv2.LINE_AA)
+        else:
+            sides = 4 if kind == "bar" else corners[i]
+            angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
+            outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
+            _fill(image, outline, turns[i], (x, y), gray)
+
+
+def _standing_out(below: int, contrast: float) -> int:
+    """A gray level apart from what is below: lighter or darker, the other way where that would be cut off."""
+    gray = int(np.clip(below + contrast, 0, 255))
+    return gray if abs(gray - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
+
+
+def _draw_letter(
+    image: np.ndarray, letter: str, center: tuple[float, float], radius: float, gray: int
+) -> None:
+    corner = (int(center[0] - 0.6 * radius), int(center[1] + 0.7 * radius))
+    thickness = max(1, round(radius / 4))
+    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, gray, thickness, cv2.LINE_AA)
+
+
+def _fill(
+    image: np.ndarray, outline: np.ndarray, turn: float, center: tuple[float, float], gray: int
+) -> None:
+    """Fill a polygon, turned about its center."""
+    cosine, sine = math.cos(turn), math.sin(turn)
+    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + center
+    fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
+    cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
+
 
 Vector = tuple[float, float, float]
 X, Y, Z = np.eye(3)

@@ -1,26 +1,89 @@
-"""The images of exported frames, from the sequence that a run read."""
+"""Images of the exported frames, and undistortion of images and keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchslam.data import open_sequence
-from torchslam.data.formats.transforms import resize
 from torchslam.data.sequence import Sequence
+from torchslam.data.transforms import resize
 from torchslam.errors import ResultsError, SequenceError
 from torchslam.geometry import Camera
 from torchslam.io.export.scene import Scene
-from torchslam.io.export.undistortion import Undistorter
 
-WITHOUT = "--sequence says where it is now, --no-images does without"
+MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
+
+
+def pinhole_within(camera: Camera) -> Camera:
+    """Return the pinhole camera with the largest field of view that lies within the view of the camera.
+
+    It has the focal lengths of the camera, reduced only if the image would be more than MAX_GROWTH times as wide or
+    high. Raises ResultsError if the field of view is too wide.
+    """
+    if camera.model == "pinhole":
+        return camera
+    x, y = (torch.arange(size, dtype=camera.params.dtype) for size in camera.size)
+    left, right = (camera.normalize(_line(at, y))[:, 0] for at in (0, camera.width - 1))
+    top, bottom = (camera.normalize(_line(at, x).flip(1))[:, 1] for at in (0, camera.height - 1))
+    low, high = torch.stack((left.max(), top.max())), torch.stack((right.min(), bottom.min()))
+    focal = camera.params[:2]
+    extent, size = (high - low) * focal, torch.tensor(camera.size)
+    if not bool((extent >= 1).all()):
+        raise ResultsError("the field of view of the camera is too wide for an undistorted image")
+    scale = (MAX_GROWTH * size / extent).min().clamp(max=1.0)
+    width, height = (int(side) + 1 for side in scale * extent)
+    params = torch.cat((scale * focal, -scale * focal * low))
+    return Camera("pinhole", params, (width, height))
+
+
+def undistorted(scene: Scene) -> Scene:
+    """Return the scene for `pinhole_within` of its camera; keypoints may lie outside of the new images."""
+    if scene.camera.model == "pinhole":
+        return scene
+    pinhole = pinhole_within(scene.camera)
+    return replace(scene, camera=pinhole, pixels=undistorted_pixels(scene.pixels, scene.camera, pinhole))
+
+
+def undistorted_pixels(pixels: Tensor, camera: Camera, pinhole: Camera) -> Tensor:
+    """Convert pixels (N, 2) of a camera to its `pinhole_within`."""
+    return camera.normalize(pixels) * pinhole.params[:2] + pinhole.params[2:]
+
+
+class Undistorter:
+    """Converts images of a camera to its `pinhole_within`."""
+
+    def __init__(self, camera: Camera) -> None:
+        pinhole = pinhole_within(camera)
+        v, u = torch.meshgrid(*(torch.arange(size) for size in reversed(pinhole.size)), indexing="ij")
+        rays = torch.nn.functional.pad(
+            pinhole.normalize(torch.stack((u, v), -1).flatten(0, 1).double()), (0, 1), value=1.0
+        )
+        pixels = camera.project(rays)[0].reshape(pinhole.height, pinhole.width, 2)
+        self._x, self._y = (pixels[..., axis].float().numpy() for axis in (0, 1))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, C) uint8 -> the same in the new size."""
+        # Border pixels may fall outside by a rounding error, so the border is replicated.
+        return cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _line(at: int, values: Tensor) -> Tensor:
+    """(N, 2) pixels (at, values)."""
+    return torch.stack((torch.full_like(values, at), values), dim=-1)
+
+
+WITHOUT = "use --sequence for its new location, or --no-images"
 
 
 class Images:
-    """Color images by frame, without distortion where that is asked for.
+    """Color images by frame, optionally undistorted.
 
     rows: which frame of the sequence each frame of the run is
     """
@@ -41,12 +104,16 @@ class Images:
 
 
 def open_images(source: str, scene: Scene, undistort: bool = False, fps: float | None = None) -> Images:
-    """The images that the frames of a scene are from, at the size that the run saw them in.
+    """Open the images of a scene, in the size of the run.
 
-    fps: at which the run read them, which is the time of images that have none
+    Images are matched by timestamp, since the run may have read a part of the sequence. Raises ResultsError if the
+    sequence is missing or a different one.
 
-    They are found by their times: the run may have read a part of the sequence.
-    Raises ResultsError where it is gone or another one.
+    Args:
+        source: path of the sequence.
+        scene: the exported frames.
+        undistort: undistort the images.
+        fps: frame rate with which the run read images without timestamps.
     """
     times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
     try:
@@ -67,7 +134,7 @@ def open_images(source: str, scene: Scene, undistort: bool = False, fps: float |
 
 
 def write_images(folder: Path, scene: Scene, images: Images) -> None:
-    """Write the image of every frame as PNG, under its name; images of another export are removed."""
+    """Write the image of every frame as PNG; images of an earlier export are deleted."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("[0-9]" * 6 + ".png"):
         old.unlink()

@@ -1,7 +1,7 @@
 """`transforms.json` of nerfstudio, with the point cloud that splatting starts from.
 
-Poses and points are in the same upright world. There is no `applied_transform`: versions of nerfstudio differ in
-whether it moves the point cloud (issues 2784 and 3101), and without it all of them are right.
+Poses and points are in the same upright frame. `applied_transform` is omitted, since versions of nerfstudio differ in
+whether they apply it to the point cloud (issues 2784 and 3101).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recordings for the rerun viewer: the map, the way of the camera, and what its keyframes saw."""
+"""Recordings for the rerun viewer: map, camera path, and images and keypoints of the keyframes."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ GAP = 5  # usual intervals without a pose that break the line of the path
 
 
 def import_rerun() -> ModuleType:
-    """The module `rerun`. Raises ResultsError that says how to get it."""
+    """Import rerun. Raises ResultsError with an installation hint if it is missing."""
     try:
         import rerun
     except ImportError:
-        raise ResultsError("a recording needs rerun: pip install 'torchslam[rerun]'") from None
+        raise ResultsError("rerun is required for recordings: pip install 'torchslam[rerun]'") from None
     return rerun
 
 
 class Recorder:
-    """Writes what a scene is made of to a recording of rerun: all that torchslam logs is named here.
+    """Writes the entities of torchslam to a rerun recording.
 
-    The entities that were given a lens, say `world/camera`, have poses, images and keypoints; pixels have their origin
-    in the center of the top left one.
+    Entities with a camera, such as `world/camera`, have poses, images and keypoints. Pixel (0, 0) is the center of the
+    top left pixel.
     """
 
     def __init__(self, recording: Any) -> None:
@@ -47,42 +47,42 @@ class Recorder:
         self._rr, self._recording = import_rerun(), recording
 
     def world(self, up: str) -> None:
-        """What axes the world has: "RIGHT_HAND_Z_UP", or "RDF" for one that was a camera's."""
+        """Set the axes of the world: "RIGHT_HAND_Z_UP", or "RDF" for camera axes."""
         self._log("world", getattr(self._rr.ViewCoordinates, up), static=True)
 
-    def lens(self, entity: str, camera: Camera) -> None:
-        """The camera at an entity. A pinhole is all that rerun knows."""
-        lens = self._rr.Pinhole(
+    def camera(self, entity: str, camera: Camera) -> None:
+        """Set the pinhole camera of an entity; rerun has no other model."""
+        pinhole = self._rr.Pinhole(
             image_from_camera=_numpy(corner_camera(camera).K),
             resolution=camera.size,
             camera_xyz=self._rr.ViewCoordinates.RDF,
         )
-        self._log(entity, lens, static=True)
+        self._log(entity, pinhole, static=True)
 
     def points(self, points_w: Tensor, colors: Tensor | None) -> None:
-        """The points (P, 3) of the map, in the place of those before, with or without colors (P, 3) uint8."""
+        """Replace the points (P, 3) of the map, with or without colors (P, 3) uint8."""
         content = self._rr.Points3D(
             _numpy(points_w), colors=UNPAINTED if colors is None else colors.cpu().numpy()
         )
         self._log("world/points", content, static=True)
 
     def path(self, positions_w: Tensor, breaks: list[int]) -> None:
-        """The path (F, 3), in the place of that before, broken before some rows."""
+        """Replace the path (F, 3), interrupted before some rows."""
         strips = [_numpy(part) for part in torch.tensor_split(positions_w, breaks)]
         self._log("world/path", self._rr.LineStrips3D(strips), static=True)
 
     def at(self, frame: int, seconds: float) -> None:
-        """What is logged from now on belongs to a frame."""
+        """Set the frame and time of the following entries."""
         self._recording.set_time("frame", sequence=frame)
         self._recording.set_time("time", duration=seconds)
 
     def pose(self, entity: str, T_wc: Tensor) -> None:
-        """Where a camera is: (4, 4)."""
+        """Log the pose (4, 4) of a camera."""
         pose = _numpy(T_wc)
         self._log(entity, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
     def keypoints(self, entity: str, pixels: Tensor, colors: Tensor | None = None) -> None:
-        """The keypoints (N, 2) that a camera sees; colors (N, 3) uint8."""
+        """Log the keypoints (N, 2) of a camera; colors (N, 3) uint8."""
         content = self._rr.Points2D(
             _numpy(corner_pixels(pixels)),
             colors=TRACKED if colors is None else colors.cpu().numpy(),
@@ -91,13 +91,13 @@ class Recorder:
         self._log(f"{entity}/keypoints", content)
 
     def image(self, entity: str, image: np.ndarray) -> None:
-        """What a camera sees: uint8, gray or blue, green, red."""
+        """Log the image of a camera: uint8, gray or BGR."""
         _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
-    def words(self, entity: str, words: str) -> None:
-        """A line of the log."""
-        self._log(entity, self._rr.TextLog(words))
+    def text(self, entity: str, text: str) -> None:
+        """Log a line of text."""
+        self._log(entity, self._rr.TextLog(text))
 
     def _log(self, entity: str, content: Any, static: bool = False) -> None:
         self._recording.log(entity, content, static=static)
@@ -120,7 +120,7 @@ def write_recording(path: Path, scene: Scene, R_up: Tensor, images: Images | Non
     recorder.points(upright.points_w, scene.colors)
     recorder.path(upright.T_wc[:, :3, 3], gaps(scene.frame_ids))
     for entity in (CAMERA, KEYFRAME):
-        recorder.lens(entity, scene.camera)
+        recorder.camera(entity, scene.camera)
     for row in range(len(scene.T_cw)):
         recorder.at(int(scene.frame_ids[row]), float(scene.timestamps[row] - scene.timestamps[0]))
         recorder.pose(CAMERA, upright.T_wc[row])
@@ -139,7 +139,7 @@ def _numpy(values: Tensor) -> np.ndarray:
 
 
 def gaps(times: Tensor) -> list[int]:
-    """Rows before which the path is broken. times: (F,) ascending, frames or seconds."""
+    """Return the rows before which the path is interrupted. times: (F,) ascending, frames or seconds."""
     if len(times) < 3:
         return []
     steps = times.diff()

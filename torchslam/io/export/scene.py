@@ -1,4 +1,4 @@
-"""What exports are made of: posed frames of one run in one submap, the points they see, and where."""
+"""Scene for exports: posed frames of one run in one submap, their points and observations."""
 
 from __future__ import annotations
 
@@ -42,32 +42,32 @@ class Scene:
 
     @property
     def image_names(self) -> list[str]:
-        """What the images are called in an export, in the order of their frames."""
+        """Image file names of an export, in the order of the frames."""
         return [f"{index:06d}.png" for index in self.frame_ids.tolist()]
 
     def turned(self, R: Tensor) -> Scene:
-        """The same scene in a submap that is turned by R (3, 3): points p become R p."""
+        """Return the scene rotated by R (3, 3): points p become R p."""
         T_cw = self.T_cw.clone()
         T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
         return replace(self, T_cw=T_cw, points_w=self.points_w @ R.mT)
 
     def errors(self) -> Tensor:
-        """(O,) distances of the points' projections from the observed pixels."""
+        """Return the reprojection errors (O,)."""
         points_c = transform(self.T_cw[self.frame_index], self.points_w[self.point_index][:, None])
         return squared_reprojection_errors(points_c[:, 0], self.pixels, self.camera).sqrt()
 
     def point_errors(self) -> Tensor:
-        """(P,) mean of the errors of a point: their mean over all points is what COLMAP calls reprojection error."""
+        """Return the mean error (P,) of each point; their mean is the reprojection error of COLMAP."""
         total = torch.zeros(len(self.points_w), dtype=self.pixels.dtype)
         count = torch.bincount(self.point_index, minlength=len(total))
         return total.index_add(0, self.point_index, self.errors()) / count
 
 
 def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
-    """The frames of one session in a submap that was read from a file, or its keyframes alone.
+    """Build the scene of one session in a saved submap, from all frames or only from keyframes.
 
-    Observations of points that lie outside of the camera's model, and points that fewer than two of the frames see,
-    are left out. Raises ResultsError where there are no frames.
+    Points outside of the domain of the camera model and points with fewer than two observations are omitted. Raises
+    ResultsError if there are no frames.
     """
     if submap.map.num_keyframes == 0:
         raise ResultsError(f"submap {submap.number} is empty")

@@ -1,4 +1,4 @@
-"""Pictures of a run, and of many. Functions of plain values that return a matplotlib figure; `save` writes it."""
+"""Plots of one run or of a batch: functions of plain values that return a matplotlib figure; `save` writes it."""
 
 from torchslam.io.plots.batch import plot_batch
 from torchslam.io.plots.image import plot_features

@@ -1,4 +1,4 @@
-"""What came of many sequences: how much of each is posed, and how far off the path is."""
+"""Plot of a batch: ratio of posed frames and relative error of every sequence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the camera went and what it saw: path, map and camera axes, in two 3-D views and from above."""
+"""Plots of the path and the map: two 3-D views and a top view with covariance ellipses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from torch import Tensor
 
 from torchslam.io.plots import style
-from torchslam.io.plots.ellipses import draw_ellipses
 from torchslam.types import Trajectory
 
 if TYPE_CHECKING:
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d import Axes3D
+
 
 MAX_POINTS = 25_000
 MAX_CAMERAS = 30
@@ -263,3 +263,50 @@ def _title(title: str, scene: _Scene, box: np.ndarray) -> str:
     figures = f"{len(scene.path)} poses, {len(scene.points)} points"
     figures += f" ({outside} outside the picture)" if outside else ""
     return f"{title}: {figures}" if title else figures
+
+
+SIGMAS = 3.0
+_SIZE = 0.06  # of the largest ellipse in the picture, when magnified
+
+
+def draw_ellipses(
+    axes: Axes,
+    centers: np.ndarray,
+    covariances: np.ndarray,
+    what: str,
+    color: str,
+    magnified_in: float = 0.0,
+    linewidth: float = 0.9,
+    zorder: float = 5,
+) -> None:
+    """Draw covariances (L, 2, 2) around centers (L, 2), say in the legend what they are; none where all are zero.
+
+    magnified_in: the width of the picture, in which to magnify by the power of ten that keeps ellipses small; 0: not
+    """
+    from matplotlib.collections import EllipseCollection
+
+    variances, directions = np.linalg.eigh(covariances)
+    radii = SIGMAS * np.sqrt(variances.clip(min=0.0))
+    known = radii[:, 1] > 0
+    if not known.any():
+        return
+    radii, directions = radii[known], directions[known]
+    largest = max(1.0, _SIZE * magnified_in / radii.max())
+    magnification = 10.0 ** int(np.floor(np.log10(largest)))
+    diameters = 2 * magnification * radii
+    label = f"{what}, {SIGMAS:g} sigma" + (f" x {magnification:g}" if magnification > 1.0 else "")
+    ellipses = EllipseCollection(
+        diameters[:, 1],
+        diameters[:, 0],
+        np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1])),
+        units="xy",
+        offsets=centers[known],
+        offset_transform=axes.transData,
+        facecolors="none",
+        edgecolors=color,
+        linewidths=linewidth,
+        zorder=zorder,
+    )
+    axes.add_collection(ellipses)
+    # A legend cannot show a collection of ellipses.
+    axes.plot([], [], "o", ms=8, mfc="none", mec=color, mew=linewidth, label=label)

@@ -1,4 +1,4 @@
-"""What happened over time: errors against ground truth, tracking strength, time per stage."""
+"""Plots over time: errors against ground truth, tracked points, time per stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frames of a run as they pass: live in rerun, and as a film of what was tracked."""
+"""Live viewers of a run: rerun, and a video of the tracked frames."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from torch import Tensor
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ResultsError
 from torchslam.geometry import se3_inverse
+from torchslam.io.export.images import Undistorter, pinhole_within, undistorted_pixels
 from torchslam.io.export.recording import APPLICATION, CAMERA, Recorder, gaps, import_rerun
-from torchslam.io.export.undistortion import Undistorter, pinhole_within, undistorted_pixels
 from torchslam.map.map import Map
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -41,7 +41,7 @@ FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 @dataclass(frozen=True)
 class FrameSnapshot:
-    """One frame and what became of it.
+    """One frame and its tracking result.
 
     image:     (H, W) uint8 gray
     keypoints: (N, 2) all that were found; tracked: (m, 2) those whose map points hold the pose, where it is believed
@@ -54,7 +54,7 @@ class FrameSnapshot:
 
 
 class FrameViewer(Protocol):
-    """Shows frames one after the other."""
+    """Interface of a viewer: shows frames one after the other."""
 
     def show(self, glimpse: FrameSnapshot) -> None: ...
 
@@ -64,9 +64,9 @@ class FrameViewer(Protocol):
 
 
 class FrameViewers:
-    """Passes what a run sees on to screens.
+    """Passes every processed frame on to the viewers.
 
-    sequence: to be run instead of the one that is watched: it remembers the last image, so that none is read twice
+    sequence: wrapper to run instead of the original one; it keeps the last image, so that none is read twice
     """
 
     def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:
@@ -88,7 +88,8 @@ class FrameViewers:
         if self._memory is None:
             return
         assert self._memory.last is not None  # the frame's own
-        seen = self._slam.seen
+        seen = self._slam.last_features
+        assert seen is not None
         glimpse = FrameSnapshot(
             result,
             (self._memory.last[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy(),
@@ -138,7 +139,7 @@ class LiveView:
         self._start: float | None = None
         self._state: State | None = None
         self._recorder.world("RDF")
-        self._recorder.lens(CAMERA, self._pinhole)
+        self._recorder.camera(CAMERA, self._pinhole)
 
     @classmethod
     def spawn(cls, slam: SLAM) -> LiveView:
@@ -166,7 +167,7 @@ class LiveView:
         recorder.keypoints(CAMERA, pixels)
         if result.state is not self._state:
             self._state = result.state
-            recorder.words("state", ": ".join(filter(None, (result.state.value, result.reason))))
+            recorder.text("state", ": ".join(filter(None, (result.state.value, result.reason))))
         if result.is_keyframe:
             slam = self._slam
             self._map(slam.map, slam.posed_frames.trajectory(slam.map, slam.session.number), painted=False)
@@ -220,13 +221,13 @@ class Film:
         self._writer.write(image)
 
     def end(self, run: Run) -> None:
-        """Nothing: what is learned later does not change what was seen."""
+        """Do nothing: later optimization does not change the video."""
 
     def close(self) -> None:
         self._writer.release()
 
 
 def film_of(sequence: Sequence, directory: Path) -> Film:
-    """A film of a sequence in the folder of results, at its rate."""
+    """Create the video of a run in the results folder, at the frame rate of the sequence."""
     rate = sequence.frame_rate if sequence.known_length is not None and len(sequence.timestamps) > 1 else 0.0
     return Film(directory / VIDEO, sequence.size, rate or USUAL_RATE)

@@ -1,33 +1,50 @@
-"""view.html: map, path, cameras and errors of a run in a page that needs nothing but a browser."""
+"""view.html: map, path, cameras and errors of a run as a self-contained page."""
 
 from __future__ import annotations
 
+import base64
 import html
 import json
+import sys
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchslam.data.trajectories import nearest
+from torchslam.errors import TrajectoryError
+from torchslam.evaluation import Evaluation, evaluate
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.transforms import upright_rotation
+from torchslam.io.export.recording import gaps
+from torchslam.io.pictures import aligned
+from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.results import Results
-from torchslam.io.viewer.data import page_data
+from torchslam.map.atlas import Submap
+from torchslam.system.run import keyframe_trajectory
+from torchslam.types import State, Trajectory
 
 VIEW = "view.html"
 SCRIPTS = ("draw.js", "orbit.js", "scene.js", "view.js")  # in this order, all in one script
 
 
 def write_view(results: Results, directory: Path) -> Path:
-    """Write the page into a folder of results; returns its file. Same results, same bytes."""
+    """Write the page into a results folder and return its file; deterministic."""
     path = directory / VIEW
     path.write_text(page(results), encoding="utf-8")
     return path
 
 
 def page(results: Results) -> str:
-    """The whole page: its own style and script, and all data."""
+    """Return the page with style, scripts and data."""
     data = page_data(results)
     parts = {
         "title": html.escape(data["title"]),
         "css": _asset("view.css"),
-        # Nothing in the data may end the script that it stands in.
+        # The data must not contain `</script>`.
         "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
         "script": "".join(map(_asset, SCRIPTS)),
     }
@@ -42,3 +59,164 @@ def page(results: Results) -> str:
 
 def _asset(name: str) -> str:
     return (files("torchslam.io.viewer") / name).read_text(encoding="utf-8")
+
+
+MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
+MAX_FRAMES = 20_000  # 100 bytes each in the page
+MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
+FRUSTUM = 0.035  # its depth, in radii of the scene
+STATES = tuple(State)
+
+
+def page_data(results: Results) -> dict[str, Any]:
+    """Return the data of the page for JSON, with arrays as `encoded`; deterministic.
+
+    `frames` has a row per displayed frame: index, seconds since the first one, state and so on. `submaps` has
+    those with frames of the run, the main one first, see `_submap`.
+    """
+    metrics = results.metrics
+    frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
+    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
+    reasons = list(dict.fromkeys(frame.reason for frame in frames))
+    number_of = {reason: number for number, reason in enumerate(reasons)}
+    paths = {metrics["submap"]: results.trajectory} | results.others
+    shown = [submap for submap in results.submaps if len(paths.get(submap.number, ()))]
+    shown.sort(key=lambda submap: submap.number != metrics["submap"])
+    budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
+    accuracy = f" · ATE {metrics['ate_m']:.3g} m" if "ate_m" in metrics else ""
+    return {
+        "title": Path(metrics.get("source") or "torchslam").name,
+        "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}",
+        "failure": metrics.get("failure", ""),
+        "corners": _corners(results.camera).tolist(),
+        "reasons": reasons,
+        "frames": {
+            "index": encoded([frame.index for frame in frames], "int32"),
+            "seconds": encoded(times - times[:1], "float64"),
+            "state": encoded([STATES.index(frame.state) for frame in frames], "uint8"),
+            "keyframe": encoded([frame.is_keyframe for frame in frames], "uint8"),
+            "inliers": encoded([frame.inliers for frame in frames], "int32"),
+            "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
+        },
+        "submaps": [
+            _submap(submap, paths[submap.number], results, times, int(budget * submap.map.num_points))
+            for submap in shown
+        ],
+    }
+
+
+def encoded(values: Tensor | np.ndarray | list[Any], kind: str) -> dict[str, str]:
+    """Encode numbers as base64 of their little-endian bytes, row by row."""
+    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
+    if sys.byteorder == "big":
+        array = array.byteswap()
+    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def decoded(packed: dict[str, str]) -> np.ndarray:
+    """Decode the result of `encoded` to a flat array."""
+    kind = np.dtype(packed["type"]).newbyteorder("<")
+    return np.frombuffer(base64.b64decode(packed["data"]), kind)
+
+
+def _submap(
+    submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
+) -> dict[str, Any]:
+    """A submap as it is shown: upright, around the middle of its box; aligned and in meters with ground truth.
+
+    S_shown_map: (4, 4) similarity from the map to what is shown
+    frame, keyframe: (F,), (K,) rows of `frames`; poses, keyframe_poses: (F, 3, 4), (K, 3, 4) camera to world
+    errors:      (F,) meters, NaN where unknown; breaks: rows before which the path is broken
+    truth:       (M, 3); points, colors: (P, 3), no colors where no image was seen; points_total: before thinning
+    box:         (2, 3) lowest and highest corner around what matters; radius: half its diagonal
+    """
+    evaluation = _evaluation(path, results)
+    S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
+    keyframes = keyframe_trajectory(submap.map, results.session)
+    up = torch.eye(4, dtype=torch.float64)
+    up[:3, :3] = upright_rotation(aligned(Trajectory(path.timestamps, se3_inverse(submap.map.T_cw)), S).T_wc)
+    S = up @ S
+    points_w, colors = _points(submap)
+    box = torch.from_numpy(
+        robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy()).T.copy()
+    )
+    S[:3, 3] -= box.mean(dim=0)
+    box = box - box.mean(dim=0)
+    errors = torch.full((len(path),), torch.nan, dtype=torch.float64)
+    truth = torch.zeros(0, 3, dtype=torch.float64)
+    if evaluation is not None:
+        errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
+        to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
+        truth = transform(to_shown, _during(results, path).positions_w)
+        truth = truth[thin(len(truth), MAX_FRAMES)]
+    frame, rows = _shown_rows(path.timestamps, times)
+    keyframe, keyframe_rows = _shown_rows(keyframes.timestamps, times)
+    shown, kept = aligned(path, S).T_wc[rows], torch.from_numpy(thin(len(points_w), max_points))
+    breaks = gaps(frame)
+    steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
+    steps[[row - 1 for row in breaks]] = 0.0
+    return {
+        "name": f"{submap.number}" + (", the main one" if submap.number == results.metrics["submap"] else ""),
+        "unit": "" if evaluation is None else "m",
+        "S_shown_map": S.tolist(),
+        "frame": encoded(frame, "int32"),
+        "poses": encoded(shown[:, :3], "float32"),
+        "errors": encoded(errors[rows], "float32"),
+        "breaks": breaks,
+        "path_length": float(steps.sum()),
+        "truth": encoded(truth, "float32"),
+        "keyframe": encoded(keyframe, "int32"),
+        "keyframe_poses": encoded(aligned(keyframes, S).T_wc[keyframe_rows][:, :3], "float32"),
+        "points": encoded(transform(S, points_w)[kept], "float32"),
+        "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
+        "points_total": len(points_w),
+        "box": box.tolist(),
+        "radius": float((box[1] - box[0]).norm()) / 2,
+        "frustum": FRUSTUM * float((box[1] - box[0]).norm()) / 2,
+    }
+
+
+def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
+    """Return the errors of the poses in a submap; None without ground truth."""
+    if results.groundtruth is None:
+        return None
+    try:
+        return evaluate(path, results.groundtruth)
+    except TrajectoryError:
+        return None
+
+
+def _during(results: Results, path: Trajectory) -> Trajectory:
+    """Return the ground truth from the first to the last pose of a submap."""
+    truth = results.groundtruth
+    assert truth is not None  # else there is no evaluation
+    during = (truth.timestamps >= path.timestamps[0]) & (truth.timestamps <= path.timestamps[-1])
+    return Trajectory(truth.timestamps[during], truth.T_wc[during])
+
+
+def _points(submap: Submap) -> tuple[Tensor, Tensor]:
+    """Return positions (P, 3) and colors (P, 3) of the valid points."""
+    if submap.map.num_points == 0:
+        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
+    ids = submap.map.valid_points()
+    positions_w = submap.map.positions_w[ids].double()
+    finite = positions_w.isfinite().all(dim=-1)
+    return positions_w[finite], submap.map.points["colors"][ids][finite]
+
+
+def _shown_rows(timestamps: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the displayed frames that have a pose, ascending, and the rows of their poses."""
+    if len(timestamps) == 0 or len(times) == 0:
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    row, distance = nearest(times, timestamps)
+    frame = torch.nonzero(distance < 1e-6)[:, 0]  # files keep nanoseconds
+    return frame, row[frame]
+
+
+def _corners(camera: Camera) -> Tensor:
+    """Return (4, 3) rays of unit depth through the image corners, in order around the image."""
+    fx, fy, cx, cy = camera.params.double()[:4]
+    x = (torch.tensor([0.0, 1, 1, 0]) * (camera.width - 1) - cx) / fx
+    y = (torch.tensor([0.0, 0, 1, 1]) * (camera.height - 1) - cy) / fy
+    slopes = torch.stack((x, y), dim=-1).clamp(-MAX_SLOPE, MAX_SLOPE)
+    return torch.nn.functional.pad(slopes, (0, 1), value=1.0)

@@ -9,7 +9,7 @@ import torch
 from torchslam import SLAM
 from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.data.arrays import image_tensor
+from torchslam.data.formats.image_file import image_tensor
 from torchslam.errors import FrameError
 
 GREEN = np.zeros((4, 6, 3), np.uint8)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.data.formats.transforms import scale_camera
+from torchslam.data.transforms import scale_camera
 from torchslam.errors import SequenceError
 from torchslam.geometry.camera import Camera
 

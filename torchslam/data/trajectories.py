@@ -1,0 +1,129 @@
+"""Trajectory files (TUM, KITTI) and association of poses by timestamp."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
+from torchslam.errors import TrajectoryError
+from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
+from torchslam.types import Trajectory
+
+ORTHOGONAL = 0.05
+"""Tolerated deviation of R R^T from the identity; some files have few digits."""
+FARTHEST = 1e12
+"""Maximum coordinate of a position, in meters."""
+COLUMNS = "timestamp tx ty tz qx qy qz qw"
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a TUM trajectory file; `#` starts a comment.
+
+    Raises TrajectoryError naming file and line: a missing or empty file, not eight finite numbers, a
+    quaternion far from unit length, timestamps out of order or doubled.
+    """
+    rows: list[list[float]] = []
+    for number, line in numbered_lines(path, TrajectoryError):
+        where = f"{path}:{number}"
+        row = parse_floats(line, where, TrajectoryError)
+        if len(row) != 8:
+            raise TrajectoryError(
+                f"{where}: expected `timestamp tx ty tz qx qy qz qw`, got {len(row)} numbers"
+            )
+        if abs(sum(value * value for value in row[4:]) - 1.0) > 0.1:
+            raise TrajectoryError(f"{where}: the quaternion {row[4:]} does not have unit length")
+        if rows:
+            check_later(row[0], rows[-1][0], where, TrajectoryError)
+        rows.append(row)
+    if not rows:
+        raise TrajectoryError(f"{path}: no poses")
+    table = torch.tensor(rows, dtype=torch.float64)
+    quaternions = table[:, 4:] / table[:, 4:].norm(dim=-1, keepdim=True)
+    T_wc = checked_poses(rigid(matrix_from_quaternion(quaternions), table[:, 1:4]), path)
+    return Trajectory(table[:, 0].contiguous(), T_wc)
+
+
+def checked_poses(T_wc: Tensor, path: Path | str) -> Tensor:
+    """Return poses (..., 4, 4) unchanged. Raises TrajectoryError for an invalid rotation or position."""
+    R, positions_w = T_wc[..., :3, :3], T_wc[..., :3, 3]
+    error = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs()
+    if not bool((error < ORTHOGONAL).all()):  # not so NaN either
+        raise TrajectoryError(f"{path}: a pose is not a rigid transformation")
+    if not bool((positions_w.abs() < FARTHEST).all()):
+        raise TrajectoryError(f"{path}: a position is farther away than {FARTHEST:g}")
+    return T_wc
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a trajectory as a TUM file: nanoseconds, nanometers, nine decimals of the quaternion."""
+    T_wc = trajectory.T_wc.detach().double().cpu()
+    quaternions = quaternion_from_matrix(T_wc[:, :3, :3])
+    table = torch.cat((T_wc[:, :3, 3], quaternions), dim=-1).tolist()
+    lines = [f"# {COLUMNS} (camera to world, seconds, metres)\n"]
+    for timestamp, row in zip(trajectory.timestamps.tolist(), table, strict=True):
+        # The shortest text that reads back as the same time: seconds since 1970 fill all digits of a double.
+        lines.append(f"{round(timestamp, 9)!r} " + " ".join(f"{value:.9f}" for value in row) + "\n")
+    Path(path).write_text("".join(lines), encoding="utf-8")
+
+
+def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the nearest reference time of each timestamp; of two equally near ones, the earlier.
+
+    Args:
+        timestamps: (N,) seconds.
+        reference: (M,) seconds, sorted, M >= 1.
+
+    Returns:
+        Indices (N,) into `reference`, and distances (N,) in seconds.
+    """
+    right = _next(timestamps, reference)
+    left = (right - 1).clamp(min=0)
+    to_left, to_right = (timestamps - reference[left]).abs(), (timestamps - reference[right]).abs()
+    return torch.where(to_left <= to_right, left, right), torch.minimum(to_left, to_right)
+
+
+def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Interpolate a trajectory along the geodesic between the two neighboring poses; constant beyond its ends.
+
+    Args:
+        trajectory: the poses.
+        timestamps: (N,) seconds.
+        tolerance: seconds to the nearest pose up to which the result is valid.
+
+    Returns:
+        T_wc (N, 4, 4), finite also where invalid, and valid (N,).
+    """
+    times = trajectory.timestamps
+    _, distances = nearest(timestamps, times)
+    right = _next(timestamps, times)
+    left = (right - 1).clamp(min=0)
+    interval = times[right] - times[left]
+    fraction = ((timestamps - times[left]) / torch.where(interval > 0, interval, 1.0)).clamp(0, 1)
+    T_wc = se3_interpolate(trajectory.T_wc[left], trajectory.T_wc[right], fraction.to(trajectory.T_wc))
+    # At a pose's own time and beyond the ends it is taken as it is, without the rounding of log and exp.
+    exact = ((fraction >= 1) | (interval == 0))[:, None, None]
+    return torch.where(exact, trajectory.T_wc[right], T_wc), distances <= tolerance
+
+
+def _next(timestamps: Tensor, reference: Tensor) -> Tensor:
+    """Return (N,) the index of the first reference time at or after each timestamp, or the last one."""
+    return torch.searchsorted(reference.contiguous(), timestamps.contiguous()).clamp(max=len(reference) - 1)
+
+
+POSES, TIMES = "poses.txt", "times.txt"
+
+
+def write_kitti(folder: Path, trajectory: Trajectory) -> None:
+    """Write poses.txt and times.txt in KITTI odometry format: camera to world, one line per posed frame.
+
+    The format has no place for frames without a pose; times.txt identifies the frames.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = trajectory.T_wc[:, :3].flatten(1).tolist()
+    poses = [" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows]
+    times = [f"{time!r}\n" for time in trajectory.timestamps.tolist()]
+    (folder / POSES).write_text("".join(poses), encoding="utf-8")
+    (folder / TIMES).write_text("".join(times), encoding="utf-8")

@@ -1,0 +1,217 @@
+"""Transformations of a sequence: a range of frames, a lower rate, another size, masks, another ground truth."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import cv2
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchslam.data.calibration import size_text
+from torchslam.data.formats.frame_names import natural
+from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, read_gray
+from torchslam.data.sequence import Sequence, Transformed
+from torchslam.errors import FrameError, SequenceError
+from torchslam.geometry.camera import Camera
+from torchslam.types import Trajectory
+
+TOLERANCE = 0.25
+"""Tolerated earliness of a frame when frames are thinned out, as a ratio of the interval."""
+SMALLEST = 32
+"""Minimum width and height in pixels."""
+
+
+def cut(sequence: Sequence, start: str | int = 0, stop: str | int | None = None) -> Sequence:
+    """Return the frames of [start, stop), given as numbers or as times such as `12.5s` or `1:30`.
+
+    Raises SequenceError if none are left.
+    """
+    first = _frame_at(sequence, start, "start")
+    last = None if stop is None else _frame_at(sequence, stop, "stop")
+    return sequence if first == 0 and last is None else sequence.part(first, last)
+
+
+def thin(sequence: Sequence, rate: float) -> Sequence:
+    """Select at most `rate` frames per second by their timestamps."""
+    _check_known(sequence, "--fps")
+    elapsed = (sequence.timestamps - sequence.timestamps[:1]).tolist()
+    chosen: list[int] = []
+    last = -1
+    for index, time in enumerate(elapsed):
+        slot = math.floor(time * rate + TOLERANCE)
+        if slot > last:
+            chosen.append(index)
+            last = slot
+    return sequence if len(chosen) == len(sequence) else Transformed(sequence, chosen)
+
+
+def resize(sequence: Sequence, text: str) -> Sequence:
+    """Resize images and camera to `640x480`, `640` (width; the height follows) or by a factor `0.5`.
+
+    Raises SequenceError for anything else and for sizes that are too small or too large.
+    """
+    size = _new_size(sequence.size, text)
+    return sequence if size == sequence.size else Resized(sequence, size)
+
+
+class Resized(Transformed):
+    """Sequence with resized images: averaged when shrinking, interpolated when growing."""
+
+    def __init__(self, whole: Sequence, size: tuple[int, int]) -> None:
+        camera = whole._camera
+        super().__init__(whole, camera=None if camera is None else scale_camera(camera, size), size=size)
+
+    def image(self, index: int) -> Tensor:
+        return self._resized(super().image(index)[0, 0])[None, None]
+
+    def color(self, index: int) -> Tensor:
+        return self._resized(super().color(index))
+
+    def mask(self, index: int) -> Tensor | None:
+        mask = super().mask(index)
+        if mask is None:
+            return None
+        return F.interpolate(mask.float(), self.size[::-1], mode="nearest-exact") > 0
+
+    def _resized(self, image: Tensor) -> Tensor:
+        smaller = self.size[0] <= image.shape[1] and self.size[1] <= image.shape[0]
+        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        return torch.from_numpy(cv2.resize(image.numpy(), self.size, interpolation=interpolation))
+
+
+def scale_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Scale a camera to images of another size; integer pixel coordinates stay pixel centers."""
+    x, y = size[0] / camera.width, size[1] / camera.height
+    fx, fy, cx, cy = camera.params[..., :4].unbind(-1)
+    scaled = torch.stack((fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5), dim=-1)
+    return Camera(camera.model, torch.cat((scaled, camera.params[..., 4:]), dim=-1), size)
+
+
+def _new_size(size: tuple[int, int], text: str) -> tuple[int, int]:
+    width, height = size
+    if both := re.fullmatch(r"(\d{1,6})[xX*](\d{1,6})", text):
+        new = int(both[1]), int(both[2])
+    elif re.fullmatch(r"\d{2,6}", text):
+        new = int(text), round(height * int(text) / width)
+    elif re.fullmatch(r"\d{0,2}\.\d+|\d{1,2}", text):
+        new = round(width * float(text)), round(height * float(text))
+    else:
+        raise SequenceError(f"--resize: expected 640x480, 640 or 0.5, got `{text}`")
+    if min(new) < SMALLEST or new[0] * new[1] > MAX_PIXELS:
+        raise SequenceError(
+            f"--resize {text}: images of {size_text(new)}; at least {SMALLEST} pixels each way "
+            f"and at most {MAX_PIXELS} in all are possible"
+        )
+    return new
+
+
+def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
+    """Return the index of the first frame at or after `text`."""
+    if isinstance(text, int) or re.fullmatch(r"\d{1,12}", text):
+        if int(text) < 0:
+            raise SequenceError(f"{sequence.name}: --{which} must be at least 0, not {text}")
+        return int(text)
+    found = re.fullmatch(r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d+)?)s?", text)
+    if found is None:
+        raise SequenceError(f"--{which}: expected a frame, as 120, or a time, as 12.5s or 1:30, got `{text}`")
+    seconds = 3600 * int(found[1] or 0) + 60 * int(found[2] or 0) + float(found[3])
+    _check_known(sequence, f"--{which} as a time")
+    elapsed = sequence.timestamps - sequence.timestamps[:1]
+    # Times as text are rounded; half a microsecond is less than any frame lasts.
+    return int(torch.searchsorted(elapsed, seconds - 5e-7))
+
+
+def _check_known(sequence: Sequence, what: str) -> None:
+    """Raise SequenceError if the timestamps are not known in advance."""
+    if not len(sequence.timestamps):
+        raise SequenceError(
+            f"{sequence.name}: {what} needs timestamps known in advance, which a live source does not have"
+        )
+
+
+class Masked(Transformed):
+    """Sequence with masks: no features are used where a mask is black, such as on a car's hood or a logo.
+
+    Args:
+        whole: the sequence.
+        path: one mask of the image size for all frames, or a folder with one mask per frame, matched by name (`7.png`
+            or `7.jpg.png` for `7.jpg`) or, if there are as many as frames, by order. Frames without a mask are used
+            entirely.
+
+    Raises SequenceError if there is no mask, or one of another size.
+    """
+
+    def __init__(self, whole: Sequence, path: str | Path) -> None:
+        path = Path(path)
+        self._mask: Tensor | None = None
+        self._files: dict[int, Path] = {}
+        if path.is_dir():
+            self._files = _by_frame(path, whole)
+            with_mask = len(self._files)
+            notes = [f"masks for {with_mask} of {len(whole)} frames"] if with_mask < len(whole) else []
+            super().__init__(whole, notes=notes)
+            self._read(next(iter(self._files.values())))
+        else:
+            super().__init__(whole)
+            self._mask = self._read(path)
+
+    def mask(self, index: int) -> Tensor | None:
+        """Return the mask of a frame. Raises FrameError if it cannot be read."""
+        if index not in self._files:
+            return self._mask
+        try:
+            return self._read(self._files[index])
+        except SequenceError as error:
+            raise FrameError(str(error)) from error
+
+    def _read(self, path: Path) -> Tensor:
+        try:
+            gray = read_gray(path, "--mask")
+        except FrameError as error:
+            raise SequenceError(str(error)) from error
+        size = (gray.shape[-1], gray.shape[-2])
+        if size != self.size:
+            raise SequenceError(
+                f"{path}: the mask is {size_text(size)}, the images are {size_text(self.size)}"
+            )
+        return gray > 0
+
+
+def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
+    """Return the mask file of each frame."""
+    if sequence.known_length is None:
+        raise SequenceError(f"{folder}: a live source takes one mask for all frames")
+    files = sorted(
+        (
+            file
+            for file in folder.iterdir()
+            if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+        ),
+        key=lambda file: natural(file.name),
+    )
+    by_name = {file.stem: file for file in files}
+    names = [Path(sequence.image_name(index)) for index in range(len(sequence))]
+    found = {
+        index: by_name.get(name.name, by_name.get(name.stem))
+        for index, name in enumerate(names)
+        if name.name in by_name or name.stem in by_name
+    }
+    if not found and len(files) == len(sequence):
+        return dict(enumerate(files))
+    if not found:
+        raise SequenceError(f"{folder}: none of its {len(files)} images is the mask of a frame by its name")
+    return {index: file for index, file in found.items() if file is not None}
+
+
+class WithGroundTruth(Transformed):
+    """Sequence with another ground truth, whose timestamps are of the same clock."""
+
+    def __init__(self, whole: Sequence, groundtruth: Trajectory) -> None:
+        super().__init__(whole, groundtruth=groundtruth)
+
+    def pose(self, index: int) -> Tensor | None:
+        return Sequence.pose(self, index)
