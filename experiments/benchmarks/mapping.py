@@ -37,7 +37,7 @@ UNMAPPED = 3  # every so many points of the wall are not in the map: the new key
 
 
 class Walk:
-    """A world of so many keyframes along the wall, and the stages that take the next ones."""
+    """A submap of keyframes along a wall, and the stages that process the next ones."""
 
     def __init__(self, keyframes: int) -> None:
         g = self.generator = torch.Generator().manual_seed(0)
@@ -58,7 +58,7 @@ class Walk:
         for some in torch.arange(keyframes).split(100):
             slam_map.refresh(some)
         self.submap.num_cull_checked = keyframes
-        self.memory = LoopCloser(CAMERA, Config(), self.atlas)
+        self.loop_closer = LoopCloser(CAMERA, Config(), self.atlas)
 
     def look(self, index: int) -> tuple[FrameFeatures, Tensor]:
         """What the camera sees at a step of its way, and which points of the wall these are."""
@@ -104,7 +104,7 @@ class Walk:
         view, seen = self.look(index)
         assert view.T_cw_groundtruth is not None
         known = self.rows[seen] >= 0
-        ids = slam_map.resolve(self.rows[seen[known]])  # of merged points the heirs
+        ids = slam_map.follow_merges(self.rows[seen[known]])  # of merged points the heirs
         alive = slam_map.points["is_valid"][ids]
         at, ids = torch.nonzero(known)[alive, 0], ids[alive]
         eye = torch.eye(6, dtype=torch.float64)
@@ -118,13 +118,13 @@ class Walk:
             return answer
 
         keyframe = timed("mapping, bundle", self.mapper.insert, slam_map, view, estimate)
-        timed("memory", self.memory.add, slam_map, keyframe)
+        timed("loop_closer", self.loop_closer.add, slam_map, keyframe)
         timed("local map", self.tracker.reset_to_keyframe, self.submap, keyframe)
-        timed("recognition", self.memory.recognizer.recognize, self.submap, keyframe)
+        timed("recognition", self.loop_closer.loop_detector.detect, self.submap, keyframe)
         keys = slam_map.keys
-        renumbering = timed("tidy", self.mapper.tidy, self.submap)
+        renumbering = timed("cull_and_compact", self.mapper.cull_and_compact, self.submap)
         if renumbering is not None:
-            self.memory.remove(keys[renumbering.keyframes < 0])
+            self.loop_closer.remove(keys[renumbering.keyframes < 0])
             self.rows = torch.where(self.rows >= 0, renumbering.points[self.rows], -1)
         at = torch.nonzero(slam_map.keyframes["point_ids"][-1, : len(seen)] >= 0)[:, 0]
         self.rows[seen[at]] = slam_map.keyframes["point_ids"][-1, at]

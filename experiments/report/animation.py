@@ -15,7 +15,7 @@ from PIL import Image
 from experiments.common import parser_of
 from torchslam import open_sequence
 from torchslam.data.sequence import Sequence
-from torchslam.geometry.conventions import upright_rotation
+from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.plots.style import ACCENT, ESTIMATE, house_style, new_figure, robust_box
 from torchslam.io.results import read_results
 
@@ -39,10 +39,10 @@ class RunScene:
 
     def __init__(self, directory: Path) -> None:
         results = read_results(directory)
-        submap = next(each for each in results.worlds if each.number == results.metrics["world"])
+        submap = next(each for each in results.submaps if each.number == results.metrics["submap"])
         ids = submap.map.valid_points()
         R = upright_rotation(results.trajectory.T_wc)
-        rows, observations = submap.history.frames, submap.history.observations
+        rows, observations = submap.posed_frames.frames, submap.posed_frames.observations
         self.path = (results.trajectory.positions_w @ R.mT).numpy()
         self.points = (submap.map.positions_w[ids] @ R.mT).numpy()
         keyframe_frames = submap.map.keyframes["frame_index"]

@@ -1,4 +1,4 @@
-"""A trial, run, and what came of it."""
+"""Run a trial and evaluate it."""
 
 from __future__ import annotations
 
@@ -28,24 +28,25 @@ from torchslam.system.slam import SLAM
 from torchslam.types import Frame, State, StepResult
 
 LETTERS = {State.INITIALIZING: "i", State.TRACKING: "T", State.UNCERTAIN: "U", State.LOST: "L"}
-TOLD = 8  # stretches of states, and recalls, of which the table tells
+MAX_LISTED = 8  # stretches of states, and loop closures, in the table
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run over an edited sequence came to.
+    """The result of a run over an edited sequence.
 
-    posed:    frames with a pose in the main submap that can have one, `possible` of which there are
+    posed:    frames with a pose in the main submap that can have one
+    possible: frames that can have a pose
     strays:   frames with a pose in the main submap that cannot have one
-    submaps:   frames of each submap, the main one first
-    ate:      in units of the truth; None where too little is posed
+    submaps:  frames of each submap, the main one first
+    ate:      in units of the truth; None with too few poses
     extent:   of the true path
-    misled:   frames called tracking whose pose in the main submap is wrong, as it was given or in the end
-    states:   one per frame; recalls: places recognized; apart: by the truth, how far away the furthest of them is:
-              meters and degrees; None without truth
-    seconds:  of the processor, for the whole run, or the rest after a cut, with reading of images and the last
-              adjustment
-    ms:       of the processor, for `SLAM.step`, median
+    misled:   frames with the state tracking whose online or final pose in the main submap is wrong
+    states:   one per frame
+    loop_closures: recognized places
+    apart:    largest true distance of a loop closure: meters and degrees; None without truth
+    seconds:  processor time of the run (after a cut: of its rest), with reading of images and final adjustment
+    ms:       processor time of `SLAM.step`, median
     failure:  why there is no map
     """
 
@@ -57,7 +58,7 @@ class Outcome:
     extent: float
     misled: list[int]
     states: list[State]
-    recalls: list[LoopClosureRecord]
+    loop_closures: list[LoopClosureRecord]
     apart: tuple[float, float] | None
     seconds: float
     ms: float
@@ -65,7 +66,7 @@ class Outcome:
 
 
 def timed(slam: SLAM) -> list[float]:
-    """How much of the processor each `step` from now on takes, in ms: other work on the machine does not change it."""
+    """Record the processor time of each following `step`, in ms."""
     taken: list[float] = []
     step = slam.step
 
@@ -80,7 +81,7 @@ def timed(slam: SLAM) -> list[float]:
 
 
 def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
-    """Run a trial; `more` settings come after its own. Raises SequenceError where its frames are not at hand."""
+    """Run a trial; `more` settings come after its own. Raises SequenceError if its frames are not available."""
     config = load_config(None, [*trial.settings, *more])
     sequence = trial.sequence()
     slam, so_far = _begin(trial, sequence, config)
@@ -91,7 +92,7 @@ def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
         start = time.process_time()
         run = run_sequence(slam, sequence, None, so_far)
         seconds = time.process_time() - start
-    assert known <= set(final_poses(run)), "what was tracked before the last checkpoint has no pose any more"
+    assert known <= set(final_poses(run)), "frames tracked before the last checkpoint lost their poses"
     return _outcome(run, sequence, seconds, taken), run
 
 
@@ -129,8 +130,8 @@ def _outcome(run: Run, sequence: Edited, seconds: float, taken: list[float]) -> 
         extent=0.0 if truth is None else extent(truth.positions_w),
         misled=misled(run, sequence),
         states=[result.state for result in run.results],
-        recalls=list(run.recalls),
-        apart=furthest(list(run.recalls), sequence),
+        loop_closures=list(run.loop_closures),
+        apart=furthest(list(run.loop_closures), sequence),
         seconds=seconds,
         ms=median(taken),
         failure=run.failure,
@@ -138,7 +139,7 @@ def _outcome(run: Run, sequence: Edited, seconds: float, taken: list[float]) -> 
 
 
 def final_poses(run: Run) -> dict[int, Tensor]:
-    """T_cw (4, 4) of the frames of the main submap, by their numbers, as the run left them."""
+    """Final T_cw (4, 4) of the frames of the main submap, by frame number."""
     if run.main is None or len(run.main.posed_frames) == 0:
         return {}
     frames = run.main.posed_frames.frames
@@ -148,9 +149,9 @@ def final_poses(run: Run) -> dict[int, Tensor]:
 
 
 def online_poses(run: Run) -> dict[int, Tensor]:
-    """T_cw (4, 4) of the frames that were tracking in the main submap, by their numbers, as they were given.
+    """Online T_cw (4, 4) of the frames that were tracking in the main submap, by frame number.
 
-    Uncertain poses are no claim: many of them would tell the judge what is right.
+    Uncertain poses are excluded: many of them would distort the alignment.
     """
     if run.main is None:
         return {}
@@ -163,13 +164,13 @@ def online_poses(run: Run) -> dict[int, Tensor]:
 
 
 def misled(run: Run, sequence: Edited) -> list[int]:
-    """The frames that were called tracking and whose pose in the main submap, given or final, is wrong."""
+    """The frames with the state tracking whose online or final pose in the main submap is wrong."""
     bad = wrong_frames(final_poses(run), sequence) | wrong_frames(online_poses(run), sequence)
     return [result.index for result in run.results if result.state is State.TRACKING and result.index in bad]
 
 
 def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
-    """Those of the frames whose poses T_cw, in one submap, are wrong: any pose is where none can be."""
+    """The frames of one submap whose poses T_cw are wrong; those of strays always are."""
     strays = {index for index in poses if not sequence.belongs[index]}
     pairs = {
         index: (poses[index], pose) for index in sorted(poses) if (pose := sequence.pose(index)) is not None
@@ -183,11 +184,11 @@ def wrong_frames(poses: dict[int, Tensor], sequence: Edited) -> set[int]:
     return strays | {index for index, is_bad in zip(pairs, bad.tolist(), strict=True) if is_bad}
 
 
-def furthest(recalls: list[LoopClosureRecord], sequence: Edited) -> tuple[float, float] | None:
-    """The largest distance, in meters, and the largest angle, in degrees, between a frame and the place it recalled."""
+def furthest(loop_closures: list[LoopClosureRecord], sequence: Edited) -> tuple[float, float] | None:
+    """The largest distance (meters) and angle (degrees) between a frame and the place of its loop closure."""
     meters, degrees = [], []
-    for recall in recalls:
-        here, there = sequence.pose(recall.frame), sequence.pose(recall.place)
+    for closure in loop_closures:
+        here, there = sequence.pose(closure.frame), sequence.pose(closure.place)
         if here is None or there is None:
             continue
         motion = se3_inverse(here) @ there
@@ -196,7 +197,7 @@ def furthest(recalls: list[LoopClosureRecord], sequence: Edited) -> tuple[float,
     return (max(meters), max(degrees)) if meters else None
 
 
-HEADER = ["trial", "posed", "submaps", "ATE", "wrong & tracking", "states", "recalls", "s, ms a frame"]
+HEADER = ["trial", "posed", "submaps", "ATE", "wrong & tracking", "states", "loop closures", "s, ms a frame"]
 
 
 def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
@@ -208,15 +209,15 @@ def cells(name: str, outcome: Outcome, unit: str) -> list[str]:
         _ate(outcome, unit),
         _misled(outcome),
         states_in_short(outcome.states),
-        _recalls(outcome),
+        _loop_closures(outcome),
         f"{outcome.seconds:.0f}, {outcome.ms:.0f}",
     ]
 
 
 def states_in_short(states: list[State]) -> str:
-    """How often each state came in a row, initializing, tracking, uncertain and lost by their letters."""
+    """Run-length encoding of the states by their letters."""
     stretches = [f"{LETTERS[state]}{len(list(group))}" for state, group in groupby(states)]
-    return " ".join(stretches[:TOLD]) + " …" * (len(stretches) > TOLD)
+    return " ".join(stretches[:MAX_LISTED]) + " …" * (len(stretches) > MAX_LISTED)
 
 
 def _ate(outcome: Outcome, unit: str) -> str:
@@ -230,12 +231,14 @@ def _misled(outcome: Outcome) -> str:
     return f"{len(outcome.misled)} ({share:.1%})" if outcome.misled else "0"
 
 
-def _recalls(outcome: Outcome) -> str:
-    told = [
-        f"{recall.frame}→{recall.place}" + " in another submap" * (recall.submap != recall.other)
-        for recall in outcome.recalls
+def _loop_closures(outcome: Outcome) -> str:
+    listed = [
+        f"{closure.frame}→{closure.place}" + " in another submap" * (closure.submap != closure.other)
+        for closure in outcome.loop_closures
     ]
-    text = ", ".join(told[:TOLD]) + f" and {len(told) - TOLD} more" * (len(told) > TOLD)
+    text = ", ".join(listed[:MAX_LISTED]) + f" and {len(listed) - MAX_LISTED} more" * (
+        len(listed) > MAX_LISTED
+    )
     if outcome.apart is not None:
         text += f"; within {outcome.apart[0]:.2g} m, {outcome.apart[1]:.0f}°"
     return text or "none"

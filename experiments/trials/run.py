@@ -1,4 +1,4 @@
-"""Does the system know when it is wrong, come back, keep submaps apart, and close the right loops? See README.md."""
+"""Does the system detect its failures, recover, keep submaps apart, and close the right loops? See README.md."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from experiments.common import add_engine, check, each_case, kept, table, write_between
+from experiments.common import add_engine, cached_run, check, run_cases, table, write_between
 from experiments.trials.gradient import report
 from experiments.trials.outcome import HEADER, Outcome, cells, perform
 from experiments.trials.trials import TRIALS, Trial
@@ -25,14 +25,14 @@ README = HERE / "README.md"
 GRADIENT = "gradient.md"
 NOT_RUN = "not yet run"
 LEFT_OUT = "left out"
-"""Beginning of what is said of a trial whose frames are not at hand."""
+"""Prefix of the message for a trial whose frames are not available."""
 
 
 def chosen(patterns: list[str]) -> list[str]:
-    """The trials that one of the patterns names, in their own order. Raises SystemExit for one that names none."""
+    """Select the trials that match a pattern, in their own order. Raises SystemExit if a pattern matches none."""
     for pattern in patterns:
         if not any(fnmatch(name, pattern) for name in TRIALS):
-            raise SystemExit(f"{pattern}: there is no such trial; there are {', '.join(TRIALS)}")
+            raise SystemExit(f"{pattern}: no such trial; the trials are {', '.join(TRIALS)}")
     return [name for name in TRIALS if any(fnmatch(name, pattern) for pattern in patterns or ["*"])]
 
 
@@ -44,18 +44,18 @@ def rows_in(text: str) -> dict[str, list[str]]:
 
 
 def write(rows: dict[str, list[str]]) -> None:
-    """The table of all trials; those that were not run stand there too."""
+    """Write the table of all trials, including those not run."""
     blank = [NOT_RUN, *[""] * (len(HEADER) - 2)]
     write_between(README, table(HEADER, [rows.get(name, [name, *blank]) for name in TRIALS]))
 
 
 def attempt(case: Columns) -> Columns:
-    """Run a trial unless it was run before; returns its row as `cells`. No Exception leaves it.
+    """Run a trial unless its result exists; return its row as `cells`. It raises no Exception.
 
-    case: `name` of the trial, `settings` after its own, `output`: folder of the results
+    case: `name` of the trial, `settings` applied after its own, `output` folder of the results
     """
     name, settings = case["name"], case["settings"]
-    return kept(
+    return cached_run(
         short_name(name),
         name,
         settings,
@@ -79,10 +79,10 @@ def _attempt(name: str, settings: list[str], folder: Path) -> Columns:
 
 
 def follow_up(trial: Trial, outcome: Outcome, run: Run, file: Path) -> None:
-    """What is looked at beyond the row of the table."""
-    assert outcome.recalls, "no loop was closed"
+    """Write the report of the gradient."""
+    assert outcome.loop_closures, "no loop was closed"
     file.write_text((HERE / GRADIENT).read_text(encoding="utf-8"), encoding="utf-8")
-    report(run, trial.sequence(), file, [(recall.frame, recall.place) for recall in outcome.recalls])
+    report(run, trial.sequence(), file, [(closure.frame, closure.place) for closure in outcome.loop_closures])
 
 
 def main() -> None:
@@ -94,7 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     output = arguments.output.absolute()
 
-    def told(columns: Columns) -> None:
+    def on_progress(columns: Columns) -> None:
         if columns["status"] != DONE:
             print(f"{columns['trial']}: {columns['error']}", flush=True)
             return
@@ -108,7 +108,7 @@ def main() -> None:
     cases = [
         {"name": name, "settings": arguments.set, "output": str(output)} for name in chosen(arguments.names)
     ]
-    found = each_case(attempt, cases, arguments, told)
+    found = run_cases(attempt, cases, arguments, on_progress)
     check(columns for columns in found if not columns.get("error", "").startswith(LEFT_OUT))
 
 

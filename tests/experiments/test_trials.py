@@ -382,5 +382,11 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(monkeypatch: pyte
 def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     made = Edited("round", Round(3).camera, [Shot(Round(3), index) for index in range(3)])
     result, _ = outcome.perform(Trial(lambda: made))
-    assert (result.ate, result.misled, result.recalls, result.posed, result.possible) == (None, [], [], 0, 3)
+    assert (result.ate, result.misled, result.loop_closures, result.posed, result.possible) == (
+        None,
+        [],
+        [],
+        0,
+        3,
+    )
     assert "no map was initialized" in cells("x", result, "m")[3]

@@ -17,7 +17,7 @@ from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import EndOfSequence
 from torchslam.errors import FrameError
 from torchslam.geometry import Camera
-from torchslam.parallel.live_prefetch import LivePrefetcher
+from torchslam.parallel.prefetch import LivePrefetcher
 from torchslam.system.front_end import image_extractor
 from torchslam.utils.timing import Stopwatch
 

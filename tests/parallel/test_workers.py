@@ -13,10 +13,9 @@ from torchslam import load_config, open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.features import OpenCVORB
 from torchslam.geometry import Camera
-from torchslam.mapping.async_bundle import solve_here
+from torchslam.mapping.local_bundle import solve_here
 from torchslam.parallel.bundle_worker import BundleWorker
-from torchslam.parallel.live_prefetch import LivePrefetcher
-from torchslam.parallel.prefetch import FeaturePrefetcher
+from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.workers import WORTH, WORTH_AT_ONCE, best_number, processors, why_alone, with_workers
 from torchslam.system.slam import SLAM
 
@@ -39,8 +38,8 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
     """Where the frames come from, and whether adjustments are found beside."""
     with with_workers(sequence, slam, processes, start) as frames:
-        is_beside = isinstance(slam.mapper.adjusting.solver, BundleWorker)
-    assert slam.mapper.adjusting.solver is solve_here
+        is_beside = isinstance(slam.mapper.adjustment.solver, BundleWorker)
+    assert slam.mapper.adjustment.solver is solve_here
     return type(frames).__name__, is_beside
 
 

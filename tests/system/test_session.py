@@ -1,4 +1,4 @@
-"""What a session is: its number, its worlds, and what it leaves in a file."""
+"""What a session is: its number, its submaps, and what it leaves in a file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torchslam.system.session import Session
 
 
 def in_a_world() -> Session:
-    world = simulated_world()
-    world.map.points["last_seen_frame"][:] = 7
-    return Session(CAMERA, Atlas.of([world], 1, CAMERA.params))
+    submap = simulated_world()
+    submap.map.points["last_seen_frame"][:] = 7
+    return Session(CAMERA, Atlas(CAMERA.params, [submap], 1))
 
 
 def test_each_session_has_the_next_number(tmp_path: Path) -> None:
@@ -35,21 +35,21 @@ def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Pa
     in_a_world().save(path)
     session = Session.load(path, mapping=False)
     assert (session.number, session.count) == (1, 1)
-    (world,) = session.worlds
-    assert (world.map.points["last_seen_frame"] == 7).all()
+    (submap,) = session.atlas
+    assert (submap.map.points["last_seen_frame"] == 7).all()
     session.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
 def test_where_the_map_may_change_frames_are_numbered_anew(tmp_path: Path) -> None:
     in_a_world().save(tmp_path / "map")
-    (world,) = Session.load(tmp_path / "map").worlds
-    assert (world.map.points["last_seen_frame"] == -1).all()
+    (submap,) = Session.load(tmp_path / "map").atlas
+    assert (submap.map.points["last_seen_frame"] == -1).all()
 
 
 def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
     Session(CAMERA, Atlas(CAMERA.params)).save(tmp_path / "empty")
     assert read_atlas(tmp_path / "empty").sessions == 1
-    assert len(Session.load(tmp_path / "empty").worlds) == 0
-    with pytest.raises(ResultsError, match="no world in it to localise in"):
+    assert len(Session.load(tmp_path / "empty").atlas) == 0
+    with pytest.raises(ResultsError, match="no submap in it to localize in"):
         Session.load(tmp_path / "empty", mapping=False)

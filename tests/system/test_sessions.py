@@ -1,4 +1,4 @@
-"""Maps that last: worlds that are saved, and gone on in; what a frame must be to be processed at all."""
+"""Maps that last: submaps that are saved, and gone on in; what a frame must be to be processed at all."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SEEN = eyes().of(WALK)
 
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[SLAM, Run, Path]:
-    """A system that has seen the beginning of the walk, its run, and the file of its worlds."""
+    """A system that has seen the beginning of the walk, its run, and the file of its submaps."""
     slam = SLAM(WALK.camera, config_of())
     run = slam.run(SEEN.part(0, FIRST))
     path = tmp_path_factory.mktemp("saved") / "map.safetensors"
@@ -61,7 +61,7 @@ def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_pat
     assert len(slam.trajectory()) == 0
     assert (slam.map.points["last_seen_frame"] == -1).all()  # frames are numbered anew
     run = slam.run(SEEN.part(FIRST - 10))
-    assert len(run.worlds) == 1
+    assert len(run.submaps) == 1
     assert run.session == 1
     assert len(run.trajectory) == len(WALK) - FIRST + 10
     assert run.results[0].state is State.UNCERTAIN
@@ -69,11 +69,11 @@ def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_pat
     assert run.map.num_keyframes > first[1].map.num_keyframes
     assert len(run.keyframes) == int((run.map.keyframes["session"] == 1).sum()) > 0
     assert evaluate(run.trajectory, WALK.groundtruth).ate_m < 1e-3
-    (world,) = run.worlds
-    both = torch.cat([world.trajectory(session).timestamps for session in (0, 1)])
-    assert len(both) == len(world.trajectory()) == FIRST + len(run.trajectory)
+    (submap,) = run.submaps
+    both = torch.cat([submap.trajectory(session).timestamps for session in (0, 1)])
+    assert len(both) == len(submap.trajectory()) == FIRST + len(run.trajectory)
     assert len(run.graph.timestamps) == len(both)  # frames of the same number in both sessions are two
-    assert evaluate(world.trajectory(0), WALK.groundtruth).ate_m < 1e-3
+    assert evaluate(submap.trajectory(0), WALK.groundtruth).ate_m < 1e-3
     slam.save(tmp_path / "grown")
     assert SLAM.load(tmp_path / "grown", config_of()).session.number == 2
 
@@ -83,7 +83,7 @@ def test_a_third_session_knows_the_keyframes_of_both(first: tuple[SLAM, Run, Pat
     slam.run(SEEN.part(FIRST - 10))
     slam.save(tmp_path / "grown")
     third = SLAM.load(tmp_path / "grown", config_of(), mapping=False)
-    assert len(third.memory.places) == slam.map.num_keyframes
+    assert len(third.loop_closer.keyframe_database) == slam.map.num_keyframes
     assert third.step(SEEN[45]).reason == "found again"
 
 
@@ -109,7 +109,7 @@ def test_localising_elsewhere_finds_nothing_and_begins_nothing(first: tuple[SLAM
     slam = SLAM.load(first[2], config_of("relocalization.frames_before_new_submap=2"), mapping=False)
     run = slam.run(eyes(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
     assert {result.state for result in run.results} == {State.LOST}
-    assert len(run.worlds) == 1
+    assert len(run.submaps) == 1
     assert len(run.trajectory) == 0
     assert run.failure == "none of 10 frames was recognised in the map"
     assert run.graph is not None
@@ -117,7 +117,7 @@ def test_localising_elsewhere_finds_nothing_and_begins_nothing(first: tuple[SLAM
 
 def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
     SLAM(WALK.camera, config_of()).save(tmp_path / "empty")
-    with pytest.raises(ResultsError, match="no world in it to localise in"):
+    with pytest.raises(ResultsError, match="no submap in it to localize in"):
         SLAM.load(tmp_path / "empty", config_of(), mapping=False)
     slam = SLAM.load(tmp_path / "empty", config_of())
     assert len(slam.run(SEEN.part(0, 12)).trajectory) == 12

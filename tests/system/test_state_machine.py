@@ -21,7 +21,7 @@ def result(index: int, reason: str) -> StepResult:
 def test_a_video_without_texture_is_told_so() -> None:
     few = "too few matches with the reference frame: 12, 100 are needed"
     results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
-    assert why_no_map(results, []) == f"no map was initialised in 1000 frames: {few}"
+    assert why_no_map(results, []) == f"no map was initialized in 1000 frames: {few}"
 
 
 def test_a_reference_frame_alone_is_too_short_a_video() -> None:
@@ -43,10 +43,10 @@ def test_states_follow_each_other_as_frames_come(slam: SLAM) -> None:
     started = next(index for index, each in enumerate(results) if each.reason == Reason.STARTED)
     assert all(each.state is State.INITIALIZING and each.T_cw is None for each in results[:started])
     assert all(each.state is not State.INITIALIZING and each.T_cw is not None for each in results[started:])
-    assert slam.world is not None
+    assert slam.submap is not None
     slam.reset()
     assert slam.state is State.INITIALIZING
-    assert slam.world is None
+    assert slam.submap is None
 
 
 def test_a_camera_without_a_view_is_lost_and_found_again(slam: SLAM) -> None:

@@ -14,14 +14,16 @@ from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
 from torchslam.system import state_machine as following
 from torchslam.system.front_end import Simulated
-from torchslam.system.tentative_mapping import TentativeMapping
+from torchslam.system.local_mapping import TentativeMapping
 from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking import pose_confirmation as probation
 from torchslam.tracking.dynamic.independent_motion import NOTHING
+from torchslam.types import Reason, Rejection
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 DOUBTED = range(22, 34)
-LATE = 15  # the first frame that may begin a world, where one starts late
+LATE = 15  # the first frame that may begin a submap, where one starts late
+ODD = Rejection(Reason.LOW_COVERAGE_RATIO, {"ratio": 0.1})
 SEEN = 46  # frames, until as many were certain as were doubtful
 
 
@@ -39,13 +41,15 @@ class Leaving(Walk):
         return frame if index < self.leaves else replace(frame, T_cw_groundtruth=away)
 
 
-def doubting(monkeypatch: pytest.MonkeyPatch, frames: Iterable[int], judge: str = "why_strange") -> SLAM:
+def doubting(
+    monkeypatch: pytest.MonkeyPatch, frames: Iterable[int], judge: str = "check_map_agreement"
+) -> SLAM:
     """A system to which some frames seem strange."""
     slam = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED))
 
-    def why(*_: object) -> str:
+    def why(*_: object) -> Rejection | None:
         assert slam.last_frame is not None
-        return "odd" if slam.last_frame[0] in frames else ""
+        return ODD if slam.last_frame[0] in frames else None
 
     monkeypatch.setattr(following, judge, why)
     return slam
@@ -74,7 +78,7 @@ def test_the_map_grows_on_trial_and_is_kept_when_it_is_confirmed(monkeypatch: py
     assert keyframes[last] > keyframes[first - 1] + 1
     assert states[first : SEEN - 1] == [State.UNCERTAIN] * (SEEN - 1 - first)
     assert states[SEEN - 1 :] == [State.TRACKING] * 5  # as many certain frames as doubtful ones
-    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
     assert len(slam.trajectory()) == len(walk)
     assert walk.groundtruth is not None
     assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
@@ -88,10 +92,10 @@ def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: 
     states = shown(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
     assert states[-1] is State.LOST
     assert max(grown) > grown[DOUBTED[0] - 1]
-    assert len(slam.memory.places) == slam.map.num_keyframes == grown[DOUBTED[0] - 1]
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes == grown[DOUBTED[0] - 1]
 
     cautious = doubting(monkeypatch, DOUBTED)
-    monkeypatch.setattr(TentativeMapping, "take", lambda *_: None)
+    monkeypatch.setattr(TentativeMapping, "add_keyframe", lambda *_: None)
     assert shown(cautious, walk) == states
     assert tables(slam).keys() == tables(cautious).keys()
     for name, column in tables(slam).items():
@@ -99,17 +103,19 @@ def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: 
     assert torch.equal(slam.trajectory().T_wc, cautious.trajectory().T_wc)
 
 
-@pytest.mark.parametrize("judge", ["why_unsound", "moves"])
+@pytest.mark.parametrize("judge", ["check_pose_quality", "detect_independent_motion"])
 def test_a_pose_that_is_not_what_its_matches_say_is_not_mapped(
     judge: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slam = doubting(monkeypatch, DOUBTED, "why_strange" if judge == "moves" else judge)
-    if judge == "moves":
-        monkeypatch.setattr(following, "why_strange", lambda *_: "")
-        moving = replace(NOTHING, words="it moves", is_doubt=True)
+    slam = doubting(
+        monkeypatch, DOUBTED, "check_map_agreement" if judge == "detect_independent_motion" else judge
+    )
+    if judge == "detect_independent_motion":
+        monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
+        moving = replace(NOTHING, rejection=ODD)
         monkeypatch.setattr(
-            slam.foreign,
-            "moves",
+            slam.non_static_filter,
+            "detect_independent_motion",
             lambda _: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NOTHING,
         )
     grown: list[int] = []
@@ -132,10 +138,10 @@ def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyP
 
 
 def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
-    """No world may begin before frame `LATE`: what comes before waits for the way back."""
-    beginning = slam._states.beginning
+    """No submap may begin before frame `LATE`: what comes before waits for the way back."""
+    beginning = slam._state_machine.initialization
     step = beginning.step
-    monkeypatch.setattr(beginning, "step", lambda view: "wait" if view.index < LATE else step(view))
+    monkeypatch.setattr(beginning, "step", lambda view: ODD if view.index < LATE else step(view))
 
 
 def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
@@ -143,11 +149,11 @@ def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
 ) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
     shown(slam, walk)
     assert len(slam.trajectory()) == len(walk)
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
-    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
     assert walk.groundtruth is not None
     assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
 
@@ -155,21 +161,21 @@ def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
 def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd")
+    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
     grown: list[int] = []
 
-    def why_unsound(*_: object) -> str:
+    def check_pose_quality(*_: object) -> Rejection | None:
         grown.append(slam.map.num_keyframes)
-        return "off" if len(grown) > LATE // 2 else ""
+        return ODD if len(grown) > LATE // 2 else None
 
-    monkeypatch.setattr(backwards, "why_unsound", why_unsound)
+    monkeypatch.setattr(backwards, "check_pose_quality", check_pose_quality)
     shown(slam, walk)
     assert grown[-1] > grown[0]
     first = int(slam.map.keyframes["frame_index"][0])
     assert first >= LATE
     assert int(slam.map.keyframes["frame_index"].min()) == first
-    assert int(slam.history.frames["frame_index"].min()) == first
-    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert int(slam.posed_frames.frames["frame_index"].min()) == first
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
 @pytest.mark.parametrize(("end", "posed"), [(SLAM.finalize, 36), (SLAM.confirm_map, 22)])
@@ -181,25 +187,25 @@ def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
     slam = doubting(monkeypatch, range(22, 60))
     starting_late(monkeypatch, slam)
     shown(slam, walk)
-    assert slam.youth is not None
-    assert slam.map.num_keyframes > len(slam.memory.places)
+    assert slam.provisional_map is not None
+    assert slam.map.num_keyframes > len(slam.loop_closer.keyframe_database)
     end(slam)
     assert len(slam.trajectory()) == posed
-    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
 
 
 def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
-    monkeypatch.setattr(probation, "MOST", 5)
+    monkeypatch.setattr(probation, "MAX_PENDING_FRAMES", 5)
     walk = Leaving(arc(60)[:40], 34)
     slam = doubting(monkeypatch, range(22, 60))
     states = shown(slam, walk)
     assert states[22:34] == [State.UNCERTAIN] * 12
     assert states[34:] == [State.LOST] * 6
-    assert slam.history.frames["frame_index"].tolist() == list(range(32))
+    assert slam.posed_frames.frames["frame_index"].tolist() == list(range(32))
     assert int(slam.map.keyframes["frame_index"].max()) < 32
-    assert len(slam.memory.places) == slam.map.num_keyframes
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
 def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,16 +215,19 @@ def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: py
     for index in range(len(walk)):
         slam.step(frames[index])
         newest = slam.map.num_keyframes - 1
-        if slam.mapper.adjusting and slam.memory.looks_known == (slam.map.key(newest), False):
+        if slam.mapper.adjustment.is_pending and slam.loop_closer.loop_precheck == (
+            slam.map.key(newest),
+            False,
+        ):
             break
     else:
         pytest.fail("no keyframe was asked about")
     asked: list[int] = []
-    recognizer, world = slam.memory.recognizer, slam.world
-    assert world is not None
-    monkeypatch.setattr(recognizer, "recognize", lambda _, keyframe: asked.append(keyframe))
-    slam._states.loop_closing.detect_and_close(world)
+    loop_detector, submap = slam.loop_closer.loop_detector, slam.submap
+    assert submap is not None
+    monkeypatch.setattr(loop_detector, "detect", lambda _, keyframe: asked.append(keyframe))
+    slam._state_machine.keyframe_actions.detect_and_close()
     assert not asked  # it is known already
-    slam.memory.looks_known = -1, False
-    slam._states.loop_closing.detect_and_close(world)
+    slam.loop_closer.loop_precheck = -1, False
+    slam._state_machine.keyframe_actions.detect_and_close()
     assert asked == [newest]

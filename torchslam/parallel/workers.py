@@ -13,10 +13,8 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 from torchslam.data.sequence import Sequence
-from torchslam.mapping.async_bundle import solve_here
 from torchslam.parallel.bundle_worker import BundleWorker
-from torchslam.parallel.live_prefetch import LivePrefetcher
-from torchslam.parallel.prefetch import FeaturePrefetcher
+from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.worker import starts_at_once
 from torchslam.system.run import Frames
 
@@ -63,8 +61,8 @@ def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: i
             others.enter_context(ahead)
             frames = ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
-            slam.mapper.adjusting.solver = others.enter_context(BundleWorker(slam.camera))
-            others.callback(setattr, slam.mapper.adjusting, "solver", solve_here)
+            worker = others.enter_context(BundleWorker(slam.camera))
+            others.enter_context(slam.mapper.adjustment.solved_by(worker))
         if isinstance(ahead, FeaturePrefetcher):
             ahead.begin(start)
         slam.precompute_undistortion()  # while the workers read
@@ -89,7 +87,7 @@ def why_alone(sequence: Sequence, slam: SLAM) -> str:
     """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
-    if slam.has_own_parts:
+    if slam.has_custom_components:
         return "a front end or matcher of your own is here alone"
     if slam.config.matching.matcher != "descriptors":
         return "the matcher may want images"

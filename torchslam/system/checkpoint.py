@@ -2,7 +2,7 @@
 
 It is a map file with more in it: the results so far, where the camera is, and which pixels stay in place. What is not
 in it: frames that still wait for a pose, which stay without one, and the frame that the next one would be compared
-with in search of pixels that stay. A world that is hardly begun, held-back frames and the search for a start are not in
+with in search of pixels that stay. A provisional map, held-back frames and the search for a start are not in
 it either, since no checkpoint is taken while there are any (`SLAM.can_checkpoint`).
 """
 
@@ -22,8 +22,8 @@ from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.map.atlas import TrackingState
 from torchslam.map.file import Saved, pack, read_tensors, unpack, write_tensors
-from torchslam.map.tracking_state import TrackingState
 from torchslam.system.front_end import FrontEnd
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
@@ -31,18 +31,18 @@ from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
 
 STATES = tuple(State)
-TRACK = "run.track."
+TRACKING = "run.tracking."
 UNKNOWN = "not a whole checkpoint"
 
 
 def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
     """Write the state after a frame, whole or not at all. The system must be settled (`SLAM.can_checkpoint`)."""
-    world = slam.world
-    if world is None or not slam.can_checkpoint:
-        raise ValueError("a checkpoint needs a world that is followed and nothing that is held back")
-    tensors, about = pack(slam.worlds, slam.camera, slam.session.count, slam.worlds.begun)
-    whole = {column.name: getattr(world.track, column.name) for column in fields(TrackingState)}
-    track = {TRACK + name: value for name, value in whole.items() if isinstance(value, Tensor)}
+    submap = slam.submap
+    if submap is None or not slam.can_checkpoint:
+        raise ValueError("a checkpoint needs a submap that is followed and nothing that is held back")
+    tensors, about = pack(slam.atlas, slam.camera, slam.session.count, slam.atlas.num_created)
+    whole = {column.name: getattr(submap.tracking, column.name) for column in fields(TrackingState)}
+    tracking = {TRACKING + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
     about["run"] = {
         "sequence": fingerprint(sequence),
@@ -52,15 +52,19 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         "reasons": reasons,
         "stages": stages,
         "last_frame": slam.last_frame,
-        "world": world.number,
-        "track": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
-        "asked": [each.asked for each in slam.worlds],
-        "adjusting": bool(slam.mapper.adjusting),
-        "due": slam.mapper.adjusting.due,
-        "looks_known": slam.memory.looks_known,
-        "recalls": [astuple(recall) for recall in slam.memory.recalls],
+        "submap": submap.number,
+        "tracking": {name: value for name, value in whole.items() if not isinstance(value, Tensor)},
+        "num_cull_checked": [each.num_cull_checked for each in slam.atlas],
+        "adjustment": slam.mapper.adjustment.is_pending,
+        "due": slam.mapper.adjustment.due,
+        "loop_precheck": slam.loop_closer.loop_precheck,
+        "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
-    write_tensors(path, tensors | track | results | {"run.evidence": slam.foreign.stillness.evidence}, about)
+    write_tensors(
+        path,
+        tensors | tracking | results | {"run.evidence": slam.non_static_filter.static_overlay.evidence},
+        about,
+    )
 
 
 def read_checkpoint(
@@ -88,7 +92,7 @@ def read_checkpoint(
     slam = SLAM(saved.camera, config, extractor)
     try:
         so_far = RunProgress(run["next"], _results(own, run, device), run["skipped"])
-        _go_on(slam, saved, own, run, device)
+        _restore(slam, saved, own, run, device)
     except (
         KeyError,
         ValueError,
@@ -110,48 +114,51 @@ def fingerprint(of: Sequence | Config) -> str:
     return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
 
 
-def _go_on(
+def _restore(
     slam: SLAM, saved: Saved, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str
 ) -> None:
-    """Put the system to where it was."""
-    (world,) = (world for world in saved.worlds if world.number == run["world"])
+    """Start the session of a checkpoint in a new system."""
+    (submap,) = (submap for submap in saved.atlas if submap.number == run["submap"])
     columns: dict[str, Any] = {
-        name.removeprefix(TRACK): rows.to(device) for name, rows in tensors.items() if name.startswith(TRACK)
+        name.removeprefix(TRACKING): rows.to(device)
+        for name, rows in tensors.items()
+        if name.startswith(TRACKING)
     }
-    world.track = track = TrackingState(**run["track"], **columns)
-    _check_track(track)
+    submap.tracking = tracking = TrackingState(**run["tracking"], **columns)
+    _check_tracking(tracking)
     for rows, count in (
-        (track.seen_last, len(world.map.points)),
-        (track.local_points, len(world.map.points)),
-        (track.local_keyframes, world.map.num_keyframes),
-        (track.local_keyframes.new_tensor([track.reference]), world.map.num_keyframes),
+        (tracking.last_inlier_points, len(submap.map.points)),
+        (tracking.local_points, len(submap.map.points)),
+        (tracking.local_keyframes, submap.map.num_keyframes),
+        (tracking.local_keyframes.new_tensor([tracking.reference]), submap.map.num_keyframes),
     ):
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
             raise ValueError(f"where the camera was names rows beyond {count}")
-    for each, asked in zip(saved.worlds, run["asked"], strict=True):
-        each.asked = int(asked)
+    for each, asked in zip(saved.atlas, run["num_cull_checked"], strict=True):
+        each.num_cull_checked = int(asked)
     index, timestamp = run["last_frame"]
-    session = Session(saved.camera, saved.worlds, saved.sessions - 1)
-    slam.start_session(session, world, (int(index), float(timestamp)))
-    slam.memory.recalls += [LoopClosureRecord(*recall) for recall in run["recalls"]]
-    slam.foreign.stillness.evidence.copy_(tensors["run.evidence"])
-    if run["adjusting"]:  # of the newest keyframe, around which the map is as it was then
+    session = Session(saved.camera, saved.atlas, saved.sessions - 1)
+    slam.start_session(session, submap, (int(index), float(timestamp)))
+    precheck = run["loop_precheck"]
+    slam.loop_closer.restore(
+        [LoopClosureRecord(*closure) for closure in run["loop_closures"]],
+        None if precheck is None else (int(precheck[0]), bool(precheck[1])),
+    )
+    slam.non_static_filter.static_overlay.restore(tensors["run.evidence"])
+    if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])
-        slam.mapper.adjusting.ask(world.map, world.map.num_keyframes - 1, due)
-    if run["looks_known"] is not None:
-        key, looks_known = run["looks_known"]
-        slam.memory.looks_known = int(key), bool(looks_known)
+        slam.mapper.adjustment.request(submap.map, submap.map.num_keyframes - 1, due)
 
 
-def _check_track(track: TrackingState) -> None:
+def _check_tracking(tracking: TrackingState) -> None:
     """Raises ValueError, or TypeError for what is no tensor, where it is not the way of a camera."""
-    for T in (track.T_cr, track.velocity):
+    for T in (tracking.T_cr, tracking.velocity):
         if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
             raise ValueError("where the camera was is no pose")
-    for rows in (track.seen_last, track.local_keyframes, track.local_points):
+    for rows in (tracking.last_inlier_points, tracking.local_keyframes, tracking.local_points):
         if rows.ndim != 1 or rows.dtype != torch.int64:
             raise ValueError("where the camera was does not name rows")
-    counts, shares = (track.reference, track.reference_size), (track.error, track.explained)
+    counts, shares = (tracking.reference, tracking.reference_size), (tracking.error, tracking.explained_ratio)
     if not all(type(count) is int for count in counts) or not all(map(math.isfinite, shares)):
         raise ValueError(f"where the camera was: {counts}, {shares}")
 
@@ -167,7 +174,7 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
         (
             result.index,
             STATES.index(result.state),
-            -1 if result.world is None else result.world,
+            -1 if result.submap is None else result.submap,
             int(result.is_keyframe),
             result.matches,
             result.inliers,
@@ -197,14 +204,14 @@ def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.devi
     timestamps, stages = tensors["run.timestamps"].tolist(), run["stages"]
     T_cw, covariances = tensors["run.T_cw"].to(device), tensors["run.covariances"].to(device)
     results = []
-    for row, (index, state, world, is_keyframe, matches, inliers) in enumerate(counts):
+    for row, (index, state, submap, is_keyframe, matches, inliers) in enumerate(counts):
         results.append(
             StepResult(
                 index=index,
                 timestamp=timestamps[row],
                 state=STATES[state],
                 T_cw=None if bool(T_cw[row].isnan().any()) else T_cw[row],
-                world=None if world < 0 else world,
+                submap=None if submap < 0 else submap,
                 covariance=None if bool(covariances[row].isnan().any()) else covariances[row],
                 is_keyframe=bool(is_keyframe),
                 matches=matches,

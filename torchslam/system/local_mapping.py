@@ -1,65 +1,167 @@
-"""A frame that is believed enters its world; a keyframe grows the map."""
+"""Mapping of posed frames: keyframes of confirmed poses, of tentative ones, and of frames tracked backward in time."""
 
 from __future__ import annotations
 
-from torchslam.map.submap import Submap
-from torchslam.mapping.keyframe_policy import why_keyframe
-from torchslam.system.context import SystemContext
+from dataclasses import replace
+
+from torchslam.map.atlas import Submap, TrackingState
+from torchslam.map.map import MapSnapshot
+from torchslam.mapping.local_bundle import ApplyAt
+from torchslam.mapping.mapper import keyframe_reason
+from torchslam.system.session import SystemContext
+from torchslam.tracking.backward_tracking import UnposedFrames, track_back
+from torchslam.tracking.pose_confirmation import PendingFrame
 from torchslam.types import FrameFeatures, PoseEstimate
 
 
 class LocalMapping:
-    """Remembers frames and maps keyframes; what is around one may be adjusted while the next frames are tracked."""
+    """Adds confirmed frames to a submap, inserts keyframes, and applies the local bundle adjustments around them."""
 
-    def __init__(self, parts: SystemContext) -> None:
-        self.parts, self.adjusting = parts, parts.mapper.adjusting
+    def __init__(self, context: SystemContext) -> None:
+        self.context, self.adjustment = context, context.mapper.adjustment
 
-    def take(
-        self, world: Submap, view: FrameFeatures, tracked: PoseEstimate, delay: int | None = None
+    def add_frame(
+        self,
+        submap: Submap,
+        view: FrameFeatures,
+        estimate: PoseEstimate,
+        apply_at: ApplyAt = ApplyAt.NOW,
     ) -> str:
-        """Remember a frame that is believed; a keyframe grows the map. Returns why it is one, or nothing.
+        """Add a frame with a confirmed pose; return why it became a keyframe, or "".
 
-        delay: frames that are tracked before the adjustment around a keyframe is taken over, or None as in `insert`;
-               there is no other keyframe until then
+        While an adjustment is pending there is no other keyframe: it is applied after this frame instead.
         """
-        parts, adjusting = self.parts, self.adjusting
-        parts.tracker.expect(world.map, tracked)
-        why = why_keyframe(view, tracked, world, parts.config.keyframes) if parts.session.mapping else ""
-        if why and adjusting:
-            adjusting.set_deadline(view.index)
+        context = self.context
+        context.tracker.count_visible(submap.map, estimate)
+        why = (
+            keyframe_reason(view, estimate, submap, context.config.keyframes)
+            if context.session.mapping
+            else ""
+        )
+        if why and self.adjustment.is_pending:
+            self.adjustment.set_deadline(view.index)
             why = ""
         if why:
-            keyframe = parts.mapper.insert(world.map, view, tracked, delay)
-            parts.memory.add(world.map, keyframe)
-            parts.tracker.follow(world, keyframe)
-        parts.tracker.vouch(world.map, tracked)
-        world.history.add(view, tracked, world.track.T_cr, world.track.reference)
+            keyframe = context.mapper.insert(submap.map, view, estimate, apply_at)
+            context.loop_closer.add(submap.map, keyframe)
+            context.tracker.reset_to_keyframe(submap, keyframe)
+        context.tracker.count_found(submap.map, estimate)
+        submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return why
 
-    def begin_adjusting(self) -> None:
-        """What was asked for with the last frame begins: that one was long enough."""
-        if self.adjusting:
-            with self.parts.clock("bundle"):
-                self.adjusting.begin()
+    def add_pending_frames(self, submap: Submap, frames: list[PendingFrame]) -> None:
+        """Add frames whose poses were confirmed by later ones."""
+        for view, estimate, T_cr, reference in frames:
+            self.context.tracker.count_visible(submap.map, estimate)
+            self.context.tracker.count_found(submap.map, estimate)
+            submap.posed_frames.add(view, estimate, T_cr, reference)
 
-    def take_over_first(self, world: Submap) -> bool:
-        """Take over what is due before the next frame, from the newest keyframe on; whether there was any."""
-        if not self.adjusting.due_before_next_frame:
+    def start_adjustment(self) -> None:
+        """Start the pending adjustment: the frame that requested it took long enough without it."""
+        if self.adjustment.is_pending:
+            with self.context.clock("bundle"):
+                self.adjustment.start()
+
+    def apply_adjustment_before_frame(self, submap: Submap) -> bool:
+        """Apply an adjustment that is due before the next frame; return whether there was one."""
+        if not self.adjustment.is_due_before_next_frame:
             return False
-        self.parts.mapper.take_over(world.map)
-        self.parts.tracker.follow(world, world.map.num_keyframes - 1)
+        self.context.mapper.apply_adjustment(submap.map)
+        self.context.tracker.reset_to_keyframe(submap, submap.map.num_keyframes - 1)
         return True
 
-    def is_due(self, frame: int) -> bool:
-        """Whether what was adjusted is taken over with this frame."""
-        return self.adjusting.is_due(frame)
-
-    def take_over(self, world: Submap, frame: int | None = None) -> bool:
-        """Put the map to where the adjustment around the newest keyframe has it, if it is time; whether it was.
-
-        frame: the one that was tracked; None: before its time, as the map is to change or the world is left
-        """
-        if not self.adjusting or (frame is not None and not self.is_due(frame)):
+    def apply_adjustment(self, submap: Submap, frame: int | None = None) -> bool:
+        """Apply the pending adjustment if it is due after a frame, or at once if `frame` is None; return whether."""
+        if not self.adjustment.is_pending or (frame is not None and not self.adjustment.is_due(frame)):
             return False
-        self.parts.mapper.take_over(world.map)
+        self.context.mapper.apply_adjustment(submap.map)
         return True
+
+
+class TentativeMapping:
+    """Inserts keyframes of frames with unconfirmed poses, so that the map can be rolled back if the camera is lost.
+
+    Without new points a moving camera would be lost before its pose is confirmed. Tentative keyframes are not in the
+    keyframe database, and their points are not culled.
+    """
+
+    def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
+        self.context, self.mapping = context, mapping
+        self._before: tuple[MapSnapshot, TrackingState] | None = None
+
+    @property
+    def has_keyframes(self) -> bool:
+        """Whether there are tentative keyframes."""
+        return self._before is not None
+
+    def add_keyframe(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+        """Insert a frame as a tentative keyframe, if one is due."""
+        context = self.context
+        if not context.session.mapping or not keyframe_reason(
+            view, estimate, submap, context.config.keyframes
+        ):
+            return
+        if self._before is None:
+            self.mapping.apply_adjustment(submap)
+            self._before = MapSnapshot.of(submap.map), replace(submap.tracking)
+        keyframe = context.mapper.insert(submap.map, view, estimate)
+        context.tracker.reset_to_keyframe(submap, keyframe)
+
+    def commit(self, submap: Submap) -> None:
+        """Keep the tentative keyframes and add them to the keyframe database."""
+        if self._before is not None:
+            (before, _), self._before = self._before, None
+            for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
+                self.context.loop_closer.add(submap.map, keyframe)
+
+    def rollback(self, submap: Submap) -> None:
+        """Restore map and tracking state from before the first tentative keyframe."""
+        if self._before is not None:
+            (before, submap.tracking), self._before = self._before, None
+            before.restore(submap.map)
+
+
+class BackwardTracking:
+    """Keeps frames without a pose, and poses them by tracking backward in time once there is a map."""
+
+    def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
+        self.context, self.mapping = context, mapping
+        self.tentative = TentativeMapping(context, mapping)
+        self.unposed = UnposedFrames(context.config.initialization.max_unposed_frames)
+
+    def from_first_keyframe(self, submap: Submap) -> None:
+        """Pose the frames from before the first keyframe of a submap."""
+        backward = submap.fork()
+        self.context.tracker.reset_to_keyframe(backward, 0)
+        self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
+
+    def from_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+        """Pose the frames from before a relocalized frame."""
+        backward = submap.fork()
+        self.context.tracker.start_at_estimate(backward, view, estimate)
+        self._track(backward, before=view.index)
+
+    def _track(self, backward: Submap, before: int) -> None:
+        context = self.context
+        with context.clock("backwards"):
+            earlier = [view for view in self.unposed if view.index < before]
+            posed = track_back(context.tracker, backward, reversed(earlier), context.config, self)
+        self.unposed.remove(posed)
+
+    def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+        """Add a frame with a confirmed pose."""
+        self.mapping.add_frame(submap, view, estimate)
+
+    def add_tentative(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
+        """Map a frame tentatively, if a keyframe is due; return whether there are tentative keyframes."""
+        self.tentative.add_keyframe(submap, view, estimate)
+        return self.tentative.has_keyframes
+
+    def commit(self, submap: Submap, frames: list[PendingFrame]) -> None:
+        """Keep the tentative keyframes, and add the frames that were held back."""
+        self.tentative.commit(submap)
+        self.mapping.add_pending_frames(submap, frames)
+
+    def rollback(self, submap: Submap) -> None:
+        """Discard the tentative keyframes."""
+        self.tentative.rollback(submap)

@@ -104,9 +104,9 @@ class Run:
 
     @property
     def online_parts(self) -> list[Trajectory]:
-        """The poses as they were given: in the main submap, and in each submap that became a part of it, each in its own.
+        """The online poses of the main submap, and of each submap that was merged into it, each in its own frame.
 
-        What was given in submaps that were taken back, or that are still beside the main one, is not among them.
+        Poses in submaps that were discarded, or that are still separate, are left out.
         """
         if self.main is None:
             return []

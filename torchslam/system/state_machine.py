@@ -1,351 +1,371 @@
-"""The state machine of a session: initialize a map, track the camera in it, find it again when lost.
+"""The state machine of a session: initialize a map, track the camera in it, relocalize when it is lost.
 
-INITIALIZING, LOST -> `LostState`: relocalize in a known submap, or begin a new one (`InitializationState`)
-TRACKING, UNCERTAIN -> `StateMachine`: track, validate the pose, map it or hold it back until it is confirmed
+INITIALIZING, LOST    -> `LostState`: relocalize in a known submap, or create a new one (`InitializationState`)
+TRACKING, UNCERTAIN   -> `StateMachine.track`: track, validate the pose; map the frame, or hold it back until confirmed
+keyframe was adjusted -> `KeyframeActions`: detect and close loops, cull, compact
 """
 
 from __future__ import annotations
 
-from torchslam.map.submap import Submap
-from torchslam.mapping.culling import drop_covered
-from torchslam.mapping.map_initialization import MapInitializer
-from torchslam.system.backward_tracking import TrackingBack
-from torchslam.system.context import Outcome, SystemContext
-from torchslam.system.local_mapping import LocalMapping
-from torchslam.system.tentative_mapping import TentativeMapping
+from dataclasses import dataclass
+
+from torchslam.map.atlas import Submap
+from torchslam.mapping.culling import remove_masked_observations
+from torchslam.mapping.local_bundle import ApplyAt
+from torchslam.mapping.mapper import MapInitializer
+from torchslam.system.local_mapping import BackwardTracking, LocalMapping, TentativeMapping
+from torchslam.system.session import SystemContext
 from torchslam.tracking.dynamic.independent_motion import NOTHING
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.pose_validation import why_strange, why_unsound
+from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
 from torchslam.tracking.provisional_map import ProvisionalMap
 from torchslam.tracking.relocalization import Relocalizer
-from torchslam.types import FrameFeatures, PoseEstimate, Reason, State, TwoViewMap
+from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
+
+
+@dataclass(frozen=True)
+class FrameOutcome:
+    """Effect of a frame: without a submap it has no pose, and `reason` says why."""
+
+    reason: str
+    submap: Submap | None = None
+    estimate: PoseEstimate | None = None
+    is_keyframe: bool = False
 
 
 class InitializationState:
-    """Begins worlds.
+    """Creates submaps from two views.
 
-    youth: of the world that is followed, if it began lately
+    provisional: the active submap, until enough frames were tracked in it to confirm it
     """
 
-    def __init__(self, parts: SystemContext, back: TrackingBack) -> None:
-        self.parts, self.back = parts, back
-        self.worlds, self.settings = parts.session.worlds, parts.config.initialization
-        self.founder = MapInitializer(parts.tracker, parts.mapper, self.settings.min_explained_ratio)
-        self.youth: ProvisionalMap | None = None
-        self.seek()
+    def __init__(self, context: SystemContext, backward: BackwardTracking) -> None:
+        self.context, self.backward = context, backward
+        self.atlas, self.settings = context.session.atlas, context.config.initialization
+        self.map_initializer = MapInitializer(
+            context.tracker, context.mapper, self.settings.min_explained_ratio
+        )
+        self.provisional: ProvisionalMap | None = None
+        self.restart()
 
-    def seek(self) -> None:
-        """Look for a start with the frames from now on."""
-        parts = self.parts
-        self.initializer = Initializer(parts.camera, parts.config, parts.matcher)
+    def restart(self) -> None:
+        """Forget the reference frame, and initialize with the frames from now on."""
+        context = self.context
+        self.initializer = Initializer(context.camera, context.config, context.matcher)
 
-    def step(self, view: FrameFeatures) -> str:
-        """Begin a world if the frame makes a start with an earlier one; why it does not, or nothing."""
-        with self.parts.clock("initialization"):
-            start, reason = self.initializer.step(view)
-            self.parts.foreign.stillness.add(self.initializer.still)
-            return reason if start is None else self._begin(start, self.initializer.views)
+    def step(self, view: FrameFeatures) -> Rejection | None:
+        """Create a submap if the frame and an earlier one determine it; return why not, or None."""
+        with self.context.clock("initialization"):
+            result = self.initializer.step(view)
+            self.context.non_static_filter.static_overlay.add(self.initializer.static_pixels)
+            return result if isinstance(result, Rejection) else self._create(result, self.initializer.views)
 
     @property
     def is_almost_confirmed(self) -> bool:
-        """Whether the young world that is followed has proved itself with one more frame."""
-        return self.youth is not None and self.youth.age + 1 >= self.settings.provisional_frames
+        """Whether one more tracked frame confirms the provisional map."""
+        return self.provisional is not None and self.provisional.age + 1 >= self.settings.provisional_frames
 
-    def grow(self, view: FrameFeatures) -> bool:
-        """The world that is followed tracked another frame; whether that shows that it has to be begun anew."""
-        if self.youth is None:
+    def add_frame(self, view: FrameFeatures) -> bool:
+        """Note that a frame was tracked; return whether the provisional map was replaced by another one."""
+        if self.provisional is None:
             return False
-        self.youth.grow(view)
-        if self._replace(self.youth):
+        self.provisional.add_frame(view)
+        if self._replace_if_contradicted(self.provisional):
             return True
-        if self.youth.age >= self.settings.provisional_frames:
+        if self.provisional.age >= self.settings.provisional_frames:
             self.confirm_map()
         return False
 
     def confirm_map(self) -> None:
-        """A young world has proved itself: pose the frames from before its start."""
-        if self.youth is None:
+        """Confirm the provisional map, and pose the frames from before its first keyframe."""
+        if self.provisional is None:
             return
-        world, self.youth = self.youth.world, None
-        self.back.from_start(world)
+        submap, self.provisional = self.provisional.submap, None
+        self.backward.from_first_keyframe(submap)
 
-    def lose(self) -> bool:
-        """The camera is lost; whether the world was hardly begun, and is taken back."""
-        taken_back = self.youth is not None and self.youth.age < self.settings.provisional_frames
-        if self.youth is not None and taken_back:
-            self._take_back(self.youth)
+    def on_lost(self) -> bool:
+        """Discard a map that is still provisional when the camera is lost; return whether it was."""
+        is_discarded = (
+            self.provisional is not None and self.provisional.age < self.settings.provisional_frames
+        )
+        if self.provisional is not None and is_discarded:
+            self._discard(self.provisional)
         self.confirm_map()
-        return taken_back
+        return is_discarded
 
-    def _begin(self, start: TwoViewMap, views: list[FrameFeatures]) -> str:
-        """Begin a world with two views, in the place of a young one; why it is not believed, or nothing."""
-        world = self.worlds.begin()
-        reason = self.founder.found(world, start, views)
-        if reason:
-            self.worlds.forget(world)
-            return reason
-        if self.youth is not None:
-            self._take_back(self.youth)
-        for keyframe in range(world.map.num_keyframes):
-            self.parts.memory.add(world.map, keyframe)
-        known = set(world.history.frames["frame_index"].tolist()) if len(world.history) else set()
+    def _create(self, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
+        """Create a submap from two views, and discard a provisional one; return why it is rejected, or None."""
+        submap = self.atlas.create()
+        rejection = self.map_initializer.build(submap, start, views)
+        if rejection:
+            self.atlas.remove(submap)
+            return rejection
+        if self.provisional is not None:
+            self._discard(self.provisional)
+        for keyframe in range(submap.map.num_keyframes):
+            self.context.loop_closer.add(submap.map, keyframe)
+        known = set(submap.posed_frames.frames["frame_index"].tolist()) if len(submap.posed_frames) else set()
         posed = [view for view in views if view.index in known]
-        self.back.waiting.remove(posed)
-        self.youth = ProvisionalMap(world, posed)
-        self.parts.here.world, self.parts.here.state = world, State.TRACKING
-        return ""
+        self.backward.unposed.remove(posed)
+        self.provisional = ProvisionalMap(submap, posed)
+        self.context.active_map.activate(submap, State.TRACKING)
+        return None
 
-    def _take_back(self, youth: ProvisionalMap) -> None:
-        """A start that later frames contradict: its frames wait for another one."""
-        self.back.waiting.add(*youth.views)
-        self.parts.mapper.adjusting.drop()
-        self.parts.memory.remove(youth.world.map.keys)
-        self.worlds.forget(youth.world)
-        self.youth = None
+    def _discard(self, provisional: ProvisionalMap) -> None:
+        """Remove a submap that later frames contradict; its frames are unposed again."""
+        self.backward.unposed.add(*provisional.views)
+        self.context.mapper.adjustment.drop()
+        self.context.loop_closer.remove(provisional.submap.map.keys)
+        self.atlas.remove(provisional.submap)
+        self.provisional = None
 
-    def _replace(self, youth: ProvisionalMap) -> bool:
-        """Begin anew with the first and the last frame of a young world, if these contradict it."""
-        parts = self.parts
-        with parts.clock("initialization"):
-            start = youth.rival(parts.camera, parts.config, parts.matcher)
-            replaced = start is not None and not self._begin(start, youth.views)
-        if replaced:
-            parts.foreign.forget_last()  # its pose was one of the map before
-        return replaced
+    def _replace_if_contradicted(self, provisional: ProvisionalMap) -> bool:
+        """Initialize from the first and the last frame of a provisional map, if they contradict it."""
+        context = self.context
+        with context.clock("initialization"):
+            start = provisional.find_contradicting_initialization(
+                context.camera, context.config, context.matcher
+            )
+            is_replaced = start is not None and not self._create(start, provisional.views)
+        if is_replaced:
+            context.non_static_filter.forget_last()  # its pose was one of the discarded map
+        return is_replaced
 
 
 class KeyframeActions:
-    """Looks back from keyframes. To be called while nobody holds rows of the map."""
+    """Loop closing, culling and compaction, once the adjustment around a keyframe is applied.
 
-    def __init__(self, parts: SystemContext, mapping: LocalMapping, beginning: InitializationState) -> None:
-        self.parts, self.mapping, self.beginning = parts, mapping, beginning
+    The methods renumber rows of the active map, and may replace it by the submap it is merged into.
+    """
 
-    @property
-    def count(self) -> int:
-        """How many places were recognised so far."""
-        return len(self.parts.memory.recalls)
+    def __init__(
+        self, context: SystemContext, mapping: LocalMapping, initialization: InitializationState
+    ) -> None:
+        self.context, self.mapping, self.initialization = context, mapping, initialization
+        self.active_map = context.active_map
 
-    def apply_adjustment_before_frame(self, world: Submap) -> Submap:
-        """As `apply_pending_adjustment`, before a frame is tracked."""
-        return self.detect_and_close(world) if self.mapping.take_over_first(world) else world
+    def apply_adjustment_before_frame(self) -> None:
+        """Apply an adjustment that is due before the next frame, then detect and close loops."""
+        if self.mapping.apply_adjustment_before_frame(self.active_map.current):
+            self.detect_and_close()
 
-    def apply_pending_adjustment(self, world: Submap, frame: int | None = None) -> Submap:
-        """Take over the adjustment around the newest keyframe when it is due after a frame, or, without one, now.
+    def apply_pending_adjustment(self, frame: int | None = None) -> None:
+        """Apply the pending adjustment if it is due after a frame, or at once if None; detect and close loops."""
+        if self.mapping.apply_adjustment(self.active_map.current, frame):
+            self.detect_and_close()
 
-        Then look back from there.
+    def precheck_loop(self) -> None:
+        """Look for a loop at the newest keyframe while its adjustment is pending.
+
+        Nearly always there is none, which saves the search in the frame in which the adjustment is applied.
         """
-        return self.detect_and_close(world) if self.mapping.take_over(world, frame) else world
+        slam_map, loop_closer = self.active_map.current.map, self.context.loop_closer
+        keyframe = slam_map.num_keyframes - 1
+        checked = loop_closer.loop_precheck
+        was_checked = checked is not None and checked[0] == slam_map.key(keyframe)
+        if self.mapping.adjustment.is_pending and not was_checked:
+            with self.context.clock("loops"):
+                loop_closer.precheck(self.active_map.current, keyframe)
 
-    def precheck_loop(self, world: Submap) -> None:
-        """Ask whether the newest keyframe's place looks known while the adjustment around it is waited for.
+    def detect_and_close(self) -> None:
+        """Detect and close a loop at the newest keyframe; cull keyframes and compact the map."""
+        self._detect_loop()
+        self._cull_and_compact(self.active_map.current)
 
-        Nearly always it does not, and nothing is left to be asked in the frame in which the adjustment is taken over.
-        """
-        memory, keyframe = self.parts.memory, world.map.num_keyframes - 1
-        was_asked = memory.looks_known is not None and memory.looks_known[0] == world.map.key(keyframe)
-        if self.mapping.adjusting and not was_asked:
-            with self.parts.clock("loops"):
-                memory.look_ahead(world, keyframe)
-
-    def detect_and_close(self, world: Submap) -> Submap:
-        """Recognise the newest keyframe's place, and let go of what the map can do without.
-
-        Returns the world that is followed from now on: another one where two were joined.
-        """
-        world = self._detect_loop(world)
-        self._cull_and_compact(world)
-        return world
-
-    def _detect_loop(self, world: Submap) -> Submap:
-        """Has the newest keyframe's place been seen before? Then the loop is closed, or two worlds become one."""
-        parts, newest = self.parts, world.map.num_keyframes - 1
-        with parts.clock("loops"):
-            found = parts.memory.recognize(world, newest)
+    def _detect_loop(self) -> None:
+        """Close a loop at the newest keyframe, or merge two submaps, if its place was seen before."""
+        context, submap = self.context, self.active_map.current
+        with context.clock("loops"):
+            found = context.loop_closer.detect(submap, submap.map.num_keyframes - 1)
             if found is None:
-                return world
+                return
             if not found.is_loop:
-                self.beginning.confirm_map()
-            world, keyframe = parts.memory.take_up(found)
-            parts.here.world = world
-            parts.tracker.follow(world, keyframe)
-            parts.foreign.forget_last()  # its pose was one of the map before
-        return world
+                self.initialization.confirm_map()
+            submap, keyframe = context.loop_closer.close(found)
+            self.active_map.replace(submap)
+            context.tracker.reset_to_keyframe(submap, keyframe)
+            context.non_static_filter.forget_last()  # its pose was one of the map before
 
-    def _cull_and_compact(self, world: Submap) -> None:
-        """Let go of what the map can do without."""
-        keys = world.map.keys
-        renumbering = self.parts.mapper.tidy(world)
-        if renumbering is not None:
-            self.parts.memory.remove(keys[renumbering.keyframes < 0])
+    def _cull_and_compact(self, submap: Submap) -> None:
+        keys = submap.map.keys
+        remap = self.context.mapper.cull_and_compact(submap)
+        if remap is not None:
+            self.context.loop_closer.remove(keys[remap.keyframes < 0])
 
 
 class LostState:
-    """Looks for a world to follow; frames wait until there is a pose for them."""
+    """Looks for a submap to track the camera in; frames are kept as unposed until there is one."""
 
-    def __init__(self, parts: SystemContext, beginning: InitializationState, back: TrackingBack) -> None:
-        self.parts, self.beginning, self.back = parts, beginning, back
-        self.relocalizer = Relocalizer(parts.tracker, parts.config)
-        self.lost_for = 0  # frames
+    def __init__(
+        self, context: SystemContext, initialization: InitializationState, backward: BackwardTracking
+    ) -> None:
+        self.context, self.initialization, self.backward = context, initialization, backward
+        self.relocalizer = Relocalizer(context.tracker, context.config)
+        self.num_frames = 0  # since the camera was lost
 
-    def seek(self) -> None:
-        """Nothing is followed any more."""
-        parts, here = self.parts, self.parts.here
-        here.world = None
-        self.beginning.seek()
-        parts.probation.release()
-        parts.foreign.forget_last()
-        self.lost_for = 0
-        here.state = State.LOST if len(parts.session.worlds) else State.INITIALIZING
+    def enter(self) -> None:
+        """Stop tracking in the active map."""
+        context = self.context
+        context.active_map.deactivate(State.LOST if len(context.session.atlas) else State.INITIALIZING)
+        self.initialization.restart()
+        context.confirmation.confirm()
+        context.non_static_filter.forget_last()
+        self.num_frames = 0
 
-    def find(self, view: FrameFeatures) -> Outcome:
-        """Relocalise the frame, or begin a world with it; it waits where that cannot be done."""
-        parts = self.parts
-        self.lost_for += 1
-        if len(parts.session.worlds):
-            with parts.clock("relocalization"):
-                found = self.relocalizer.locate(view, parts.memory.likely(view))
+    def step(self, view: FrameFeatures) -> FrameOutcome:
+        """Relocalize the frame, or initialize a new submap with it."""
+        context, has_submaps = self.context, len(self.context.session.atlas) > 0
+        self.num_frames += 1
+        if has_submaps:
+            with context.clock("relocalization"):
+                found = self.relocalizer.locate(view, context.loop_closer.query(view))
             if found is not None:
-                return self._return(view, *found)
-        self.back.waiting.add(view)
-        patient = (
-            self.lost_for <= parts.config.relocalization.frames_before_new_submap or not parts.session.mapping
-        )
-        if len(parts.session.worlds) and patient:
-            return Outcome(Reason.LOST)
-        reason = self.beginning.step(view)
-        return Outcome(reason) if reason else Outcome(Reason.STARTED, parts.here.world, is_keyframe=True)
+                return self._on_relocalized(view, *found)
+        self.backward.unposed.add(view)
+        waits = self.num_frames <= context.config.relocalization.frames_before_new_submap
+        if has_submaps and (waits or not context.session.mapping):
+            return FrameOutcome(Reason.LOST)
+        rejection = self.initialization.step(view)
+        if rejection:
+            return FrameOutcome(str(rejection))
+        return FrameOutcome(Reason.STARTED, context.active_map.submap, is_keyframe=True)
 
-    def _return(self, view: FrameFeatures, world: Submap, tracked: PoseEstimate) -> Outcome:
-        """Go on in a world that was recognised; the next frames have to confirm it."""
-        parts = self.parts
-        parts.tracker.start_at(world, view, tracked)
-        parts.here.world, parts.here.state = world, State.UNCERTAIN
-        parts.probation.come_back(view, tracked, world.track)
-        return Outcome(Reason.FOUND_AGAIN, world, tracked)
+    def _on_relocalized(self, view: FrameFeatures, submap: Submap, estimate: PoseEstimate) -> FrameOutcome:
+        """Track in the submap from here; the next frames have to confirm the pose."""
+        context = self.context
+        context.tracker.start_at_estimate(submap, view, estimate)
+        context.active_map.activate(submap, State.UNCERTAIN)
+        context.confirmation.start_after_relocalization(view, estimate, submap.tracking)
+        return FrameOutcome(Reason.FOUND_AGAIN, submap, estimate)
 
 
 class StateMachine:
-    """Follows the camera through a world, frame by frame."""
+    """Processes the features of one frame after the other."""
 
-    def __init__(self, parts: SystemContext) -> None:
-        self.parts = parts
-        self.mapping = LocalMapping(parts)
-        self.on_trial = TentativeMapping(parts, self.mapping)
-        self.back = TrackingBack(parts, self.mapping)
-        self.beginning = InitializationState(parts, self.back)
-        self.loop_closing = KeyframeActions(parts, self.mapping, self.beginning)
-        self.finding = LostState(parts, self.beginning, self.back)
+    def __init__(self, context: SystemContext) -> None:
+        self.context, self.active_map = context, context.active_map
+        self.mapping = LocalMapping(context)
+        self.tentative = TentativeMapping(context, self.mapping)
+        self.backward = BackwardTracking(context, self.mapping)
+        self.initialization = InitializationState(context, self.backward)
+        self.keyframe_actions = KeyframeActions(context, self.mapping, self.initialization)
+        self.lost = LostState(context, self.initialization, self.backward)
 
-    def step(self, view: FrameFeatures) -> Outcome:
-        """Process the features of one frame: track the active map, or look for one."""
-        world = self.parts.here.world
-        return self.finding.find(view) if world is None else self.follow(world, view)
+    def relocalize_or_initialize(self, view: FrameFeatures) -> FrameOutcome:
+        """Look for a submap to track in, without an active one."""
+        return self.lost.step(view)
 
-    def follow(self, world: Submap, view: FrameFeatures) -> Outcome:
-        """Track the frame; what is doubtful is held back until later frames confirm it."""
-        parts = self.parts
-        self.mapping.begin_adjusting()
-        world = self.loop_closing.apply_adjustment_before_frame(world)
-        with parts.clock("tracking"):
-            expected = None if world.track.velocity is None else parts.tracker.predict(world)
-            tracked = parts.tracker.track(world, view, is_sure=not parts.probation)
-        if tracked is None:
-            return self._on_lost(world, view)
-        unsound = why_unsound(tracked, expected, parts.config.pose_validation)
-        doubt = unsound or why_strange(tracked, world.track, parts.config.pose_validation)
-        moves = parts.foreign.moves(tracked) if not doubt else NOTHING
-        if doubt or moves.is_doubt or parts.probation:
-            if not unsound and not moves.is_doubt and self._wants_map(doubt):
-                self.on_trial.take(world, view, tracked)
-            return self._on_uncertain(world, view, tracked, doubt or (moves.words if moves.is_doubt else ""))
-        return self._on_confident(world, view, tracked, moves.words)
+    def track(self, view: FrameFeatures) -> FrameOutcome:
+        """Track the frame; a doubtful pose is held back until later frames confirm it."""
+        context = self.context
+        self.mapping.start_adjustment()
+        self.keyframe_actions.apply_adjustment_before_frame()
+        submap = self.active_map.current
+        with context.clock("tracking"):
+            expected = None if submap.tracking.velocity is None else context.tracker.predict(submap)
+            is_sure = not context.confirmation.is_holding
+            estimate = context.tracker.track(submap, view, is_sure=is_sure)
+        if estimate is None:
+            return self._on_lost(view)
+        bad_quality = check_pose_quality(estimate, expected, context.config.pose_validation)
+        doubt = bad_quality or check_map_agreement(estimate, submap.tracking, context.config.pose_validation)
+        motion = NOTHING if doubt else context.non_static_filter.detect_independent_motion(estimate)
+        if not (doubt or motion.rejection or context.confirmation.is_holding):
+            return self._on_confident(view, estimate, motion.note)
+        if not bad_quality and not motion.rejection and self._maps_tentatively(doubt):
+            self.tentative.add_keyframe(submap, view, estimate)
+        return self._on_uncertain(view, estimate, doubt or motion.rejection)
 
     def finalize(self) -> None:
-        """The last frame has come: what is held back keeps its pose, uncertain as it is."""
-        here = self.parts.here
-        if here.world is not None:
-            self._keep_uncertain(here.world)
-            self.loop_closing.apply_pending_adjustment(here.world)
-        self.beginning.confirm_map()
+        """End the session: frames that are held back keep their poses, uncertain as they are."""
+        if self.active_map.submap is not None:
+            self._keep_uncertain()
+            self.keyframe_actions.apply_pending_adjustment()
+        self.initialization.confirm_map()
 
     def confirm_map(self) -> None:
-        """Believe a young world as it is, with what was mapped on trial: the way back adds to the same map."""
-        world = self.parts.here.world
-        if world is not None and self.beginning.youth is not None:
-            self.on_trial.keep(world)
-            self.mapping.take_over(world)
-        self.beginning.confirm_map()
+        """Confirm a provisional map with its tentative keyframes: backward tracking adds to the same map."""
+        if self.active_map.submap is not None and self.initialization.provisional is not None:
+            self.tentative.commit(self.active_map.current)
+            self.mapping.apply_adjustment(self.active_map.current)
+        self.initialization.confirm_map()
 
-    def _on_confident(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate, moves: str) -> Outcome:
-        """A frame that is believed: map it, look back, let a young world grow, follow the next ones from here.
+    def _on_confident(self, view: FrameFeatures, estimate: PoseEstimate, motion: str) -> FrameOutcome:
+        """Map the frame, close loops, remove static overlays, confirm a provisional map.
 
-        moves: what was said of what moves against the scene
+        motion: description of what moves independently of the scene
         """
-        parts, mapping, closing = self.parts, self.mapping, self.loop_closing
-        parts.here.state = State.TRACKING
-        why = mapping.take(world, view, tracked, self._delay(world))
+        context, mapping, actions = self.context, self.mapping, self.keyframe_actions
+        self.active_map.set_state(State.TRACKING)
+        why = mapping.add_frame(self.active_map.current, view, estimate, self._apply_at())
         is_keyframe = bool(why)
-        if is_keyframe and not mapping.adjusting:
-            world = closing.detect_and_close(world)
-        stays = parts.session.mapping and parts.foreign.stays(world.T_cw, tracked.depth)
-        if stays:
-            world = closing.apply_pending_adjustment(world)
-            drop_covered(world, parts.foreign.stillness.covers)
-        if self.beginning.is_almost_confirmed:
-            world = closing.apply_pending_adjustment(world)
-        if self.beginning.grow(view):
-            return Outcome(Reason.STARTED_ANEW, parts.here.world, is_keyframe=True)
-        if not is_keyframe and not mapping.is_due(view.index):
-            closing.precheck_loop(world)
+        if is_keyframe and not mapping.adjustment.is_pending:
+            actions.detect_and_close()
+        has_new_overlay = context.session.mapping and context.non_static_filter.update_overlay(
+            self.active_map.current.T_cw, estimate.depth
+        )
+        if has_new_overlay:
+            actions.apply_pending_adjustment()
+            remove_masked_observations(
+                self.active_map.current, context.non_static_filter.static_overlay.covers
+            )
+        if self.initialization.is_almost_confirmed:
+            actions.apply_pending_adjustment()
+        if self.initialization.add_frame(view):
+            return FrameOutcome(Reason.STARTED_ANEW, self.active_map.submap, is_keyframe=True)
+        if not is_keyframe and not mapping.adjustment.is_due(view.index):
+            actions.precheck_loop()
         if not is_keyframe:
-            world = closing.apply_pending_adjustment(world, view.index)
-        why = "; ".join(filter(None, [why, Reason.STATIC_OVERLAY if stays else "", moves]))
-        return Outcome(why, world, tracked, is_keyframe)
+            actions.apply_pending_adjustment(view.index)
+        why = "; ".join(filter(None, [why, Reason.STATIC_OVERLAY if has_new_overlay else "", motion]))
+        return FrameOutcome(why, self.active_map.submap, estimate, is_keyframe)
 
-    def _delay(self, world: Submap) -> int | None:
-        """Frames that are tracked before a keyframe's adjustment is taken over: none while each moves the whole map."""
-        settings = self.parts.config.bundle_adjustment
+    def _apply_at(self) -> ApplyAt:
+        """When the adjustment around a new keyframe is applied: soon, as long as it moves the whole map."""
+        settings = self.context.config.bundle_adjustment
         if settings.delay_frames == 0:
-            return None
-        is_small = world.map.num_keyframes < settings.local_window
-        return 0 if is_small or self.beginning.youth is not None else settings.delay_frames
+            return ApplyAt.NOW
+        is_small = self.active_map.current.map.num_keyframes < settings.local_window
+        if is_small or self.initialization.provisional is not None:
+            return ApplyAt.BEFORE_NEXT_FRAME
+        return ApplyAt.AFTER_DELAY
 
-    def _wants_map(self, doubt: str) -> bool:
-        """Whether frames that are held back are to be mapped: not what came back and is certain so far."""
-        return bool(doubt or self.on_trial) and not self.parts.probation.came_back
+    def _maps_tentatively(self, doubt: Rejection | None) -> bool:
+        """Whether to map frames that are held back: not a relocalized camera whose pose is not in doubt."""
+        return bool(doubt or self.tentative.has_keyframes) and not self.context.confirmation.is_relocalized
 
-    def _on_uncertain(self, world: Submap, view: FrameFeatures, tracked: PoseEstimate, doubt: str) -> Outcome:
-        """Do not build on a pose yet: enough certain frames in a row confirm what was held back."""
-        parts, probation = self.parts, self.parts.probation
-        probation.hold(view, tracked, world.track, doubt, bool(self.on_trial))
-        if probation:
-            if probation.is_full:
-                self._keep_uncertain(world)
-            parts.here.state = State.UNCERTAIN
-            return Outcome(doubt or probation.reason, world, tracked)
-        self.on_trial.keep(world)
-        came_back, held = probation.came_back, probation.release()
-        for earlier in held:
-            parts.tracker.expect(world.map, earlier[1])
-            parts.tracker.vouch(world.map, earlier[1])
-            world.history.add(*earlier)
-        if came_back:
-            first, located, _, _ = held[0]
-            self.back.from_frame(world, first, located)
-        parts.here.state = State.TRACKING
-        return Outcome("", world, tracked)
+    def _on_uncertain(
+        self, view: FrameFeatures, estimate: PoseEstimate, doubt: Rejection | None
+    ) -> FrameOutcome:
+        """Hold the frame back; enough frames in a row without doubt confirm all that are held back."""
+        submap, confirmation = self.active_map.current, self.context.confirmation
+        confirmation.push(view, estimate, submap.tracking, doubt, self.tentative.has_keyframes)
+        if confirmation.is_holding:
+            if confirmation.is_full:
+                self._keep_uncertain()
+            self.active_map.set_state(State.UNCERTAIN)
+            return FrameOutcome(str(doubt or confirmation.reason), submap, estimate)
+        self.tentative.commit(submap)
+        was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
+        self.mapping.add_pending_frames(submap, frames)
+        if was_relocalized:
+            first, first_estimate, _, _ = frames[0]
+            self.backward.from_frame(submap, first, first_estimate)
+        self.active_map.set_state(State.TRACKING)
+        return FrameOutcome("", submap, estimate)
 
-    def _keep_uncertain(self, world: Submap) -> None:
-        """What is held back keeps its pose, uncertain as it is, and so does what was mapped of it."""
-        self.on_trial.keep(world)
-        for held in self.parts.probation.hand_over():
-            world.history.add(*held)
+    def _keep_uncertain(self) -> None:
+        """Keep the poses of frames that are held back, and their tentative keyframes."""
+        submap = self.active_map.current
+        self.tentative.commit(submap)
+        for pending in self.context.confirmation.pop_all():
+            submap.posed_frames.add(*pending)
 
-    def _on_lost(self, world: Submap, view: FrameFeatures) -> Outcome:
-        """No pose: what was held back waits again, and a world that was hardly begun is taken back."""
-        self.loop_closing.apply_pending_adjustment(world)
-        self.on_trial.take_back(world)
-        self.back.waiting.add(*self.parts.probation.views(), view)
-        taken_back = self.beginning.lose()
-        self.finding.seek()
-        return Outcome(Reason.LOST_AT_START if taken_back else Reason.LOST)
+    def _on_lost(self, view: FrameFeatures) -> FrameOutcome:
+        """Frames that are held back are unposed again; a provisional map is discarded."""
+        self.keyframe_actions.apply_pending_adjustment()
+        self.tentative.rollback(self.active_map.current)
+        self.backward.unposed.add(*self.context.confirmation.views(), view)
+        is_discarded = self.initialization.on_lost()
+        self.lost.enter()
+        return FrameOutcome(Reason.LOST_AT_START if is_discarded else Reason.LOST)
