@@ -54,10 +54,10 @@ def train(
     loader = DataLoader(clips, batch_sampler=batches, collate_fn=collate)
     for step, clip in zip(training, loader, strict=False):
         poses = module(clip.images, clip.camera, graphs(clip))
-        loss, failures = clip_loss(poses, clip.T_cw, relative_ate, on_failure=FAILED)
+        loss, failure_rate = clip_loss(poses, clip.T_cw, relative_ate, on_failure=FAILED)
         training.descend(loss)
         if log is not None:
-            log("failures", failures, step)
+            log("failure_rate", failure_rate, step)
         if rank == 0 and (training.step % save_every == 0 or training.step == steps):
             training.save(checkpoint)
     return training

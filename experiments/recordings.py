@@ -1,4 +1,4 @@
-"""Whole runs over all real recordings, with something changed beside the default: ratios of errors with intervals."""
+"""Whole runs over all real recordings, a change compared with the default: ratios of errors with intervals."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import torch
 
-from experiments.common import DATA_DIR, add_engine, at_hand, figures_of_all, row_of, table
+from experiments.common import DATA_DIR, add_engine, available, metrics_of_runs, row_of, table
 from torchslam.batch import Columns, Row
 from torchslam.batch.result_store import RUNS
 from torchslam.io.results import read_metrics
 
 SEEDS = (0, 1, 2)
 DEFAULT = "default"
-KEPT_ORB = ("features.kind=experiments.kept_features:ORB",)
+KEPT_ORB = ("features.kind=experiments.cached_features:ORB",)
 """The default's features, found once: the same bytes."""
 ENOUGH = 0.9
 """Of the frames that the default poses: with fewer an error is that of another path, and not compared."""
@@ -61,15 +61,15 @@ units are arbitrary."""
 
 
 def recordings(labels: Sequence[str]) -> dict[str, Recording]:
-    """Those of the labels, all if there are none, whose data are at hand."""
+    """The labels (all if none are given) whose data are available."""
     chosen = {label: RECORDINGS[label] for label in labels or RECORDINGS}
-    there = set(at_hand(dict.fromkeys(one.name for one in chosen.values())))
+    there = set(available(dict.fromkeys(one.name for one in chosen.values())))
     return {label: one for label, one in chosen.items() if one.name in there}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to: share of frames with a pose, and ATE, None without a map."""
+    """The result of a run: fraction of posed frames, and ATE, None without a map."""
 
     posed: float
     ate: float | None
@@ -84,40 +84,40 @@ Outcomes = dict[tuple[str, str, int], Outcome]
 
 
 Overrides = Callable[[str, str, int], Sequence[str]]
-"""The settings of a run by recording, arm and seed, its seed apart."""
+"""Maps recording, arm and seed to the settings of a run, without the seed."""
 
 
 def add_choices(parser: argparse.ArgumentParser, arms: Sequence[str]) -> None:
-    """Which recordings, arms and seeds are run; runs of all experiments lie together: the default's are made once."""
+    """Add the choice of recordings, arms and seeds; all experiments share a folder, so the default is run once."""
     parser.add_argument("labels", nargs="*", choices=[[], *RECORDINGS], help="recordings; all by default")
     parser.add_argument("--arms", nargs="*", choices=arms, default=list(arms))
     parser.add_argument("--seeds", nargs="*", type=int, default=list(SEEDS))
-    parser.add_argument("--kept", action="store_true", help="no run: a table of those that were made before")
+    parser.add_argument("--cached", action="store_true", help="only a table of the existing runs")
     parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "recordings")
 
 
 def outcomes_of(options: argparse.Namespace, overrides: Overrides) -> Outcomes:
-    """The runs that the options of `add_choices` name, made unless they are there. Raises SystemExit for an error."""
+    """Run what the options of `add_choices` select, or reuse it. Raises SystemExit for an error."""
     cases = [
         (label, arm, seed)
         for seed in options.seeds
         for arm in options.arms
         for label in recordings(options.labels)
     ]
-    if options.kept:
+    if options.cached:
         folders = {case: options.output / RUNS / RECORDINGS[case[0]].row(*case, ()).name for case in cases}
         return {case: Outcome.of(read_metrics(path)) for case, path in folders.items() if path.is_dir()}
     rows = [RECORDINGS[case[0]].row(*case, overrides(*case)) for case in cases]
-    figures = figures_of_all(rows, options)
+    figures = metrics_of_runs(rows, options)
     return {case: Outcome.of(found) for case, found in zip(cases, figures, strict=True)}
 
 
-def log_ratios(outcomes: Outcomes, label: str, arm: str, beside: str = DEFAULT) -> dict[int, float]:
+def log_ratios(outcomes: Outcomes, label: str, arm: str, reference: str = DEFAULT) -> dict[int, float]:
     """By seed, the logarithm of an arm's ATE over that of another; without seeds in which too little is posed."""
     found = {}
     for seed in SEEDS:
-        one, other = outcomes.get((label, arm, seed)), outcomes.get((label, beside, seed))
+        one, other = outcomes.get((label, arm, seed)), outcomes.get((label, reference, seed))
         if one is None or other is None or one.ate is None or other.ate is None:
             continue
         if one.posed >= ENOUGH * other.posed:
@@ -159,30 +159,30 @@ def interval(ratios: dict[str, dict[int, float]], kin: dict[str, str], seed: int
 HEADER = ["recording", "arm", "posed, %", "ATE"]
 
 
-def report(outcomes: Outcomes, arms: Sequence[str], beside: str = DEFAULT) -> str:
+def report(outcomes: Outcomes, arms: Sequence[str], reference: str = DEFAULT) -> str:
     """A row for every recording and arm, seed by seed, `-` for one not run, and the geometric means."""
     labels = list(dict.fromkeys(label for label, _, _ in outcomes))
     made = dict.fromkeys((label, arm) for label, arm, _ in outcomes)
-    rows = [_row(outcomes, label, arm, beside) for label in labels for arm in arms if (label, arm) in made]
+    rows = [_row(outcomes, label, arm, reference) for label in labels for arm in arms if (label, arm) in made]
     kin = {label: RECORDINGS[label].kin for label in labels}
     for arm in arms:
-        ratios = {label: log_ratios(outcomes, label, arm, beside) for label in labels}
+        ratios = {label: log_ratios(outcomes, label, arm, reference) for label in labels}
         counted = sum(bool(by_seed) for by_seed in ratios.values())
         low, high = interval(ratios, kin)
         mean = f"**{geometric_mean(ratios):.2f}**"
         if not math.isnan(low):  # of one recording there is none
             mean += f" ({low:.2f} to {high:.2f})"
-        if arm != beside and counted:
+        if arm != reference and counted:
             rows.append([f"geometric mean of {counted}", arm, "", "", mean])
-    return table([*HEADER, f"over {beside}"], rows)
+    return table([*HEADER, f"over {reference}"], rows)
 
 
-def _row(outcomes: Outcomes, label: str, arm: str, beside: str) -> list[str]:
+def _row(outcomes: Outcomes, label: str, arm: str, reference: str) -> list[str]:
     runs = [outcomes.get((label, arm, seed)) for seed in SEEDS]
     posed = " ".join("-" if run is None else f"{100 * run.posed:.0f}" for run in runs)
     ates = " ".join("-" if run is None else _ate(run) for run in runs)
-    ratios = log_ratios(outcomes, label, arm, beside)
-    ratio = "" if arm == beside else f"{geometric_mean({label: ratios}):.2f}" if ratios else "not compared"
+    ratios = log_ratios(outcomes, label, arm, reference)
+    ratio = "" if arm == reference else f"{geometric_mean({label: ratios}):.2f}" if ratios else "not compared"
     return [label, arm, posed, ates, ratio]
 
 

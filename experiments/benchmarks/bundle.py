@@ -1,4 +1,4 @@
-"""A large bundle adjustment with the gradient to all its pixels, beside Ceres, and many small ones at once.
+"""A large bundle adjustment with the gradient to all its pixels, compared with Ceres, and many small ones at once.
 
     python -m experiments.benchmarks.bundle [--output FILE]
 
@@ -62,8 +62,8 @@ def ring(frames: int = 100, points: int = 3500, observations: int = 43_000) -> B
     points_w = torch.stack((radius * around.sin(), height, radius * around.cos()), dim=-1)
     angle = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
     zero = torch.zeros_like(angle)
-    centre = 2 * torch.stack((angle.sin(), 0.1 * (3 * angle).sin(), angle.cos()), dim=-1)
-    T_cw = se3_inverse(rigid(so3_exp(torch.stack((zero, angle, zero), dim=-1)), centre))
+    center = 2 * torch.stack((angle.sin(), 0.1 * (3 * angle).sin(), angle.cos()), dim=-1)
+    T_cw = se3_inverse(rigid(so3_exp(torch.stack((zero, angle, zero), dim=-1)), center))
     return Scene(T_cw, points_w, 0, observations).problem
 
 

@@ -1,4 +1,4 @@
-"""How good and how fast the features and their matching are, beside OpenCV, in one run and on one thread.
+"""Quality and speed of features and matching compared with OpenCV, in one run on one thread.
 
     python -m experiments.benchmarks.features [--data FOLDER] [--output FILE] [--pairs 8]
 
@@ -253,7 +253,7 @@ def main() -> None:
         ]
     text = "\n".join(lines)
     print(text)
-    arguments.output.write_text(f"# Features and matching beside OpenCV\n\n{text}\n")
+    arguments.output.write_text(f"# Features and matching compared with OpenCV\n\n{text}\n")
 
 
 if __name__ == "__main__":

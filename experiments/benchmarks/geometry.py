@@ -1,4 +1,4 @@
-"""How right and how fast the pose estimators are, beside poselib, in one run and on one thread.
+"""Accuracy and speed of the pose estimators compared with poselib, in one run on one thread.
 
     python -m experiments.benchmarks.geometry [--peers FOLDER] [--output FILE] [--problems 60]
 
@@ -174,7 +174,7 @@ def throughput(problems: ModuleType) -> list[str]:
 
 
 def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> str:
-    """One row: medians and means of ours beside the peer's, and their ratios."""
+    """One row: medians and means of ours and the peer's, and their ratios."""
     cells = [f"{len(ours)}"]
     for field, digits in (("rotation", 3), ("translation", 4)):
         mine, peer = ([getattr(errors, field) for errors in group] for group in (ours, theirs))
@@ -219,7 +219,7 @@ def main() -> None:
     torch.set_num_threads(1)
     text = report(load_problems(arguments.peers), arguments.problems)
     print(text)
-    arguments.output.write_text(f"# Pose estimation beside poselib\n\n{text}\n")
+    arguments.output.write_text(f"# Pose estimation compared with poselib\n\n{text}\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How fast and how right pose graph optimisation is, beside GTSAM, in one run and on one thread.
+"""Speed and accuracy of pose graph optimization compared with GTSAM, in one run on one thread.
 
     python -m experiments.benchmarks.pose_graph [--output FILE]
 
@@ -39,14 +39,14 @@ class Problem(NamedTuple):
     S_cw: Tensor
 
 
-def loop(nodes: int, neighbours: int, seed: int = 0) -> Problem:
-    """A circular walk, every node joined with the next `neighbours`, the last ones with the first."""
+def loop(nodes: int, neighbors: int, seed: int = 0) -> Problem:
+    """A circular walk, every node joined with the next `neighbors`, the last ones with the first."""
     generator = torch.Generator().manual_seed(seed)
     angle = torch.arange(nodes, dtype=torch.float64) * (2 * math.pi / nodes)
     zero = torch.zeros_like(angle)
-    centre = RADIUS * torch.stack((angle.sin(), 0.02 * (5 * angle).sin(), angle.cos()), dim=-1)
-    S_cw = sim3_inverse(rigid(so3_exp(torch.stack((zero, angle, zero), dim=-1)), centre))
-    pairs = [(k, k + d) for d in range(1, neighbours + 1) for k in range(nodes - d)]
+    center = RADIUS * torch.stack((angle.sin(), 0.02 * (5 * angle).sin(), angle.cos()), dim=-1)
+    S_cw = sim3_inverse(rigid(so3_exp(torch.stack((zero, angle, zero), dim=-1)), center))
+    pairs = [(k, k + d) for d in range(1, neighbors + 1) for k in range(nodes - d)]
     closures = [(nodes - 1 - k, k) for k in range(CLOSURES)]
     edges = torch.tensor(pairs + closures)
     noise = SIGMAS * torch.randn(len(edges), 7, generator=generator, dtype=torch.float64)
@@ -67,13 +67,13 @@ def cost(graph: PoseGraph, S_cw: Tensor) -> float:
 
 
 def drift(problem: Problem, S_cw: Tensor) -> float:
-    """Root mean square distance of the camera centres from the truth, in units of the truth."""
+    """Root mean square distance of the camera centers from the truth, in units of the truth."""
     found, truth = (sim3_inverse(S)[:, :3, 3] for S in (S_cw, problem.S_cw))
     return float((found - truth).square().sum(-1).mean().sqrt())
 
 
 class Peer(NamedTuple):
-    """GTSAM's answer (K, 4, 4), its time in the optimiser and its iterations."""
+    """GTSAM's answer (K, 4, 4), its time in the optimizer and its iterations."""
 
     S_cw: Tensor
     solve_ms: float
@@ -108,9 +108,9 @@ def gtsam_solve(graph: PoseGraph) -> Peer:
     return Peer(sim3_inverse(S_wc / S_wc[:, 3:, 3:]), elapsed, optimizer.iterations())
 
 
-def row(nodes: int, neighbours: int, repeats: int) -> list[str]:
+def row(nodes: int, neighbors: int, repeats: int) -> list[str]:
     """One line of the table."""
-    problem = loop(nodes, neighbours)
+    problem = loop(nodes, neighbors)
     graph = problem.graph
     S_ji = graph.S_ji.clone().requires_grad_()
 
@@ -174,7 +174,7 @@ def main() -> None:
     text = (
         "# Pose graphs\n\nA circular walk of radius 20 whose odometry is noisy and halves the scale; the last ten "
         "nodes meet the first. Similarities, least squares, float64, one thread, median CPU time of the process, "
-        "GTSAM measured in turns with ours, both to a relative decrease of 1e-8; error: of the camera centres, root "
+        "GTSAM measured in turns with ours, both to a relative decrease of 1e-8; error: of the camera centers, root "
         "mean square.\n\n"
         "    python -m experiments.benchmarks.pose_graph\n\n"
         f"{table(header, rows)}\n"

@@ -1,4 +1,4 @@
-"""The fixed problems that peers are measured on; they lie beside the repository."""
+"""The fixed problems for measuring peers, in a folder next to the repository."""
 
 from __future__ import annotations
 

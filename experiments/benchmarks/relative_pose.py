@@ -1,4 +1,4 @@
-"""Relative pose of real pairs of images, by threshold, beside poselib and OpenCV's MAGSAC, in one run, on one thread.
+"""Relative pose of real pairs of images, by threshold, compared with poselib and OpenCV's MAGSAC.
 
     python -m experiments.benchmarks.relative_pose [--data FOLDER] [--output FILE] [--pairs 60] [--seeds 3]
 
@@ -41,7 +41,7 @@ from torchslam.geometry.relative_pose_search import Model
 from torchslam.types import Features
 
 HERE = Path(__file__).parent
-# Sequences with the least baseline in metres whose direction the ground truth tells, to some degrees: several times
+# Sequences with the least baseline in meters whose direction the ground truth determines to some degrees: several times
 # what it is good to.
 SEQUENCES = {"redkitchen": 0.1, "kitti07": 0.5, "machine_hall": 0.03, "fr2_desk_20": 0.05, "shelf_bin": 0.02}
 GAPS_S = (0.2, 0.4, 0.6, 0.8, 1.0)

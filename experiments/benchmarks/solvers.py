@@ -1,4 +1,4 @@
-"""How fast and how right the solvers are, beside pycolmap (Ceres), in one run and on one thread.
+"""Speed and accuracy of the solvers compared with pycolmap (Ceres), in one run on one thread.
 
     python -m experiments.benchmarks.solvers [--peers FOLDER] [--output FILE]
 
@@ -25,7 +25,7 @@ from torchslam.geometry.robust import Kernel
 from torchslam.optim import BundleProblem, bundle_adjust, refine_pose
 
 HERE = Path(__file__).parent
-FOCAL, CENTRE, SIZE = 525.0, (319.5, 239.5), (640, 480)
+FOCAL, CENTER, SIZE = 525.0, (319.5, 239.5), (640, 480)
 
 
 class Row(NamedTuple):
@@ -45,7 +45,7 @@ class Peer(NamedTuple):
 
 
 def camera() -> Camera:
-    return Camera.pinhole(FOCAL, FOCAL, *CENTRE, size=SIZE)
+    return Camera.pinhole(FOCAL, FOCAL, *CENTER, size=SIZE)
 
 
 def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
@@ -204,7 +204,7 @@ def colmap_solve(problem: BundleProblem) -> Peer:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
-    model = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[FOCAL, FOCAL, *CENTRE])
+    model = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[FOCAL, FOCAL, *CENTER])
     model.camera_id = 1
     reconstruction.add_camera_with_trivial_rig(model)
     rows = [[] for _ in problem.T_cw]  # type: list[list[int]]

@@ -21,7 +21,7 @@ def arms(folder: Path) -> dict[str, tuple[str, ...]]:
         if not weights.is_file():
             print(f"{name}: no {weights}, left out")
             continue
-        front_end = (f"features.kind=experiments.kept_features:{part}", f'features.weights="{weights}"')
+        front_end = (f"features.kind=experiments.cached_features:{part}", f'features.weights="{weights}"')
         found |= {name + words: front_end + matcher for words, matcher in MATCHERS.items()}
     return found
 

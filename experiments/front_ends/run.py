@@ -8,8 +8,8 @@ from pathlib import Path
 from experiments.common import (
     DATA_DIR,
     add_engine,
-    at_hand,
-    figures_of_all,
+    available,
+    metrics_of_runs,
     row_of,
     table,
     write_between,
@@ -34,10 +34,10 @@ def main() -> None:
         for kind in arguments.front_ends
         if (found := overrides(kind, arguments.weights)) is not None
     }
-    cases = [(name, kind) for name in at_hand(arguments.names) for kind in settings]
+    cases = [(name, kind) for name in available(arguments.names) for kind in settings]
     runs = [row_of(name, kind, overrides=settings[kind]) for name, kind in cases]
     rows = []
-    for (name, kind), result in zip(cases, figures_of_all(runs, arguments), strict=True):
+    for (name, kind), result in zip(cases, metrics_of_runs(runs, arguments), strict=True):
         rows.append(row(name, kind, result))
         print(*rows[-1], sep="\t", flush=True)
     text = table(["sequence", "front end", "posed", "ATE (m)", "features (ms)", "frames/s"], rows)

@@ -1,10 +1,10 @@
-"""Are the gradients of clips those of a minimum, and what tells where they are not?
+"""Are the gradients of clips those of a minimum, and what indicates when they are not?
 
     python -m experiments.gradients.clips [--output FILE]
 
-Clips of 8 frames with 1000 ORB keypoints of all sequences, whose keypoints move by half a pixel at random as learning
-would move them, are posed with more and more iterations. The reference goes on until a step promises 1e-16 of the cost,
-and is itself compared with central differences. Prints a table and writes it to FILE.
+Clips of 8 frames with 1000 ORB keypoints of all sequences, whose keypoints move by half a pixel at random as training
+would move them, are posed with increasing numbers of iterations. The reference iterates until a step predicts a
+relative decrease of 1e-16, and is itself compared with central differences. Prints a table and writes it to FILE.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.clips import MOVE_PX, Looked, build_graph
+from experiments.benchmarks.clips import MOVE_PX, PreparedClip, prepare
 from experiments.common import parser_of, sequences, table
 from torchslam import ORB, ClipGraph, ClipPoses, ClipSLAM, Features
-from torchslam.learning import clip as clips
-from torchslam.learning.clips import Clips
+from torchslam.learning import clip_slam as clip_module
+from torchslam.learning.dataset import Clips
 from torchslam.learning.losses import relative_ate
 
 HERE = Path(__file__).parent
@@ -60,19 +60,19 @@ def _deviation(row: int, poses: ClipPoses) -> Tensor:
 class Moved:
     """Clips whose keypoints were moved: features in float64, cameras (B, K)."""
 
-    looked: Sequence[Looked]
+    prepared: Sequence[PreparedClip]
     features: Sequence[Features]
     cameras: Tensor
 
     @classmethod
-    def of(cls, looked: Sequence[Looked], seed: int) -> Moved:
+    def of(cls, prepared: Sequence[PreparedClip], seed: int) -> Moved:
         generator = torch.Generator().manual_seed(seed)
         features = []
-        for each in looked:
+        for each in prepared:
             keypoints = each.features.keypoints
             noise = torch.randn(keypoints.shape, generator=generator)
             features.append(replace(each.features, keypoints=(keypoints + MOVE_PX * noise).double()))
-        return cls(looked, features, torch.stack([each.clip.camera.params for each in looked]))
+        return cls(prepared, features, torch.stack([each.clip.camera.params for each in prepared]))
 
     def by(self, keypoints: Sequence[Tensor], cameras: Tensor) -> Moved:
         """Moved on by (T, N, 2) of each clip, and (B, K)."""
@@ -84,14 +84,14 @@ class Moved:
 
     def losses(self, clip_slam: ClipSLAM, together: bool) -> tuple[Tensor, ClipPoses]:
         """The relative ATE (B,) of each clip, posed in one call or in one each; poses of one call, or the last."""
-        truths = torch.stack([each.clip.T_cw for each in self.looked])
-        camera = self.looked[0].clip.camera.with_params(self.cameras)
+        truths = torch.stack([each.clip.T_cw for each in self.prepared])
+        camera = self.prepared[0].clip.camera.with_params(self.cameras)
         if together:
-            stacked = ClipGraph.stack([each.graph for each in self.looked])
+            stacked = ClipGraph.stack([each.graph for each in self.prepared])
             poses = clip_slam.pose(stacked, self.features, camera)
             return relative_ate(poses.T_cw, truths, poses.posed), poses
         losses = []
-        for row, (each, features) in enumerate(zip(self.looked, self.features, strict=True)):
+        for row, (each, features) in enumerate(zip(self.prepared, self.features, strict=True)):
             poses = clip_slam.pose(each.graph, features, camera[row])
             losses.append(relative_ate(poses.T_cw, truths[row], poses.posed))
         return torch.stack(losses), poses
@@ -127,7 +127,7 @@ class Moved:
 
 def _limited(iterations: int, tolerance: float) -> AbstractContextManager[object]:
     """Clips posed with other limits than ClipSLAM's."""
-    return patch.multiple(clips, _ITERATIONS=iterations, _TOLERANCE=tolerance)
+    return patch.multiple(clip_module, _ITERATIONS=iterations, _TOLERANCE=tolerance)
 
 
 def apart(one: Posed, other: Posed) -> Tensor:
@@ -193,17 +193,17 @@ def main() -> None:
     differences, count = [], 0
     for sequence in sequences(NAMES):
         chosen = Clips([sequence], per_sequence=CLIPS)
-        looked = [build_graph(clip_slam, chosen[number]) for number in range(len(chosen))]
-        looked = [each for each in looked if each.graph.runs[0] is not None]
-        count += len(looked)
+        prepared = [prepare(clip_slam, chosen[number]) for number in range(len(chosen))]
+        prepared = [each for each in prepared if each.graph.runs[0] is not None]
+        count += len(prepared)
         for seed in range(SEEDS):
-            moved = Moved.of(looked, seed)
+            moved = Moved.of(prepared, seed)
             reference = moved.pose(clip_slam, REFERENCE, together=True)
             assert reference.poses.success.all()
             differences.append(moved.off_differences(clip_slam, reference))
             for limits, parts in found.items():
                 parts.append(Found.of(clip_slam, moved, limits, reference))
-        print(sequence.name, len(looked), "clips", flush=True)
+        print(sequence.name, len(prepared), "clips", flush=True)
     header = ["iterations, tolerance", "at a minimum", "there off by", "one call or many", "elsewhere off by"]
     header += ["one call or many"]
     joined = {limits: Found.join(parts) for limits, parts in found.items()}
@@ -223,9 +223,9 @@ def main() -> None:
         "The reference is off central differences along the gradient by "
         f"{slopes[:, 0].median():.0e} in the median and {slopes[:, 0].max():.0e} at most for keypoints, and by "
         f"{slopes[:, 1].median():.0e} and {slopes[:, 1].max():.0e} for cameras.\n\n"
-        "How well a clip is determined does not tell: after 30 iterations the position of the least certain keyframe "
-        f"has a deviation of {100 * of_there:.2f} % of the median depth, in the median, in clips at a minimum, and of "
-        f"{100 * of_elsewhere:.2f} % in the others; its rank correlation with the error of the gradient is "
+        "How well a clip is determined does not indicate it: after 30 iterations the position of the least certain "
+        f"keyframe has a deviation of {100 * of_there:.2f} % of the median depth, in the median, in clips at a "
+        f"minimum, and of {100 * of_elsewhere:.2f} % in the others; its rank correlation with the gradient error is "
         f"{rank_correlation(before.deviations, before.off):.2f} ("
         f"{rank_correlation(before.deviations[before.there], before.off[before.there]):.2f} among those at a "
         "minimum).\n"

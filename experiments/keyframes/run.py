@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
+from experiments.common import add_engine, available, metrics_of_runs, row_of, table, write_between
 
 NAMES = ("redkitchen", "kitti07", "machine_hall", "shelf_bin")
 FRAMES = 400
@@ -24,10 +24,10 @@ def main() -> None:
     parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "keyframes")
     options = parser.parse_args()
-    cases = [(name, rule) for name in at_hand(options.names) for rule in RULES]
+    cases = [(name, rule) for name in available(options.names) for rule in RULES]
     runs = [row_of(name, rule, overrides=RULES[rule], limit=FRAMES) for name, rule in cases]
     rows = []
-    for (name, rule), found in zip(cases, figures_of_all(runs, options), strict=True):
+    for (name, rule), found in zip(cases, metrics_of_runs(runs, options), strict=True):
         cpu = 1e3 * found["cpu_s"] / found["frames"]
         row = [name, rule, str(found["keyframes"])]
         row += [f"{found['ate_m']:.4f}", f"{found['posed']} of {found['frames']}", f"{cpu:.0f}"]

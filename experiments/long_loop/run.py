@@ -23,11 +23,11 @@ def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:
     """(F, 4, 4) T_cw of a camera that walks an ellipse, looks ahead and outwards, and never quite repeats itself."""
     s = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames_per_lap)
     drift = 0.5 * torch.sin(s / 7.3)
-    centres = torch.stack([10 * torch.cos(s), drift, 6 * torch.sin(s)], -1)
+    centers = torch.stack([10 * torch.cos(s), drift, 6 * torch.sin(s)], -1)
     heading = -(s + 0.4)
     zero = torch.zeros_like(s)
     about_y = torch.stack([zero, heading, zero], -1)
-    return se3_inverse(rigid(so3_exp(about_y), centres))
+    return se3_inverse(rigid(so3_exp(about_y), centers))
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from torchslam.types import Features
 SIZE = (512, 384)
 FOCAL = 0.9 * SIZE[0]  # the camera is unknown: a guess
 THRESHOLD = 2.0  # pixels, wide for a guessed camera
-MIN_MATCHES = 10  # below, RANSAC is not asked
+MIN_MATCHES = 10  # fewer are not verified by RANSAC
 MAX_SAMPLES = 1000
 
 

@@ -1,4 +1,4 @@
-"""Which way of recognizing places should one take, and what does it cost? See README.md."""
+"""Which score finds earlier keyframes of the same place, and what does it cost? See README.md."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:
     """The candidates, by name."""
     rendered = sample(rendered_descriptors(), DESCRIPTORS)
     words = rendered_words(rendered.device)
-    # What an image of redkitchen is like, for words that know one image only.
+    # The words of a single image of redkitchen.
     one = alternatives.first_words(features, len(lookalike_truth()[0]))
     return [
         ("1024 words, tf-idf", lambda: alternatives.bag_of_words(features, words)),

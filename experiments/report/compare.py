@@ -40,7 +40,7 @@ def missing(record: Record, history: Sequence[Record]) -> list[str]:
 
 
 def same_bytes(record: Record, history: Sequence[Record]) -> dict[str, bool]:
-    """Of every sequence that the history knows, whether the trajectory has the bytes that it had last."""
+    """For every sequence in the history, whether the trajectory has the same bytes as last time."""
     found = {}
     for name, figures in record["sequences"].items():
         for earlier in _before(record, history, "sequences", name):

@@ -22,11 +22,11 @@ DOCS = ROOT / "docs"
 COLUMNS = 3
 SIZE = (3.4, 1.9)  # inches, of one sequence
 NEWEST = 60  # reports that are drawn
-"""More would be too narrow to be told apart."""
+"""More would be too narrow to be distinguished."""
 INTRODUCTION = """\
 # History of the figures
 
-`make report` runs every sequence that is at hand with the default configuration, and the quick benchmarks, appends one
+`make report` runs every available sequence with the default configuration, and the quick benchmarks, appends one
 line to `docs/figures/history.jsonl` (commit, machine, versions, figures, hash of the bytes of each trajectory), and
 draws this page anew. It fails where a figure is worse by more than a tenth than the last one: errors and posed frames
 on any machine, times on the same one, when it was quiet both times. `--accept REASON` accepts what got worse.

@@ -1,6 +1,6 @@
 """The benchmarks that take seconds: of each what it costs (`ms`, of the processor) and, where there is one, its error.
 
-The tables beside peers are `make benchmarks`; these are the same problems, without peers.
+`make benchmarks` compares with peers; these are the same problems without peers.
 """
 
 from __future__ import annotations

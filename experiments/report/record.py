@@ -20,7 +20,7 @@ OURS = (
 )  # written by a report itself
 LIBRARIES = ("torchslam", "torch", "numpy", "opencv-python-headless", "opencv-python")
 QUIET = 0.5
-"""Load above which times count for nothing: somebody else is at work on the machine."""
+"""Load above which times are ignored, since other processes use the machine."""
 
 Record = dict[str, Any]
 

@@ -1,6 +1,6 @@
-"""Run all sequences and the quick benchmarks, keep their figures, and say what got worse by a tenth.
+"""Run all sequences and the quick benchmarks, record their metrics, and report what got worse by a tenth.
 
-    python -m experiments.report.run                           # all that are at hand: `make report`
+    python -m experiments.report.run                           # all available: `make report`
     python -m experiments.report.run shelf_bin fr2_desk_20 --no-benchmarks
     python -m experiments.report.run --accept "a stricter gate: fewer wrong poses"
 

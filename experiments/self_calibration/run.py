@@ -1,4 +1,4 @@
-"""Can the system find the camera of its images, and does it know how well? See README.md."""
+"""Can the system find the camera of its images, and how certain is it? See README.md."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import DATA_DIR, add_engine, check, each_case, kept, table, write_between
+from experiments.common import DATA_DIR, add_engine, cached_run, check, run_cases, table, write_between
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
-from torchslam.calibration import FoundCamera, Round, calibrate, estimate_intrinsics
+from torchslam.calibration import CalibrationResult, CalibrationRound, calibrate, estimate_intrinsics
 from torchslam.calibration.find_camera import contradiction
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
@@ -126,7 +126,7 @@ def found(label: str, case: Case) -> list[str]:
     given = None if known is None else SLAM(known.camera, config).run(known)
     reference = case.peer or (math.nan if known is None else float(known.camera.focal))
     off = math.log(float(result.camera.focal) / reference)
-    std = math.nan if result.refined is None else result.refined.std
+    std = math.nan if result.estimate is None else result.estimate.focal_std
     row = [
         label,
         describe(result),
@@ -145,34 +145,35 @@ def found(label: str, case: Case) -> list[str]:
     return row
 
 
-def tell(label: str, done: Round) -> None:
+def tell(label: str, done: CalibrationRound) -> None:
     """A line per round."""
-    refined = done.refined
+    estimate = done.estimate
     asks = "no map"
-    if refined is not None:
-        asks = f"{float(refined.camera.focal):.1f} px, error {refined.std:.2%}, {refined.num_radial} radial terms"
+    if estimate is not None:
+        focal = f"{float(estimate.camera.focal):.1f} px, error {estimate.focal_std:.2%}"
+        asks = f"{focal}, {estimate.num_radial} radial terms"
     print(f"{label}: {done.frames} frames with {float(done.camera.focal):.1f} px -> {asks}", flush=True)
 
 
-def describe(result: FoundCamera) -> str:
+def describe(result: CalibrationResult) -> str:
     """Focal length and the coefficients that were fitted, with their standard errors."""
-    refined = result.refined
-    if refined is None:
+    estimate = result.estimate
+    if estimate is None:
         return "no map"
-    words = [f"{float(result.camera.focal):.1f} ± {float(result.camera.focal) * refined.std:.1f}"]
-    terms = zip(result.camera.params[4:6].tolist(), refined.k_std, strict=False)
+    words = [f"{float(result.camera.focal):.1f} ± {float(result.camera.focal) * estimate.focal_std:.1f}"]
+    terms = zip(result.camera.params[4:6].tolist(), estimate.k_std, strict=False)
     return ", ".join([*words, *(f"{k:.3f} ± {std:.3f}" for k, std in terms)])
 
 
 def error_of(run: Run, sequence: Sequence) -> str:
-    """ATE in metres."""
+    """ATE in meters."""
     if sequence.groundtruth is None or len(run.trajectory) < MIN_POSES:
         return ""
     return f"{evaluate(run.trajectory, sequence.groundtruth).ate_m:.3g}"
 
 
 def warned(label: str, case: Case) -> None:
-    """What runs with focal lengths that are off both ways say of them."""
+    """Remarks of runs whose focal lengths are too large and too small."""
     _, known, config = open_case(case)
     if known is None:
         return
@@ -193,7 +194,7 @@ def attempt(case: Columns) -> Columns:
         torch.set_num_threads(1)
         return {"status": DONE, "cells": found(case["label"], CASES[case["label"]])}
 
-    return kept(case["label"], case["label"], [], work, case["output"], HERE)
+    return cached_run(case["label"], case["label"], [], work, case["output"], HERE)
 
 
 def main() -> None:
@@ -212,7 +213,7 @@ def main() -> None:
         return
     output = arguments.output.absolute()
     cases = [{"label": label, "output": str(output)} for label in labels]
-    check(each_case(attempt, cases, arguments, lambda columns: print(columns["name"], columns["status"])))
+    check(run_cases(attempt, cases, arguments, lambda columns: print(columns["name"], columns["status"])))
     records = [read_record(output / RUNS / label / RECORD) for label in CASES]
     write_between(HERE / "README.md", table(HEADER, [record["cells"] for record in records if record]))
 

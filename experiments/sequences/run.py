@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
+from experiments.common import add_engine, available, metrics_of_runs, row_of, table, write_between
 
 NAMES = ["redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20", "standstill", "synthetic:room"]
 ASKED = {
@@ -17,7 +17,7 @@ ASKED = {
     "standstill": "no map",
     "synthetic:room": "98 %, 1 % of the path",
 }
-# ORB-SLAM3 (pyorbslam3 0.1.1), fed in real time on two idle cores, median of three runs: ATE in metres, posed frames.
+# ORB-SLAM3 (pyorbslam3 0.1.1), fed in real time on two idle cores, median of three runs: ATE in meters, posed frames.
 ORB_SLAM3 = {
     "redkitchen": "0.052, 974",
     "kitti07": "0.30, 156",
@@ -36,11 +36,11 @@ def main() -> None:
     parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "sequences")
     arguments = parser.parse_args()
-    names = at_hand(arguments.names)
+    names = available(arguments.names)
     config = None if arguments.config is None else str(arguments.config.absolute())
     runs = [row_of(name, config=config, overrides=arguments.set) for name in names]
     rows = []
-    for name, result in zip(names, figures_of_all(runs, arguments), strict=True):
+    for name, result in zip(names, metrics_of_runs(runs, arguments), strict=True):
         rows.append(row(name, result))
         print(json.dumps({"sequence": name} | result), flush=True)
     header = ["sequence", "posed", "ATE (m)", "ATE / path", "keyframes", "points"]

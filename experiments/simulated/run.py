@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from experiments.common import add_engine, at_hand, figures_of_all, row_of, table, write_between
+from experiments.common import add_engine, available, metrics_of_runs, row_of, table, write_between
 
 NOISY = ["simulated.noise_px=0.5", "simulated.outlier_ratio=0.1"]
 CASES = [
@@ -22,14 +22,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     add_engine(parser, "simulated")
     options = parser.parse_args()
-    known = at_hand(dict.fromkeys(name for name, _, _ in CASES))
+    known = available(dict.fromkeys(name for name, _, _ in CASES))
     cases = [case for case in CASES if case[0] in known]
     runs = [
         row_of(name, label, overrides=["features.kind=simulated", *overrides])
         for name, label, overrides in cases
     ]
     rows = []
-    for (name, label, _), result in zip(cases, figures_of_all(runs, options), strict=True):
+    for (name, label, _), result in zip(cases, metrics_of_runs(runs, options), strict=True):
         since_start = result["frames"] - (result["initialized_at"] or 0)
         share = result["ate_m"] / result["path_length_m"]
         rows.append(

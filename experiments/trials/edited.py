@@ -16,7 +16,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.types import Trajectory
 
 RATE = 30.0
-"""Frames per second of what was put together, whatever the rate of its parts."""
+"""Frames per second of the edited sequence, independent of its parts."""
 
 Edit = Callable[[np.ndarray, int], np.ndarray]
 """From a gray image (H, W) uint8 and the number of the frame in the edited sequence to another image."""

@@ -1,4 +1,4 @@
-"""What can befall an image: functions that make edits, see `edited.Edit`. All of them are deterministic."""
+"""Faults of images: functions that make deterministic edits, see `edited.Edit`."""
 
 from __future__ import annotations
 

@@ -14,10 +14,10 @@ FAR = 0.3
 TURNED_DEG = 10.0
 """Degrees beyond the median rotation error at which a rotation is wrong."""
 MIN_JUDGED = 4
-"""Poses without which nothing can be said: fewer fit any path."""
+"""Minimum number of poses; fewer fit any path."""
 STANDS = 1e-3
 """Share of the extent: frames whose true positions are nearer to the last one before count as one for the fit, as a
-camera that stands longer than it moves would be a majority that says nothing of the scale."""
+camera that stands longer than it moves would be a majority that does not determine the scale."""
 SAMPLES, SAMPLE_SIZE, REFITS, NEAR = 200, 8, 5, 3.0  # near: in medians of the residuals
 
 

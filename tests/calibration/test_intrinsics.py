@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchslam.calibration import FoundCamera, estimate_intrinsics
+from torchslam.calibration import CalibrationResult, estimate_intrinsics
 from torchslam.calibration.find_camera import contradiction, describe_camera
 from torchslam.calibration.intrinsics import FOCAL, K1, adjust_with_camera, frames_of, problem_of
 from torchslam.geometry import Camera
@@ -28,10 +28,10 @@ def test_exact_pixels_give_the_camera(simulated: Make, truth: Camera, factor: fl
     """Focal length and both coefficients from none, the ratio of fx to fy and the rest as they are."""
     params = torch.cat([factor * truth.params[:2], truth.params[2:4], torch.zeros(2), truth.params[6:]])
     start = truth.with_params(params.double())
-    refined = estimate_intrinsics(replace(simulated(), camera=start), start, radial=2)
-    assert refined.num_radial == 2
-    torch.testing.assert_close(refined.camera.params, truth.params, rtol=1e-3, atol=1e-5)
-    assert refined.cost < 1e-3 * refined.cost_before
+    estimate = estimate_intrinsics(replace(simulated(), camera=start), start, radial=2)
+    assert estimate.num_radial == 2
+    torch.testing.assert_close(estimate.camera.params, truth.params, rtol=1e-3, atol=1e-5)
+    assert estimate.cost < 1e-3 * estimate.initial_cost
 
 
 def test_exact_pixels_leave_nothing_to_be_done(simulated: Make, truth: Camera) -> None:
@@ -48,19 +48,19 @@ def test_exact_pixels_leave_nothing_to_be_done(simulated: Make, truth: Camera) -
     )  # far below a pixel, far above rounding
     assert int(noisy.convergence.iterations) > 2
     assert float(noisy.cost) < 0.9 * float(noisy.convergence.initial_cost)
-    refined = estimate_intrinsics(simulated())
-    assert contradiction(truth, refined) == ""
+    estimate = estimate_intrinsics(simulated())
+    assert contradiction(truth, estimate) == ""
 
 
 def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make, truth: Camera) -> None:
     pinhole = straight(truth)
-    refined = estimate_intrinsics(
+    estimate = estimate_intrinsics(
         replace(simulated(pinhole, noise=0.5), camera=straight(truth, 0.9)), pinhole, radial=2
     )
-    assert refined.num_radial == 0
-    assert refined.camera.model == "pinhole"
-    assert float(refined.camera.focal) == pytest.approx(float(truth.focal), rel=5e-3)
-    torch.testing.assert_close(refined.camera.params[2:], pinhole.params[2:])
+    assert estimate.num_radial == 0
+    assert estimate.camera.model == "pinhole"
+    assert float(estimate.camera.focal) == pytest.approx(float(truth.focal), rel=5e-3)
+    torch.testing.assert_close(estimate.camera.params[2:], pinhole.params[2:])
     params = torch.tensor([400.0, 404.0, 320.0, 240.0, -0.3, 0.4, 0, 0, 0], dtype=torch.float64)
     bent = simulated(truth.with_params(params), noise=0.1)
     assert estimate_intrinsics(bent, pinhole, radial=2).num_radial == 2
@@ -68,9 +68,9 @@ def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make
 
 
 def test_distortion_stays_as_given_where_it_is_not_free(simulated: Make, truth: Camera) -> None:
-    refined = estimate_intrinsics(simulated(noise=0.3))
-    torch.testing.assert_close(refined.camera.params[2:], truth.params[2:])
-    assert refined.std == pytest.approx(refined.given_rest)
+    estimate = estimate_intrinsics(simulated(noise=0.3))
+    torch.testing.assert_close(estimate.camera.params[2:], truth.params[2:])
+    assert estimate.focal_std == pytest.approx(estimate.conditional_focal_std)
 
 
 @pytest.mark.parametrize("frames", [8, 24])
@@ -78,27 +78,27 @@ def test_formal_errors_are_those_of_many_trials(simulated: Make, truth: Camera, 
     """Where the noise is what the error assumes it is about right, and in a short way on the safe side."""
     off, stds = [], []
     for seed in range(12):
-        refined = estimate_intrinsics(simulated(straight(truth), noise=0.5, frames=frames, seed=seed))
-        off.append(math.log(float(refined.camera.focal / truth.focal)))
-        stds.append(refined.given_rest)
+        estimate = estimate_intrinsics(simulated(straight(truth), noise=0.5, frames=frames, seed=seed))
+        off.append(math.log(float(estimate.camera.focal / truth.focal)))
+        stds.append(estimate.conditional_focal_std)
     rms = math.sqrt(sum(x * x for x in off) / len(off))
     assert 0.2 < rms / (sum(stds) / len(stds)) < 1.5
 
 
-def test_a_guessed_centre_moves_as_far_as_the_images_are_sure(simulated: Make, truth: Camera) -> None:
+def test_a_guessed_center_moves_as_far_as_the_images_are_sure(simulated: Make, truth: Camera) -> None:
     """To the true one where the pixels are good, hardly at all where they say nothing, and the error knows."""
     off = straight(truth).params + torch.tensor([0, 0, 6.0, -5.0], dtype=torch.float64)
     guess = Camera.pinhole(*off.tolist(), size=truth.size)
     stds = []
     for noise, near in ((0.02, 0.6), (4.0, 8.0)):
         graph = replace(simulated(straight(truth), noise=noise, frames=24), camera=guess)
-        refined = estimate_intrinsics(graph, guess, radial=2, principal_point=True)
-        away = (refined.camera.params[2:4] - truth.params[2:4]).abs()
+        estimate = estimate_intrinsics(graph, guess, radial=2, principal_point=True)
+        away = (estimate.camera.params[2:4] - truth.params[2:4]).abs()
         assert (away < near).all()
-        assert (refined.camera.params[2:4] - off[2:4]).norm() < 9
-        assert abs(math.log(float(refined.camera.focal / truth.focal))) < 3 * refined.std
-        assert refined.std >= refined.given_rest
-        stds.append(refined.std)
+        assert (estimate.camera.params[2:4] - off[2:4]).norm() < 9
+        assert abs(math.log(float(estimate.camera.focal / truth.focal))) < 3 * estimate.focal_std
+        assert estimate.focal_std >= estimate.conditional_focal_std
+        stds.append(estimate.focal_std)
     assert stds[0] < 0.2 * stds[1]
     held = estimate_intrinsics(graph, guess, radial=2)
     torch.testing.assert_close(held.camera.params[2:4], off[2:4])
@@ -110,8 +110,8 @@ def test_parts_of_the_way_that_disagree_make_it_less_certain(simulated: Make, tr
     later = (graph.frame_index >= 12)[:, None]
     zoomed = torch.where(later, principal_point + 1.05 * (graph.pixels - principal_point), graph.pixels)
     assert (
-        estimate_intrinsics(replace(graph, pixels=zoomed)).given_rest
-        > 4 * estimate_intrinsics(graph).given_rest
+        estimate_intrinsics(replace(graph, pixels=zoomed)).conditional_focal_std
+        > 4 * estimate_intrinsics(graph).conditional_focal_std
     )
 
 
@@ -119,10 +119,10 @@ def test_a_straight_way_without_turns_leaves_it_open(simulated: Make, truth: Cam
     twists = torch.zeros(16, 6, dtype=torch.float64)
     twists[:, 2] = torch.linspace(0, 1.5, 16)
     graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
-    refined = estimate_intrinsics(
+    estimate = estimate_intrinsics(
         replace(graph, camera=straight(truth, 0.9)), straight(truth), radial=2, principal_point=True
     )
-    assert not refined.is_determined
+    assert not estimate.is_determined
     turning = estimate_intrinsics(simulated(straight(truth), noise=0.5, frames=16), straight(truth), radial=2)
     assert turning.is_determined
 
@@ -136,16 +136,16 @@ def test_a_plane_seen_from_straight_ahead_leaves_it_open(simulated: Make, truth:
     twists[:, 2] += 0.8 * torch.sin(4 * way)
     off, pinhole = straight(truth, 0.9), straight(truth)
     wall = simulated(pinhole, noise=0.5, twists=twists, frames=12, depth=0.0)
-    refined = estimate_intrinsics(replace(wall, camera=off), off, radial=2, principal_point=True)
-    assert not refined.is_determined
-    said = describe_camera(FoundCamera(refined.camera, refined, []))
-    assert said.startswith("not determined by the motion (pure rotation, a straight way and a plane")
+    estimate = estimate_intrinsics(replace(wall, camera=off), off, radial=2, principal_point=True)
+    assert not estimate.is_determined
+    said = describe_camera(CalibrationResult(estimate.camera, estimate, []))
+    assert said.startswith("not determined by the motion (pure rotation, straight motion and planes")
     twists[:, 4] += 0.5 * torch.cos(5 * way)
     twists[:, 3] += 0.3 * torch.sin(5 * way)
     tilted = simulated(pinhole, noise=0.5, twists=twists, frames=12, depth=0.0)
-    refined = estimate_intrinsics(replace(tilted, camera=off), off)
-    assert refined.is_determined
-    assert abs(math.log(float(refined.camera.focal / truth.focal))) < 3 * refined.std
+    estimate = estimate_intrinsics(replace(tilted, camera=off), off)
+    assert estimate.is_determined
+    assert abs(math.log(float(estimate.camera.focal / truth.focal))) < 3 * estimate.focal_std
 
 
 def test_few_keyframes_have_frames_between_them_counted(simulated: Make, truth: Camera) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.walks import Walk, arc, turn
-from torchslam.calibration import FoundCamera, Refinement, Round, calibrate
+from torchslam.calibration import CalibrationResult, CalibrationRound, IntrinsicsEstimate, calibrate
 from torchslam.calibration.find_camera import contradiction, describe_camera
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
@@ -30,14 +30,14 @@ def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
 
 def test_the_focal_length_is_found_from_nothing() -> None:
     unknown, config = walk(arc(22, 2.2))
-    rounds: list[Round] = []
+    rounds: list[CalibrationRound] = []
     found = calibrate(unknown, config, on_progress=rounds.append)
     assert found.is_determined
     assert float(found.camera.focal) == pytest.approx(200.0, rel=0.02)
     assert found.rounds == rounds
     assert [round(float(each.camera.focal) / 320, 3) for each in rounds[:2]] == [0.85, 0.6]
-    assert found.refined is not None
-    assert abs(float(found.camera.focal) - 200.0) < 3 * found.refined.std * 200.0
+    assert found.estimate is not None
+    assert abs(float(found.camera.focal) - 200.0) < 3 * found.estimate.focal_std * 200.0
     assert describe_camera(found).startswith("focal length ")
     assert len(unknown) == 22  # and the sequence is as it was
     assert unknown.calibrated is Calibrated.GUESSED
@@ -59,9 +59,9 @@ def test_a_camera_that_only_turns_stays_unknown() -> None:
     assert "a guess, which may be wrong by a factor of two" in describe_camera(found)
 
 
-def refinement(focal: float, std: float, drop: float = 0.0) -> Refinement:
+def refinement(focal: float, std: float, drop: float = 0.0) -> IntrinsicsEstimate:
     camera = CAMERA.with_params(CAMERA.params * torch.tensor([focal / 200] * 2 + [1.0] * 2))
-    return Refinement(camera, 0, std, std, (), 1.0 - drop, 1.0)
+    return IntrinsicsEstimate(camera, 0, std, std, (), 1.0 - drop, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def refinement(focal: float, std: float, drop: float = 0.0) -> Refinement:
         ),  # uncertain, but the residuals are clearly smaller
         (240.0, 0.09, 0.01, ""),
         (204.0, 0.09, 0.05, ""),
-        (240.0, 0.3, 0.05, "contradict a focal length of 200 px and do not say which is right"),
+        (240.0, 0.3, 0.05, "contradict a focal length of 200 px and do not determine the right one"),
         (2000.0, 0.01, 0.0, "contradict a focal length of 200 px"),  # beyond the bounds
         (240.0, 0.3, 0.01, ""),
     ],
@@ -104,10 +104,10 @@ def test_a_contradicted_camera_is_named(focal: float, std: float, drop: float, s
 
 def test_words_for_what_is_not_determined() -> None:
     vague = refinement(200.0, 0.12)
-    found = FoundCamera(vague.camera, vague, [])
+    found = CalibrationResult(vague.camera, vague, [])
     assert not found.is_determined
     assert "may be wrong by 24 %" in describe_camera(found)
-    assert "a factor of two" in describe_camera(replace(found, refined=refinement(200.0, 0.7)))
+    assert "a factor of two" in describe_camera(replace(found, estimate=refinement(200.0, 0.7)))
     far = refinement(2000.0, 0.01)  # beyond the bounds
     assert not far.is_determined
     bent = CAMERA.params.new_tensor([200.0, 200.0, 160.0, 120.0, -0.2, 0.05, 0, 0, 0])
@@ -117,4 +117,7 @@ def test_words_for_what_is_not_determined() -> None:
         num_radial=1,
         k_std=(0.01,),
     )
-    assert describe_camera(FoundCamera(sure.camera, sure, [])) == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"
+    assert (
+        describe_camera(CalibrationResult(sure.camera, sure, []))
+        == "focal length 200 ± 4 px, k1 -0.200 ± 0.010"
+    )

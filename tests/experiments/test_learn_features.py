@@ -21,11 +21,11 @@ from experiments.learned_weights.features.front_end import (
 from experiments.learned_weights.features.pairs import APART_S, Pair, PairErrors, pair_errors
 from experiments.learned_weights.features.report import Result, bootstrap, medians, ratios
 from experiments.learned_weights.features.run import Part, spread
-from tests.learning.test_clip import BentEyes
+from tests.learning.test_clip_slam import BentEyes
 from tests.walks import T_cw, Walk, arc, still
 from torchslam import ORB, ClipSLAM, Features
 from torchslam.evaluation import ate
-from torchslam.learning.clips import frames_in
+from torchslam.learning.dataset import frames_in
 from torchslam.learning.losses import path_length
 
 CPU = torch.device("cpu")
@@ -69,7 +69,7 @@ def test_pairs_and_clips_stay_in_their_part() -> None:
     assert spread(0, 4, 5) == []
 
 
-def test_patches_are_centred_on_their_keypoint() -> None:
+def test_patches_are_centered_on_their_keypoint() -> None:
     images = noise_images()
     whole = torch.tensor([[[60.0, 40.0], [20.0, 30.0]]])
     found = patches(images, whole)
@@ -100,11 +100,11 @@ def test_without_training_nothing_moves_and_later_no_further_than_the_reach() ->
 
 
 def test_a_remembering_front_end_looks_once_at_the_same_images() -> None:
-    looked: list[Tensor] = []
+    prepared: list[Tensor] = []
 
     class Counting(ORB):
         def forward(self, images: Tensor) -> Features:
-            looked.append(images)
+            prepared.append(images)
             return super().forward(images)
 
     front_end = Remembering(Counting(50))
@@ -113,7 +113,7 @@ def test_a_remembering_front_end_looks_once_at_the_same_images() -> None:
     assert front_end(first) is found
     front_end(second)
     assert torch.equal(front_end(first).keypoints, found.keypoints)
-    assert len(looked) == 3
+    assert len(prepared) == 3
 
 
 def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
@@ -154,7 +154,7 @@ def test_the_interval_is_that_of_a_mean() -> None:
     half = 1.96 * 0.5 / math.sqrt(400)
     assert (math.log(high) - math.log(low)) / 2 == pytest.approx(half, rel=0.15)
     assert math.log(low) < float(logs.mean()) < math.log(high)
-    # Neighbours that are all the same are worth one of them.
+    # Neighbors that are all the same are worth one of them.
     low_runs, high_runs = bootstrap([logs[:80].repeat_interleave(5)], block=5)
     assert math.log(high_runs / low_runs) / 2 == pytest.approx(
         1.96 * float(logs[:80].std()) / math.sqrt(80), rel=0.15

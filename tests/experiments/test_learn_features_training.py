@@ -13,11 +13,11 @@ from experiments.learned_weights.features.tracks import MIN_VIEWS, VIEWS_S, Trac
 from experiments.learned_weights.features.training import (
     Settings,
     draw,
-    localisation_errors,
+    localization_errors,
     pose_loss,
     train,
 )
-from tests.learning.test_clip import BentEyes
+from tests.learning.test_clip_slam import BentEyes
 from tests.walks import Walk, arc
 from torchslam import Features
 
@@ -66,7 +66,7 @@ def test_tracks_of_an_exact_front_end_meet_in_points(tracks: Tracks) -> None:
     assert bool((tracks.seen.sum(-1)[tracks.seen.any(-1)] >= MIN_VIEWS).all())
 
 
-def test_what_is_drawn_is_seen_where_it_is_localised(tracks: Tracks) -> None:
+def test_what_is_drawn_is_seen_where_it_is_localized(tracks: Tracks) -> None:
     settings = Settings(problems=5, tracks=12)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
@@ -80,10 +80,10 @@ def test_what_is_drawn_is_seen_where_it_is_localised(tracks: Tracks) -> None:
 def test_exact_tracks_have_no_pose_error_and_disturbed_ones_a_gradient(tracks: Tracks) -> None:
     front_end = SubPixel(nn.Identity())
     drawn = draw(tracks, Settings(problems=4), torch.Generator().manual_seed(0))
-    errors, success = localisation_errors(front_end, tracks, drawn)
+    errors, success = localization_errors(front_end, tracks, drawn)
     assert bool(success.all())
     assert float(errors.detach().max()) < 1e-5
-    errors, success = localisation_errors(front_end, disturbed(tracks), drawn)
+    errors, success = localization_errors(front_end, disturbed(tracks), drawn)
     assert float(errors.detach().min()) > 1e-4
     errors[success].log1p().sum().backward()
     gradient = front_end.network[-1].weight.grad

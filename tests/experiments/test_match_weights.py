@@ -133,9 +133,9 @@ def test_the_oracle_beats_ransac(problems: Problems) -> None:
 
 
 def test_the_table_tells_the_gain_against_the_best_competitor(problems: Problems) -> None:
-    def at(centimetres: float) -> Tensor:
+    def at(centimeters: float) -> Tensor:
         T = problems.T_true.clone()
-        T[:, 0, 3] += centimetres / 100
+        T[:, 0, 3] += centimeters / 100
         return T
 
     poses = {

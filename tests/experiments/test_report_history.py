@@ -133,11 +133,11 @@ def test_a_report_is_appended_compared_and_drawn(
     assert run.main(command) == 1
     assert "WORSE: shelf: ate 0.003, was 0.002 (1.50 times), at " in capsys.readouterr().out
     assert run.main([*command, "--accept", "for a reason"]) == 0
-    kept = [json.loads(line) for line in history.read_text().splitlines()]
-    assert [bool(line.get("worse")) for line in kept] == [False, True, True]
-    assert kept[2]["accepted"] == "for a reason"
-    assert len(kept[0]["commit"]) == 40
-    assert kept[0]["versions"]["torch"]
+    cached_run = [json.loads(line) for line in history.read_text().splitlines()]
+    assert [bool(line.get("worse")) for line in cached_run] == [False, True, True]
+    assert cached_run[2]["accepted"] == "for a reason"
+    assert len(cached_run[0]["commit"]) == 40
+    assert cached_run[0]["versions"]["torch"]
     page = (docs / "history.md").read_text()
     assert "| shelf | 50 of 50 | 0.0030 | 0.60% |" in page
     assert "for a reason: shelf: ate 0.003, was 0.002" in page

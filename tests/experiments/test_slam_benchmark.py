@@ -34,12 +34,12 @@ def test_rows_are_medians_of_their_runs() -> None:
     assert run.systems(False) == OURS
 
 
-def test_orb_slam3_is_left_out_with_a_word(
+def test_missing_orb_slam3_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("ORB_SLAM3_PYTHON", raising=False)
     assert run.find_peer() is None
-    assert "ORB-SLAM3: left out; set ORB_SLAM3_PYTHON" in capsys.readouterr().out
+    assert "ORB-SLAM3: skipped; set ORB_SLAM3_PYTHON" in capsys.readouterr().out
 
 
 def test_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common import add_engine, at_hand, each_case, figures_of_all, row_of
+from experiments.common import add_engine, available, metrics_of_runs, row_of, run_cases
 from experiments.trials import run as trials
 from tests.batch.conftest import ROOM, SETTINGS
 from torchslam.errors import SequenceError
@@ -23,15 +23,15 @@ def options(output: Path) -> argparse.Namespace:
 def test_rows_are_run_once_and_their_figures_come_with_times(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = [row_of(name, "short", overrides=SETTINGS) for name in at_hand([ROOM, "nowhere at all"])]
+    rows = [row_of(name, "short", overrides=SETTINGS) for name in available([ROOM, "nowhere at all"])]
     assert "nowhere at all: not at" in capsys.readouterr().out
-    (first,) = figures_of_all(rows, options(tmp_path))
+    (first,) = metrics_of_runs(rows, options(tmp_path))
     assert first["posed"] == first["frames"] == 10
     assert first["cpu_s"] > 0
     assert first["ms_median"] > 0
-    assert figures_of_all(rows, options(tmp_path)) == [first]  # the times too: nothing was run again
+    assert metrics_of_runs(rows, options(tmp_path)) == [first]  # the times too: nothing was run again
     with pytest.raises(SystemExit, match=r"room.*does not exist"):
-        figures_of_all([*rows, row_of("/nowhere/room")], options(tmp_path))
+        metrics_of_runs([*rows, row_of("/nowhere/room")], options(tmp_path))
 
 
 def attempted(monkeypatch: pytest.MonkeyPatch, output: Path, *more: str) -> None:
@@ -73,7 +73,7 @@ def test_a_trial_that_goes_wrong_ends_with_an_error(tmp_path: Path, monkeypatch:
 
 def test_cases_come_back_in_their_order(tmp_path: Path) -> None:
     told: list[int] = []
-    found = each_case(
+    found = run_cases(
         lambda case: {"twice": 2 * case["n"]},
         [{"n": n} for n in (2, 1)],
         options(tmp_path),

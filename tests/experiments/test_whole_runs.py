@@ -1,4 +1,4 @@
-"""Whole runs beside the default: ratios, intervals, kept features, matches without ratio test."""
+"""Whole runs compared with the default: ratios, intervals, cached features, matches without ratio test."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from experiments import kept_features
+from experiments import cached_features
 from experiments.better_front_end.parts import Mutual
 from experiments.recordings import Outcome, Outcomes, geometric_mean, interval, log_ratios, report
 from torchslam import ORB, load_config, open_sequence
@@ -51,13 +51,13 @@ def test_an_interval_draws_recordings_of_the_same_images_together() -> None:
     assert report(alone, ["default", "other"]).splitlines()[-1].endswith("| **0.80** |")
 
 
-def test_kept_features_are_those_of_the_front_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept_features, "FOLDER", tmp_path)
+def test_cached_features_are_those_of_the_front_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cached_features, "FOLDER", tmp_path)
     image = open_sequence(ROOM).image(0)
-    kept, own = kept_features.ORB(200), ORB(200)(image)
-    first = kept(image)
-    monkeypatch.setattr(kept, "front_end", None)  # it is not asked again
-    for found in (first, kept(image)):
+    cached_run, own = cached_features.ORB(200), ORB(200)(image)
+    first = cached_run(image)
+    monkeypatch.setattr(cached_run, "front_end", None)  # it is not asked again
+    for found in (first, cached_run(image)):
         for name, values in vars(own).items():
             assert values is None or torch.equal(getattr(found, name), values), name
     assert len(list(tmp_path.rglob("*.pt"))) == 1

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.learning.test_clip import FRAMES, BentEyes, clip_of
+from tests.learning.test_clip_slam import FRAMES, BentEyes, clip_of
 from tests.walks import Walk, arc
 from torchslam import ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
-from torchslam.learning import clip as clips
+from torchslam.learning import clip_slam as clip_module
 from torchslam.learning.losses import relative_ate
 
 NOISE_PX = 3.0  # many observations lie where the kernel bends: the way to the minimum is long
@@ -73,15 +73,15 @@ def test_in_one_call_or_in_turn_the_gradients_are_the_same(seen: Seen) -> None:
 def test_what_does_not_get_there_is_no_success_and_says_so(
     seen: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(clips, "_ITERATIONS", 40)
+    monkeypatch.setattr(clip_module, "_ITERATIONS", 40)
     features = [seen.moved(seed) for seed in (FEW, MANY)]
     poses = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)
     assert poses.success.tolist() == [True, False]
     assert poses.posed.all()  # there are poses, and nearly the right ones
-    assert poses.reason == ("", "its poses are no minimum after 40 iterations: their gradient would be wrong")
+    assert poses.reasons == ("", "its poses did not converge in 40 iterations: their gradient would be wrong")
     truths = torch.stack([seen.truth, seen.truth])
-    loss, failures = clip_loss(poses, truths, relative_ate, on_failure=1.0)
-    assert failures == 0.5
+    loss, failure_rate = clip_loss(poses, truths, relative_ate, on_failure=1.0)
+    assert failure_rate == 0.5
     loss.backward()
     assert (features[0].keypoints.grad != 0).any()
     assert (features[1].keypoints.grad == 0).all()

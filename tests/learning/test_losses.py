@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from tests.learning.test_clip import FRAMES, BentEyes, clip_of, derivative
+from tests.learning.test_clip_slam import FRAMES, BentEyes, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipSLAM, clip_loss
 from torchslam.errors import ClipError
 from torchslam.geometry import rigid, se3_exp, se3_inverse, sim3_exp, so3_exp, transform
-from torchslam.learning.clip import clip_mean
+from torchslam.learning.clip_slam import clip_mean
 from torchslam.learning.losses import (
     ate,
     clip_reprojection,
@@ -53,8 +53,8 @@ def scene(views: int = 3, points: int = 7, batch: int = 2) -> tuple[Tensor, Tens
 
 
 def test_the_path_is_the_way_of_the_camera() -> None:
-    centres = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 2]], dtype=torch.float64)
-    T_wc = rigid(so3_exp(normal(3, 3)), centres)
+    centers = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 2]], dtype=torch.float64)
+    T_wc = rigid(so3_exp(normal(3, 3)), centers)
     assert float(path_length(se3_inverse(T_wc))) == pytest.approx(7.0)
 
 
@@ -326,8 +326,8 @@ def test_the_clips_of_a_batch_are_judged_alone_and_failures_have_their_price() -
     assert errors.isnan().all()
     with pytest.raises(ClipError):
         clip_mean(poses, errors)
-    loss, failures = clip_mean(poses, errors, on_failure=3.0)
-    assert (float(loss.detach()), failures) == (3.0, 1.0)
+    loss, failure_rate = clip_mean(poses, errors, on_failure=3.0)
+    assert (float(loss.detach()), failure_rate) == (3.0, 1.0)
     loss.backward()
     truth = clip_of(walk)[1][None]
     whole = clip_loss(good, truth, relative_ate)

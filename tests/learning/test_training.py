@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from examples.train_weights import Weigh, train
 from torchslam import ORB, open_sequence
 from torchslam.errors import ResultsError
-from torchslam.learning.clips import Clips
+from torchslam.learning.dataset import Clips
 from torchslam.learning.training import MAX_NORM, Training
 
 ROOT = Path(__file__).parents[2]
@@ -133,7 +133,7 @@ class Stopped(Exception):
 
 
 def stop(name: str, value: float, step: int) -> None:
-    if step == 2 and name == "failures":
+    if step == 2 and name == "failure_rate":
         raise Stopped
 
 

@@ -18,7 +18,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.refine import CameraChoice, Refined, refine_poses
+from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.system.front_end import Simulated
 from torchslam.types import State, Trajectory
 
@@ -45,10 +45,10 @@ def seen(settings: Config, walk: Sequence | None = None) -> Sequence:
     return Simulated(settings, WALK.camera, TRUE).of(walk or WALK)
 
 
-def disturbed(T_cw: Tensor, centimetres: float = 3.0, degrees: float = 2.0) -> Trajectory:
+def disturbed(T_cw: Tensor, centimeters: float = 3.0, degrees: float = 2.0) -> Trajectory:
     """Poses that are off by so much in the root of the mean square, each by itself."""
     stds = torch.tensor(
-        [centimetres / 100] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64
+        [centimeters / 100] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64
     ) / math.sqrt(3)
     noise = torch.randn(len(T_cw), 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     times = torch.arange(len(T_cw), dtype=torch.float64) / 10
@@ -61,8 +61,8 @@ def with_focal(sequence: Sequence, factor: float) -> Sequence:
     return sequence.with_camera(sequence.camera.with_params(torch.cat([factor * params[:2], params[2:]])))
 
 
-def errors(refined: Refined, truth: Trajectory) -> tuple[float, float]:
-    """ATE in metres and the angle of the worst pose in degrees, both without any alignment but that to the given."""
+def errors(refined: RefinementResult, truth: Trajectory) -> tuple[float, float]:
+    """ATE in meters and the angle of the worst pose in degrees, both without any alignment but that to the given."""
     found = refined.run.trajectory
     off = se3_inverse(found.T_wc) @ truth.T_wc[: len(found)]
     trace = off[:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -71,13 +71,13 @@ def errors(refined: Refined, truth: Trajectory) -> tuple[float, float]:
 
 
 @pytest.fixture(scope="module")
-def exact() -> Refined:
+def exact() -> RefinementResult:
     """All but exact features; poses 3 cm and 2 degrees off, the focal length 5 %."""
     settings = config()
     return refine_poses(with_focal(seen(settings), 1.05), disturbed(TRUE), settings)
 
 
-def test_exact_features_give_the_true_poses(exact: Refined) -> None:
+def test_exact_features_give_the_true_poses(exact: RefinementResult) -> None:
     """In the frame and the unit of the given ones, as well as fourteen of these say what they are."""
     assert WALK.groundtruth is not None
     assert float(exact.run.camera.focal) == pytest.approx(400.0, rel=1e-4)
@@ -89,7 +89,7 @@ def test_exact_features_give_the_true_poses(exact: Refined) -> None:
     assert all(result.state is State.TRACKING for result in exact.run.results)
 
 
-def test_the_results_are_those_of_a_run(exact: Refined) -> None:
+def test_the_results_are_those_of_a_run(exact: RefinementResult) -> None:
     """The given poses are what it calls online; the graph of the run has its poses as the minimum."""
     torch.testing.assert_close(exact.run.online.T_wc, disturbed(TRUE).T_wc)
     assert exact.run.map.num_keyframes == sum(result.is_keyframe for result in exact.run.results)
@@ -121,7 +121,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
     T_wc[:, :3, 3] *= 3.28
     given = Trajectory(WALK.timestamps, T_wc)
     found = refine_poses(seen(settings), given, settings, CameraChoice.FIXED)
-    assert found.camera is None
+    assert found.intrinsics is None
     ate, angle = errors(found, given)
     assert ate < 2e-3
     assert angle < 0.02
@@ -133,8 +133,8 @@ def test_a_right_camera_stays() -> None:
     judged = refine_poses(seen(settings), disturbed(TRUE), settings)
     assert torch.equal(judged.run.camera.params, WALK.camera.params.double())
     assert judged.rounds == 1
-    assert judged.camera is not None
-    assert float(judged.camera.camera.focal) == pytest.approx(400.0, rel=0.02)
+    assert judged.intrinsics is not None
+    assert float(judged.intrinsics.camera.focal) == pytest.approx(400.0, rel=0.02)
 
 
 def test_frames_and_poses_that_have_no_partner() -> None:
@@ -149,7 +149,7 @@ def test_frames_and_poses_that_have_no_partner() -> None:
     torch.testing.assert_close(found.run.trajectory.timestamps, WALK.timestamps[:10])
     with pytest.raises(TrajectoryError, match="are not those of the images"):
         refine_poses(seen(settings), Trajectory(WALK.timestamps + 100, T_wc), settings)
-    with pytest.raises(TrajectoryError, match="without poses"):
+    with pytest.raises(TrajectoryError, match="has no poses"):
         refine_poses(seen(settings), Trajectory.empty(), settings)
 
 
@@ -157,12 +157,13 @@ def test_images_that_make_no_map() -> None:
     """The run says why, and has no poses."""
     settings, rest = config(), Walk(still(4))
     found = refine_poses(rest, disturbed(true_T_cw(rest)), settings)
-    assert found.run.failure == "no map: nothing moves in the 4 images"
+    assert found.run.failure == "no map: no motion in the 4 images"
     assert len(found.run.trajectory) == 0
     assert [result.state for result in found.run.results] == [State.LOST] * 4
     one = GivenPoses("tum", Path("one.txt"), TRUE[:1], WALK.timestamps[:1])
     assert (
-        refine_poses(seen(settings), one, settings).run.failure == "no map: 1 images with a pose are too few"
+        refine_poses(seen(settings), one, settings).run.failure
+        == "no map: 1 images with a pose are not enough"
     )
 
 

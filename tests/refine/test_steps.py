@@ -80,7 +80,7 @@ def test_rotations_that_agree_stay(generator: torch.Generator) -> None:
     assert average_rotations(true, nothing, nothing, true[:0]) is true
 
 
-def test_turning_leaves_the_centres(generator: torch.Generator) -> None:
+def test_turning_leaves_the_centers(generator: torch.Generator) -> None:
     T_cw = rigid(so3_exp(0.3 * randn(generator, 3, 3)), randn(generator, 3, 3))
     off = T_cw.clone()
     off[1] = se3_exp(torch.tensor([0, 0, 0, 0.05, 0, 0], dtype=torch.float64)) @ T_cw[1]
@@ -136,7 +136,7 @@ def test_long_tracks_are_triangulated(generator: torch.Generator) -> None:
     assert good.tolist() == [True, True, False, False]
     torch.testing.assert_close(found[:2], points_w[:2], atol=1e-9, rtol=0)
     short, _ = triangulate_tracks(
-        tracks.of(keyframe % 19 == 0), pixels[keyframe % 19 == 0], T_cw, CAMERA, 1.0
+        tracks.select(keyframe % 19 == 0), pixels[keyframe % 19 == 0], T_cw, CAMERA, 1.0
     )
     torch.testing.assert_close(short[:2], points_w[:2], atol=1e-9, rtol=0)
 
@@ -161,7 +161,7 @@ def test_a_map_sees_what_the_tracks_say() -> None:
 
 
 def test_keyframes_are_where_the_image_has_moved() -> None:
-    """0.08 of 320 px are 26: at 4 m a point moves by 50 px per metre."""
+    """0.08 of 320 px are 26: at 4 m a point moves by 50 px per meter."""
     scene = Scene.of()
     T_cw = sideways(16, step=0.1)
     views = [scene.view(index, T) for index, T in enumerate(T_cw)]
@@ -173,7 +173,7 @@ def test_keyframes_are_where_the_image_has_moved() -> None:
 
 
 def test_pairs_look_the_same_way() -> None:
-    """Neighbours in time always; others only where the given poses do not look elsewhere."""
+    """Neighbors in time always; others only where the given poses do not look elsewhere."""
     scene, T_cw = Scene.of(), sideways(8, step=0.1)
     views = [scene.view(index, T) for index, T in enumerate(T_cw)]
     assert (0, 7) in candidates(views, T_cw)
@@ -214,8 +214,8 @@ def test_images_that_are_reduced_have_the_same_pairs() -> None:
     found = []
     for factor in (2, 8):
         size = factor * CAMERA.width, factor * CAMERA.height
-        focal, centre = factor * CAMERA.params[:2], factor * (CAMERA.params[2:] + 0.5) - 0.5
-        camera = Camera.pinhole(*focal.tolist(), *centre.tolist(), size=size)
+        focal, center = factor * CAMERA.params[:2], factor * (CAMERA.params[2:] + 0.5) - 0.5
+        camera = Camera.pinhole(*focal.tolist(), *center.tolist(), size=size)
         views = [replace(view, keypoints=factor * (view.keypoints + 0.5) - 0.5) for view in small]
         found.append(find_pairs(views, T_cw, camera, CONFIG))
     assert len(found[0]) == len(found[1]) > 0
@@ -234,8 +234,8 @@ def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> N
     tracks = join_matches(pairs, 8, len(views[0].mask))
     made, _ = build_map(views, align_rotations(given, pairs), tracks, CAMERA, CONFIG)
     S = align_to_input(made.T_cw, T_cw)
-    centres = se3_inverse(made.T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
-    off = (centres - se3_inverse(T_cw)[:, :3, 3]).norm(dim=-1)
+    centers = se3_inverse(made.T_cw)[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
+    off = (centers - se3_inverse(T_cw)[:, :3, 3]).norm(dim=-1)
     assert float(off.max()) < (1e-5 if noise == 0 else 0.04)
 
 
@@ -243,7 +243,7 @@ def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> N
 
 
 def test_back_to_the_given_frame(generator: torch.Generator) -> None:
-    """The similarity that was lost is found, also of centres on a line, and one wild pose does not change it."""
+    """The similarity that was lost is found, also of centers on a line, and one wild pose does not change it."""
     S = se3_exp(torch.tensor([1.0, -2, 0.5, 0.3, -0.4, 0.2], dtype=torch.float64))
     S[:3, :3] *= 1.6
     for given in (

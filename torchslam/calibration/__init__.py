@@ -1,6 +1,6 @@
-"""The camera from the images: refinement of it on a run's graph, and runs, in turns."""
+"""Calibration from images: runs alternate with estimation of the intrinsics on their graphs."""
 
-from torchslam.calibration.intrinsics import Refinement, estimate_intrinsics
-from torchslam.calibration.rounds import FoundCamera, Round, calibrate
+from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
+from torchslam.calibration.rounds import CalibrationResult, CalibrationRound, calibrate
 
-__all__ = ["FoundCamera", "Refinement", "Round", "calibrate", "estimate_intrinsics"]
+__all__ = ["CalibrationResult", "CalibrationRound", "IntrinsicsEstimate", "calibrate", "estimate_intrinsics"]

@@ -211,7 +211,7 @@ def subproblem(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
 
 
 def frames_of(graph: ObservationGraph) -> Tensor:
-    """(n,) the keyframes of the graph's largest world, by time, with other frames if they are few."""
+    """(n,) the keyframes of the graph's largest submap, by time, with other frames if they are few."""
     submap = torch.bincount(graph.submap).argmax()
     frames = (graph.submap == submap).nonzero().squeeze(-1)
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]

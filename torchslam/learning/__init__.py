@@ -1,7 +1,7 @@
-"""A kit to train with through SLAM: clips of sequences, poses of clips, losses, and trainings that can be resumed."""
+"""Train through SLAM: clips of sequences, differentiable poses of clips, losses, and resumable training."""
 
-from torchslam.learning.clip import ClipGraph, ClipLoss, ClipPoses, ClipSLAM, clip_loss, clip_mean
-from torchslam.learning.clips import Batches, Clip, Clips, GraphCache, collate, frames_in, parallax
+from torchslam.learning.clip_slam import ClipGraph, ClipLoss, ClipPoses, ClipSLAM, clip_loss, clip_mean
+from torchslam.learning.dataset import Batches, Clip, Clips, GraphCache, collate, frames_in, parallax
 from torchslam.learning.losses import (
     clip_reprojection,
     epipolar_loss,

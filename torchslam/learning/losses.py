@@ -1,9 +1,9 @@
-"""What poses can be told to be wrong by: differentiable, batched over all leading dimensions, rows under a mask.
+"""Differentiable losses of poses, batched over all leading dimensions, with masks over rows.
 
 Every loss reduces its last dimension of rows, (..., N) to (...), and is NaN, with a gradient of zero, where no row
-counts: a loss of zero would say that all is well. `ate` and `rpe` of `torchslam.evaluation` are losses too, in metres
-and radians: both align the estimate by a similarity first, so that they know nothing of its scale. Errors of real data
-have long tails; (errors / unit).log1p() keeps the hopeless ones from ruling.
+counts: a loss of zero would look like success. `ate` and `rpe` of `torchslam.evaluation` are losses too, in meters
+and radians: both align the estimate by a similarity first, so they are independent of its scale. Errors of real data
+have long tails; (errors / unit).log1p() limits the influence of large ones.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torchslam.geometry import (
 )
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel, robustify
-from torchslam.learning.clip import ClipPoses
+from torchslam.learning.clip_slam import ClipPoses
 
 __all__ = [
     "ate",
@@ -45,16 +45,21 @@ __all__ = [
 
 @full_precision
 def path_length(T_cw: Tensor) -> Tensor:
-    """The way from the first to the last of poses (..., N, 4, 4), in their unit of length. (...)."""
+    """Compute the length (...) of the path through poses (..., N, 4, 4), in their unit."""
     return se3_inverse(T_cw)[..., :3, 3].diff(dim=-2).norm(dim=-1).sum(-1)
 
 
 @full_precision
 def relative_ate(T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The ATE as a share of the true path: an error without a unit, which clips of any size have in common.
+    """Compute the ATE relative to the length of the true path, comparable between clips of any size.
 
-    T_cw, T_cw_groundtruth: (..., N, 4, 4); mask: (..., N) poses that count; of the truth, all are the path.
-    Returns (...), NaN where fewer than three poses count or the truth stands still.
+    Args:
+        T_cw: (..., N, 4, 4).
+        T_cw_groundtruth: (..., N, 4, 4); all of it is the path.
+        mask: (..., N) poses that count.
+
+    Returns:
+        (...), NaN where fewer than three poses count or the true camera does not move.
     """
     length = path_length(T_cw_groundtruth)
     share = ate(T_cw, T_cw_groundtruth, mask) / torch.where(length > 0, length, 1.0)
@@ -63,10 +68,11 @@ def relative_ate(T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = N
 
 @full_precision
 def pose_errors(T_cw: Tensor, T_cw_groundtruth: Tensor) -> Tensor:
-    """How far poses (..., 4, 4) of the same world are apart. (..., 2).
+    """Compute the distance between poses (..., 4, 4) in the same world frame.
 
-    The distance of the camera centres, in the unit of the translations, and the angle, radians. The gradient is zero
-    where an error is.
+    Returns:
+        (..., 2): distance of the camera centers, in the unit of the translations, and angle, radians. The gradient is
+        zero where the error is.
     """
     difference = T_cw @ se3_inverse(T_cw_groundtruth)
     vectors = torch.stack((difference[..., :3, 3], so3_log(difference[..., :3, :3])), dim=-2)
@@ -75,10 +81,11 @@ def pose_errors(T_cw: Tensor, T_cw_groundtruth: Tensor) -> Tensor:
 
 @full_precision
 def motion_difference(T_21: Tensor, T_21_groundtruth: Tensor) -> Tensor:
-    """By how much motions (..., 4, 4) are turned against the true ones, whatever the length of their translations.
+    """Compute the rotation and direction errors of motions (..., 4, 4), independent of the translations' lengths.
 
-    Returns rotation vectors (..., 2, 3), radians: of the rotation, and of the direction of the translation; their
-    lengths are the errors that pairs of images are judged by. Zero for the direction where a translation is.
+    Returns:
+        Rotation vectors (..., 2, 3), radians: of the rotation, and of the direction of the translation (zero where a
+        translation is). Their lengths are the usual errors of relative poses.
     """
     t, t_true = (F.normalize(T[..., :3, 3], dim=-1) for T in (T_21, T_21_groundtruth))
     axis = torch.linalg.cross(t_true, t, dim=-1)
@@ -92,15 +99,20 @@ def motion_difference(T_21: Tensor, T_21_groundtruth: Tensor) -> Tensor:
 def pose_nll(
     T_cw: Tensor, T_cw_groundtruth: Tensor, covariance: Tensor, mask: Tensor | None = None
 ) -> Tensor:
-    """Negative logarithm of the likelihood of the true poses, the mean over the poses, nats: accurate and honest.
+    """Compute the mean negative log-likelihood of the true poses, in nats.
 
-    T_cw, T_cw_groundtruth: (..., N, 4, 4) in the same world and unit
-    covariance: (..., N, 6, 6) of the left perturbation (translation, rotation) of T_cw, as solvers give it (there
-                detached: then it only weighs the errors) or as something that learns predicts it
-    mask:       (..., N) poses that count; what does not may have any covariance
+    An error xi with covariance S costs (xi^T S^-1 xi + log det S + 6 log 2 pi) / 2. Poses whose covariance is not
+    positive definite do not count.
 
-    An error xi with covariance S costs (xi^T S^-1 xi + log det S + 6 log 2 pi) / 2. Returns (...). Poses whose
-    covariance is not positive definite do not count.
+    Args:
+        T_cw: (..., N, 4, 4).
+        T_cw_groundtruth: (..., N, 4, 4) in the same world and unit.
+        covariance: (..., N, 6, 6) of the left perturbation (translation, rotation) of T_cw: of a solver (detached, so
+            it only weights the errors) or predicted by a network.
+        mask: (..., N) poses that count; others may have any covariance.
+
+    Returns:
+        (...).
     """
     xi = se3_log(T_cw_groundtruth @ se3_inverse(T_cw))
     eye = torch.eye(6, dtype=xi.dtype, device=xi.device)
@@ -127,13 +139,20 @@ def epipolar_loss(
     kernel: Kernel = "cauchy",
     scale: float = 1.0,
 ) -> Tensor:
-    """How far matches are from the epipolar lines of a motion: the mean of robust squared Sampson distances, px^2.
+    """Compute the mean robust squared Sampson distance of matches; needs no depth and no ground truth.
 
-    T_21: (..., 4, 4), its translation of any length but zero, which would forgive everything
-    pixels_1, pixels_2: (..., N, 2); mask: (..., N) matches that count
-    scale: of the kernel, pixels
+    Args:
+        T_21: (..., 4, 4), with a translation of any length but zero, which would fit everything.
+        pixels_1: (..., N, 2).
+        pixels_2: (..., N, 2).
+        camera_1: Of the first images.
+        camera_2: Of the second images.
+        mask: (..., N) matches that count.
+        kernel: Robust kernel.
+        scale: Of the kernel, pixels.
 
-    Returns (...). Needs no depth and, with a motion that was estimated, no truth.
+    Returns:
+        (...), px^2.
     """
     counted = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     counted = counted if mask is None else counted & mask
@@ -154,14 +173,20 @@ def reprojection_loss(
     kernel: Kernel = "cauchy",
     scale: float = 1.0,
 ) -> Tensor:
-    """How far tracks are from the points that they make: the mean over points of a robust sum of squares, px^2.
+    """Compute the mean robust reprojection error of points triangulated from tracks, differentiably.
 
-    T_cw:   (..., V, 4, 4) the views' poses: the true ones, or estimated ones, which makes it self-supervised
-    pixels: (..., N, V, 2); mask: (..., N, V) which views see a point; a point needs two
-    scale:  of the kernel on the root of a point's sum of squares, pixels
+    A point behind one of its views does not count: make sure that the network cannot gain by moving it there.
 
-    Returns (...). Points are triangulated, differentiably, and each bears its best errors. A point that lies behind one
-    of its views does not count: see to it that what learns cannot gain by putting it there.
+    Args:
+        T_cw: (..., V, 4, 4) poses of the views: true ones, or estimated ones for self-supervision.
+        pixels: (..., N, V, 2).
+        camera: Of all views.
+        mask: (..., N, V) which views see a point; a point needs two.
+        kernel: Robust kernel.
+        scale: Of the kernel on the root of a point's sum of squares, pixels.
+
+    Returns:
+        (...), px^2: mean over points of the robust sum of squares.
     """
     points = triangulate_many(T_cw, pixels, camera, mask)
     seen = points.errors.isfinite()
@@ -171,18 +196,25 @@ def reprojection_loss(
 
 @full_precision
 def clip_reprojection(poses: ClipPoses, kernel: Kernel = "cauchy", scale: float = 1.0) -> Tensor:
-    """How far the observations of clips are from where their own solution has them: no truth is needed. (B,) px^2.
+    """Compute the robust reprojection error of clips against their own solution; needs no ground truth.
 
-    The mean over a clip's observations of robust squared reprojection errors, scale in pixels, for `clip_mean`; () for
-    ClipPoses of one clip. Observations of frames without a pose and of points that stayed where they were do not count.
-    All weights of observations count alike here, so that nothing is gained by weighing bad ones down.
+    Observations of frames without a pose and of points that were not optimized do not count. All observations weigh the
+    same, so that a network cannot gain by down-weighting bad ones.
+
+    Args:
+        poses: Of clips.
+        kernel: Robust kernel.
+        scale: Of the kernel, pixels.
+
+    Returns:
+        (B,), or () for one clip, px^2: mean over the observations, for `clip_mean`.
     """
     means = []
     for T_cw, graph, solution in zip(
         poses.T_cw.view(-1, *poses.posed.shape[-1:], 4, 4), poses.graphs, poses.solutions, strict=True
     ):
         if graph is None or solution is None:
-            means.append(0 * T_cw.sum() + torch.nan)  # a gradient of zero all the same
+            means.append(0 * T_cw.sum() + torch.nan)  # with a gradient of zero
             continue
         seen = transform(solution.T_cw[graph.frame_index], solution.points_w[graph.point_index, None])
         projected, valid = solution.camera.project(seen.squeeze(-2))

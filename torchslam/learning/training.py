@@ -1,4 +1,4 @@
-"""The state of a training, in one place: what a step changes, what is reported, what a file needs to go on."""
+"""Training loop state: optimizer steps, logging and resumable checkpoints."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ from torchslam.errors import ResultsError
 from torchslam.utils.atomic_write import write_whole
 
 Log = Callable[[str, float, int], None]
-"""Told a name, a value and a step, as `SummaryWriter.add_scalar` of TensorBoard is."""
+"""Called with name, value and step, like `SummaryWriter.add_scalar` of TensorBoard."""
 
 MAX_NORM = 1.0
-"""Of the gradient: one step through a badly determined pose must not undo a hundred others."""
+"""Of the gradient: one step through a poorly determined pose must not undo a hundred others."""
 
-_MANY = 1_000_003  # a prime: seeds of steps and epochs, of which torch takes 32 bits, do not soon meet those of others
+_SEED_STRIDE = (
+    1_000_003  # a prime: the 32-bit seeds of steps and epochs rarely collide with those of other seeds
+)
 
 
 class Training:
-    """A number of steps of an optimiser, with a schedule and clipped gradients, that can be stopped and resumed.
+    """A number of optimizer steps with a schedule and clipped gradients that can be stopped and resumed.
 
         training = Training(module, torch.optim.Adam(module.parameters(), 1e-3), steps=1000, log=writer.add_scalar)
         training.resume("checkpoint.pt")
@@ -37,16 +39,23 @@ class Training:
             if training.step % 100 == 0:
                 training.save("checkpoint.pt")
 
-    Resumed, it makes the same bytes as if it had not been stopped: what is drawn comes from `generator`, is a function
-    of the step (`Batches`), or is drawn from torch's own generator, as dropout is, which is seeded before every step.
-    Of several processes each has a Training of its own, with the same `generator`; one of them saves.
+    Resumed training gives the same bytes as uninterrupted training: random numbers come from `generator`, depend on
+    the step alone (`Batches`), or come from torch's default generator (dropout), which is seeded before every step.
+    With several processes each has its own Training with the same `generator`, and one of them saves.
 
-    module:    what learns: the module itself, not its DistributedDataParallel
-    schedule:  of the learning rate; along a cosine to zero at the last step if None
-    max_norm:  of the gradient, longer ones are shortened
-    step:      how many steps have been made
-    losses:    of each of them
-    generator: of random numbers, seeded with `seed`
+    Args:
+        module: The trained module itself, not its DistributedDataParallel.
+        optimizer: Of its parameters.
+        steps: Number of steps.
+        seed: Of `generator`.
+        log: Receives loss and gradient norm of every step.
+        schedule: Of the learning rate; a cosine to zero at the last step if None.
+        max_norm: Longer gradients are scaled to this norm.
+
+    Attributes:
+        step: Number of steps made.
+        losses: Of each step.
+        generator: Of random numbers.
     """
 
     def __init__(
@@ -67,22 +76,22 @@ class Training:
         self._schedule = CosineAnnealingLR(optimizer, steps) if schedule is None else schedule
 
     def __iter__(self) -> Iterator[int]:
-        """The steps that are left; the caller makes each of them, by `descend` or by `update`."""
+        """Yield the remaining steps; the caller performs each with `descend` or `update`."""
         rank, ranks = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         while self.step < self.steps:
             torch.manual_seed(seed_of(self._seed, self.step * ranks + rank))
             yield self.step
 
     def descend(self, loss: Tensor) -> None:
-        """One step down the gradient of a loss ()."""
+        """Backpropagate a loss () and make one step."""
         self.optimizer.zero_grad()
         loss.backward()
         self.update(float(loss.detach()))
 
     def update(self, loss: float) -> None:
-        """One step along the gradients that the parameters have, whoever found them.
+        """Make one step with the current gradients of the parameters.
 
-        Raises RuntimeError, the parameters being as they were, where a gradient is not finite.
+        Raises RuntimeError, with unchanged parameters, if a gradient is not finite.
         """
         parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         norm = float(clip_grad_norm_(parameters, self._max_norm, error_if_nonfinite=True))
@@ -95,15 +104,15 @@ class Training:
         self.step += 1
 
     def save(self, path: str | Path) -> None:
-        """Write a checkpoint: whole or not at all. Raises OSError."""
+        """Write a checkpoint atomically. Raises OSError."""
         buffer = io.BytesIO()
         torch.save(_plain(self._state()), buffer)
         write_whole(path, buffer.getvalue())
 
     def resume(self, path: str | Path) -> bool:
-        """Go on where a checkpoint ended; False, and nothing changes, where there is no file.
+        """Continue from a checkpoint; return False, and change nothing, if there is no file.
 
-        Raises ResultsError for a file that is not a checkpoint, or is one of another number of steps.
+        Raises ResultsError for a file that is not a checkpoint, or has another number of steps.
         """
         if not Path(path).exists():
             return False
@@ -129,7 +138,7 @@ class Training:
     def _read(self, path: str | Path) -> dict[str, Any]:
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch names no error of its own for a file that it cannot read
+        except Exception as error:  # torch has no exception class of its own for unreadable files
             raise ResultsError(f"{path} is not a checkpoint of a training: {error}") from error
         if not isinstance(state, dict) or state.keys() != self._state().keys():
             raise ResultsError(f"{path} is not a checkpoint of a training")
@@ -139,12 +148,12 @@ class Training:
 
 
 def seed_of(seed: int, number: int) -> int:
-    """The seed of a step or an epoch, of what has a seed itself."""
-    return (seed * _MANY + number) % 2**32
+    """Derive the seed of a step or an epoch."""
+    return (seed * _SEED_STRIDE + number) % 2**32
 
 
 def _plain(state: Any) -> Any:
-    """The same nested state whose bytes depend on what it says alone: pickle tells equal strings from the same one."""
+    """The nested state with interned strings: pickle distinguishes equal strings from identical ones."""
     if isinstance(state, dict):
         return {_plain(key): _plain(value) for key, value in state.items()}
     if isinstance(state, (list, tuple)):

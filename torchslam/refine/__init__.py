@@ -1,5 +1,5 @@
-"""Poses and a camera of another program, made better by the images: matched, triangulated, adjusted, calibrated."""
+"""Refine poses and camera of another program with the images: match, triangulate, adjust, calibrate."""
 
-from torchslam.refine.pose_refinement import CameraChoice, Refined, refine_poses
+from torchslam.refine.pose_refinement import CameraChoice, RefinementResult, refine_poses
 
-__all__ = ["CameraChoice", "Refined", "refine_poses"]
+__all__ = ["CameraChoice", "RefinementResult", "refine_poses"]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.calibration.intrinsics import FOCAL, directions
 from torchslam.config import Config
-from torchslam.geometry import Camera, KeypointNoise, fits, so3_exp, so3_log, transform
+from torchslam.geometry import Camera, KeypointNoise, passes_gate, so3_exp, so3_log, transform
 from torchslam.map.map import Map
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all
@@ -22,15 +22,15 @@ from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.refine.tracks import Pair, Tracks, make_map, triangulate_tracks
 from torchslam.types import FrameFeatures
 
-# Where the kernel lets go of a residual, in pixels of its level: given poses are off by tens of them.
+# Scales of the kernel, in pixels of the pyramid level: residuals of given poses can be tens of pixels.
 KERNEL_WIDTHS = 20.0, 6.0, 2.45
-GATE = 3.0  # of the last width: an observation further off does not go into the map
+GATE = 3.0  # in units of the last scale: observations further off are not added to the map
 ITERATIONS = 20
-TOLERANCE = 1e-4  # share of the cost; the last word has the adjustment of the map
+TOLERANCE = 1e-4  # relative cost decrease; the adjustment of the map follows
 
 
 def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
-    """(K, 4, 4) the given poses with rotations that the matches agree with; centres stay where they are."""
+    """Replace the rotations of given poses (K, 4, 4) by averaged relative ones of the matches; camera centers stay."""
     known = [pair for pair in pairs if pair.R_21 is not None]
     if not known:
         return T_cw
@@ -39,17 +39,17 @@ def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
     device = T_cw.device
     R_cw = average_rotations(T_cw[:, :3, :3], first.to(device), second.to(device), R_21)
     centers_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])
-    align_rotations = T_cw.clone()
-    align_rotations[:, :3, :3], align_rotations[:, :3, 3:] = R_cw, -R_cw @ centers_w
-    return align_rotations
+    aligned = T_cw.clone()
+    aligned[:, :3, :3], aligned[:, :3, 3:] = R_cw, -R_cw @ centers_w
+    return aligned
 
 
 def adjust_coarse_to_fine(
     views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool
 ) -> tuple[Tensor, Camera, Tracks, Tensor]:
-    """Poses (K, 4, 4), the camera, the tracks that agree with them, and their points (T, 3), from poses far off.
+    """Adjust inaccurate poses; return poses (K, 4, 4), camera, consistent tracks and their points (T, 3).
 
-    free_focal: the focal length is adjusted as well: matches that a wrong one would rule out still count here
+    free_focal: adjust the focal length too, before a wrong one rejects matches
     """
     pixels = torch.stack([view.keypoints for view in views])[tracks.keyframe, tracks.keypoint]
     scales, information = (
@@ -75,19 +75,19 @@ def adjust_coarse_to_fine(
         T_cw, camera = solution.T_cw, solution.camera
     points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)
     points_c = transform(T_cw[tracks.keyframe], points_w[tracks.track][:, None])[:, 0]
-    near = fits(noise.squared_reprojection(points_c, pixels, camera), (GATE * KERNEL_WIDTHS[-1]) ** 2)
-    kept = tracks.of(near & good[tracks.track])
-    seen = torch.stack([view.keypoints for view in views])[kept.keyframe, kept.keypoint]
-    return T_cw, camera, kept, triangulate_tracks(kept, seen, T_cw, camera, 0.0)[0]
+    near = passes_gate(noise.squared_reprojection(points_c, pixels, camera), (GATE * KERNEL_WIDTHS[-1]) ** 2)
+    inliers = tracks.select(near & good[tracks.track])
+    observed = torch.stack([view.keypoints for view in views])[inliers.keyframe, inliers.keypoint]
+    return T_cw, camera, inliers, triangulate_tracks(inliers, observed, T_cw, camera, 0.0)[0]
 
 
 def densify(slam_map: Map, camera: Camera, config: Config) -> None:
-    """What the first matches missed: new points along epipolar lines, and points found again by their projections."""
+    """Add points along epipolar lines and observations by projection that the first matches missed; adjust the map."""
     for keyframe in range(slam_map.num_keyframes):
-        neighbours = slam_map.covisible(keyframe, 2 * config.mapping.num_partners)
-        triangulate_against(slam_map, keyframe, neighbours[: config.mapping.num_partners], camera, config)
+        neighbors = slam_map.covisible(keyframe, 2 * config.mapping.num_partners)
+        triangulate_against(slam_map, keyframe, neighbors[: config.mapping.num_partners], camera, config)
         slam_map.refresh(slam_map.ids(keyframe))
-        fuse(slam_map, keyframe, neighbours, camera, config)
+        fuse(slam_map, keyframe, neighbors, camera, config)
     adjust_all(slam_map, camera, config.bundle_adjustment)
 
 
@@ -99,24 +99,23 @@ def build_map(
     config: Config,
     free_focal: bool = False,
 ) -> tuple[Map, Camera]:
-    """The adjusted map of keyframes whose poses T_cw (K, 4, 4) are only near the truth, and its camera."""
-    T_cw, camera, kept, points_w = adjust_coarse_to_fine(views, T_cw, tracks, camera, config, free_focal)
-    made = make_map(views, T_cw, kept, points_w)
+    """Build the adjusted map of keyframes with approximate poses T_cw (K, 4, 4); return it with its camera."""
+    T_cw, camera, inliers, points_w = adjust_coarse_to_fine(views, T_cw, tracks, camera, config, free_focal)
+    made = make_map(views, T_cw, inliers, points_w)
     adjust_all(made, camera, config.bundle_adjustment)
     densify(made, camera, config)
     return made, camera
 
 
 MAX_ROTATION_STEPS = 20
-RELATIVE_STD = math.radians(0.3)  # of a rotation between two views by their matches
-MAD = 1.4826 / 1.54  # from the median of the length of three errors to the deviation of each, about
+RELATIVE_STD = math.radians(0.3)  # of a relative rotation of two views
+MAD = (
+    1.4826 / 1.54
+)  # from the median length of a 3-vector to the standard deviation of a component, approximately
 
 
 def average_rotations(R_cw: Tensor, first: Tensor, second: Tensor, R_21: Tensor) -> Tensor:
-    """(K, 3, 3) rotations near R_cw (K, 3, 3) for which R_21 (E, 3, 3) lead from views first (E,) to second (E,).
-
-    The errors of the given rotations are taken to be as large as they disagree with the relative ones.
-    """
+    """Average rotations R_cw (K, 3, 3) with the relative ones R_21 (E, 3, 3) from views first (E,) to second (E,)."""
     if len(first) == 0:
         return R_cw
     given, count = R_cw, len(R_cw)

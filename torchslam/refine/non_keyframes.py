@@ -1,4 +1,4 @@
-"""The frames between the keyframes of a finished map: followed from one keyframe to the next."""
+"""Pose the frames between the keyframes of a finished map by tracking from keyframe to keyframe."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
 from torchslam.tracking.correspondences import match_keyframe
 from torchslam.tracking.matcher import MatchIndices
-from torchslam.tracking.pose_validation import why_doubt
-from torchslam.tracking.relocalization import alone
+from torchslam.tracking.pose_validation import validate_pose
+from torchslam.tracking.relocalization import single_frame_state
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult
 
-NUM_NEAREST = 3  # keyframes in time that a frame is compared with that was lost
+NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame
 
 
 class FramePoser:
-    """Poses the views of a sequence in a map that has some of them as keyframes."""
+    """Poses the views of a sequence in a map whose keyframes are some of them."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.tracker = Tracker(camera, config)
@@ -32,9 +32,9 @@ class FramePoser:
 
     @torch.no_grad()
     def pose(self, submap: Submap, views: list[FrameFeatures], given_cw: Tensor) -> list[StepResult]:
-        """Fill the history of the submap with the views, in their order; a result for each.
+        """Add all views to the posed frames of the submap, in order; return a result for each.
 
-        given_cw: (N, 4, 4), what the results say as the pose that was there before
+        given_cw: (N, 4, 4) the given poses, which become the online poses of the results
         """
         row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
         self.tracker.reset_to_keyframe(submap, 0)
@@ -42,14 +42,14 @@ class FramePoser:
         for view, T_cw in zip(views, given_cw, strict=True):
             keyframe = row_of.get(view.index)
             if keyframe is not None:
-                result = self._pass(submap, view, keyframe)
+                result = self._add_keyframe(submap, view, keyframe)
             else:
                 result = self._track(submap, view)
             results.append(replace(result, T_cw=T_cw, submap=submap.number))
         return results
 
-    def _pass(self, submap: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
-        """A keyframe: it is where the map has it."""
+    def _add_keyframe(self, submap: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
+        """Add a keyframe with its pose of the map."""
         slam_map = submap.map
         self.tracker.reset_to_keyframe(submap, keyframe)
         submap.tracking.velocity = None
@@ -66,23 +66,24 @@ class FramePoser:
         )
 
     def _track(self, submap: Submap, view: FrameFeatures) -> StepResult:
-        """A frame between keyframes: from the last one, or else by what the keyframes nearest in time saw."""
+        """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time."""
         estimate = self.tracker.track(submap, view)
         if estimate is None:
             estimate = self._find(submap, view)
         if estimate is None:
             return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
-        doubt = why_doubt(estimate, None, alone(submap.tracking, estimate), self.config.pose_validation)
+        state = single_frame_state(submap.tracking, estimate)
+        rejection = validate_pose(estimate, None, state, self.config.pose_validation)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return StepResult(
             view.index,
             view.timestamp,
-            State.UNCERTAIN if doubt else State.TRACKING,
+            State.UNCERTAIN if rejection else State.TRACKING,
             None,
             covariance=estimate.covariance,
             matches=estimate.matches,
             inliers=estimate.inliers,
-            reason=doubt,
+            reason=str(rejection or ""),
         )
 
     def _find(self, submap: Submap, view: FrameFeatures) -> PoseEstimate | None:
@@ -102,7 +103,7 @@ class FramePoser:
 
 
 def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
-    """A keyframe as a frame that sees what it sees."""
+    """The pose estimate of a keyframe with its own observations."""
     table = slam_map.keyframes["point_ids"][keyframe]
     keypoints = torch.nonzero(table >= 0)[:, 0]
     seen, T_cw = table[keypoints], slam_map.T_cw[keyframe]
@@ -111,7 +112,7 @@ def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
 
 
 def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
-    """What the keyframes of a map saw, without any frames between."""
+    """The graph of the keyframes of a map, without other frames."""
     posed_frames = PosedFrames()
     for keyframe in range(slam_map.num_keyframes):
         T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)

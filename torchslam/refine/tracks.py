@@ -18,26 +18,23 @@ from torchslam.map.map import Map
 from torchslam.tracking.correspondences import match_views
 from torchslam.types import FrameFeatures
 
-# A view becomes a keyframe where its matches with the last one moved by this share of the image's width, or where
-# this share of the matches is lost that the first view after it had.
-MOTION, KEPT = 0.08, 0.6
-IN_TIME = 4  # keyframes before it that each is compared with
-ALIKE = 8  # others that look most like it
-MAX_TURN_DEG = 60.0  # between views that look alike, by their given poses
-# What a relative rotation may be off from the given poses': a place that only looks alike is seldom seen so alike.
-MAX_OFF_DEG = 15.0
-THRESHOLD_PX = (
-    2.0  # of an image that is not reduced: about the noise, and what a focal length that is 5 % off bends
-)
+# A view becomes a keyframe if its matches with the last one moved by this fraction of the image width, or if fewer than
+# this fraction of the matches of the first view after it are left.
+MIN_MOTION, MIN_MATCH_RATIO = 0.08, 0.6
+NUM_RECENT = 4  # previous keyframes that each is matched with
+NUM_SIMILAR = 8  # most similar other keyframes that each is matched with
+MAX_TURN_DEG = 60.0  # between similar views, by their given poses
+MAX_DISAGREEMENT_DEG = 15.0  # of a relative rotation with the given poses: larger for lookalike places
+THRESHOLD_PX = 2.0  # at full size: about the noise plus the effect of a focal length that is 5 % off
 MIN_MATCHES = 20
 _PAIRS_AT_ONCE, _MAX_SAMPLES = 16, 500
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two keyframes that see the same: rows of their views, and matching keypoints (m,), (m,).
+    """Two overlapping keyframes: rows of their views, and matching keypoints (m,), (m,).
 
-    R_21: (3, 3) relative rotation by the matches; None where these leave two motions
+    R_21: (3, 3) relative rotation by the matches; None if it is ambiguous
     """
 
     first: int
@@ -48,14 +45,14 @@ class Pair:
 
 
 def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> list[int]:
-    """Rows of the views that are apart enough, in their order: told by the images alone."""
+    """Select the rows of views with enough motion between them, by the images alone."""
     chosen, first_matches = [0], 0
     for row in range(1, len(views)):
         last = views[chosen[-1]]
         at_1, at_2 = match_views(last, views[row], config.matching)
         first_matches = max(first_matches, len(at_1))
         motion = torch.linalg.vector_norm(last.keypoints[at_1] - views[row].keypoints[at_2], dim=-1)
-        is_far = len(at_1) < KEPT * first_matches or float(motion.median()) > MOTION * width
+        is_far = len(at_1) < MIN_MATCH_RATIO * first_matches or float(motion.median()) > MIN_MOTION * width
         if is_far or len(at_1) < MIN_MATCHES:
             chosen.append(row)
             first_matches = 0
@@ -63,10 +60,7 @@ def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> 
 
 
 def find_pairs(views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config) -> list[Pair]:
-    """The pairs of keyframes that see the same things.
-
-    T_cw: (K, 4, 4) of the views, as given
-    """
+    """Match keyframes with given poses T_cw (K, 4, 4) and verify the pairs by their epipolar geometry."""
     found = [
         (one, other, *match_views(views[one], views[other], config.matching))
         for one, other in candidates(views, T_cw)
@@ -79,7 +73,7 @@ def find_pairs(views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config:
 
 
 def candidates(views: list[FrameFeatures], T_cw: Tensor) -> list[tuple[int, int]]:
-    """Pairs (lower row first, ascending) near in time, or alike and turned to the same side by the given poses."""
+    """Pairs (lower row first, ascending) close in time, or similar and with similar given viewing directions."""
     places = KeyframeDatabase()
     for row, view in enumerate(views):
         places.add(row, view.descriptors, view.mask)
@@ -87,10 +81,10 @@ def candidates(views: list[FrameFeatures], T_cw: Tensor) -> list[tuple[int, int]
     near = axes_w @ axes_w.mT > math.cos(math.radians(MAX_TURN_DEG))
     pairs = set()
     for row, view in enumerate(views):
-        pairs |= {(other, row) for other in range(max(0, row - IN_TIME), row)}
+        pairs |= {(other, row) for other in range(max(0, row - NUM_RECENT), row)}
         keys, scores = places.query(view.descriptors, view.mask)
         alike = keys[scores > 0]
-        alike = alike[near[row, alike] & ((alike - row).abs() > IN_TIME)][:ALIKE]
+        alike = alike[near[row, alike] & ((alike - row).abs() > NUM_RECENT)][:NUM_SIMILAR]
         pairs |= {(min(row, other), max(row, other)) for other in alike.tolist()}
     return sorted(pairs)
 
@@ -102,7 +96,7 @@ def _verified(
     camera: Camera,
     config: Config,
 ) -> list[Pair]:
-    """Those of several pairs whose matches have a relative pose in common that the given ones do not rule out."""
+    """The pairs whose matches agree on a relative pose that is compatible with the given ones."""
     size = max(len(at_1) for _, _, at_1, _ in found)
     pixels = T_cw.new_zeros(2, len(found), size, 2)
     mask = torch.zeros(len(found), size, dtype=torch.bool, device=T_cw.device)
@@ -130,20 +124,20 @@ def _verified(
         is_known = bool(relative.success[row]) or relative.model[row] == "rotation"
         R_21 = relative.T_21[row, :3, :3] if is_known else None
         given = (T_cw[other] @ se3_inverse(T_cw[one]))[:3, :3]
-        if R_21 is None or float(so3_log(R_21 @ given.mT).norm()) < math.radians(MAX_OFF_DEG):
+        if R_21 is None or float(so3_log(R_21 @ given.mT).norm()) < math.radians(MAX_DISAGREEMENT_DEG):
             pairs.append(Pair(one, other, at_1[inliers], at_2[inliers], R_21))
     return pairs
 
 
-VIEWS = 8  # of a track that its point is triangulated from, spread over it
+MAX_VIEWS = 8  # for the triangulation of a track, spread over it
 _TRACKS_AT_ONCE = 4096  # tracks
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Which keypoints are one point: O rows, ordered by track, then keyframe; a keyframe sees a track once.
+    """Observations (O,) of points, ordered by track, then keyframe; a keyframe observes a track at most once.
 
-    track: (O,) from 0 on, without gaps; keyframe, keypoint: (O,)
+    track: (O,) from 0 without gaps; keyframe, keypoint: (O,)
     """
 
     track: Tensor
@@ -154,19 +148,19 @@ class Tracks:
     def count(self) -> int:
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
-    def of(self, keep: Tensor) -> Tracks:
-        """The rows of a mask (O,), of tracks that are left with two or more of them."""
+    def select(self, keep: Tensor) -> Tracks:
+        """The rows of a mask (O,), without tracks that have fewer than two of them."""
         track, keyframe, keypoint = self.track[keep], self.keyframe[keep], self.keypoint[keep]
         _, which, counts = torch.unique(track, return_inverse=True, return_counts=True)
-        lives = counts[which] >= 2
-        _, renamed = torch.unique(track[lives], return_inverse=True)
-        return Tracks(renamed, keyframe[lives], keypoint[lives])
+        is_track = counts[which] >= 2
+        _, renumbered = torch.unique(track[is_track], return_inverse=True)
+        return Tracks(renumbered, keyframe[is_track], keypoint[is_track])
 
 
 def join_matches(pairs: list[Pair], keyframes: int, keypoints: int) -> Tracks:
-    """The connected parts of all matches; what two keypoints of a keyframe contradict is left out of them.
+    """The connected components of all matches, without observations by two keypoints of one keyframe.
 
-    keypoints: how many a keyframe has room for
+    keypoints: capacity of a keyframe
     """
     one = torch.cat([pair.first * keypoints + pair.keypoints_1 for pair in pairs])
     other = torch.cat([pair.second * keypoints + pair.keypoints_2 for pair in pairs])
@@ -176,11 +170,11 @@ def join_matches(pairs: list[Pair], keyframes: int, keypoints: int) -> Tracks:
     nodes = nodes[order]
     track, keyframe = label[nodes], nodes // keypoints
     _, which, counts = torch.unique(track * keyframes + keyframe, return_inverse=True, return_counts=True)
-    return Tracks(track, keyframe, nodes % keypoints).of(counts[which] == 1)
+    return Tracks(track, keyframe, nodes % keypoints).select(counts[which] == 1)
 
 
 def _lowest_connected(one: Tensor, other: Tensor, count: int) -> Tensor:
-    """(count,) the lowest node that edges (E,), (E,) connect each node with."""
+    """(count,) the lowest node of the connected component of each node, for edges (E,), (E,)."""
     label = torch.arange(count, device=one.device)
     while True:
         lower = torch.minimum(label[one], label[other])
@@ -194,16 +188,16 @@ def _lowest_connected(one: Tensor, other: Tensor, count: int) -> Tensor:
 def triangulate_tracks(
     tracks: Tracks, pixels: Tensor, T_cw: Tensor, camera: Camera, min_parallax_deg: float
 ) -> tuple[Tensor, Tensor]:
-    """(T, 3) points of the tracks and (T,) whether they are in front of their keyframes, with enough parallax.
+    """Triangulate points (T, 3); (T,) whether they are in front of their keyframes with enough parallax.
 
     pixels: (O, 2); T_cw: (K, 4, 4)
     """
     length = torch.bincount(tracks.track)
     start = length.cumsum(0) - length
-    slot = torch.arange(VIEWS, device=length.device)
-    used = length.clamp(max=VIEWS)[:, None]
+    slot = torch.arange(MAX_VIEWS, device=length.device)
+    used = length.clamp(max=MAX_VIEWS)[:, None]
     mask = slot < used
-    # Evenly over the track, its ends included.
+    # Evenly over the track, including its ends.
     step = (length[:, None] - 1).double() / (used - 1).clamp(min=1).double()
     rows = start[:, None] + torch.where(mask, (slot * step).round().long(), 0)
     points, good = [], []
@@ -218,15 +212,15 @@ def triangulate_tracks(
 
 
 def make_map(views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, points_w: Tensor) -> Map:
-    """A map of keyframes at T_cw (K, 4, 4) and points (T, 3) that they see as the tracks say."""
+    """Create a map of keyframes at T_cw (K, 4, 4) with the points (T, 3) of the tracks."""
     made = Map()
     for view, T in zip(views, T_cw, strict=True):
         made.add_keyframe(view, T)
     first = torch.searchsorted(tracks.track, torch.arange(tracks.count, device=points_w.device))
-    born = tracks.keyframe[first]
-    ids = torch.full_like(born, -1)
+    first_keyframe = tracks.keyframe[first]
+    ids = torch.full_like(first_keyframe, -1)
     for keyframe, view in enumerate(views):
-        own = torch.nonzero(born == keyframe)[:, 0]
+        own = torch.nonzero(first_keyframe == keyframe)[:, 0]
         descriptors = view.descriptors[tracks.keypoint[first[own]]]
         ids[own] = made.add_points(points_w[own], descriptors, keyframe)
     for keyframe in range(len(views)):

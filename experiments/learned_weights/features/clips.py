@@ -8,7 +8,7 @@ import torch
 
 from torchslam import ClipSLAM, clip_loss
 from torchslam.data.sequence import Sequence
-from torchslam.learning.clips import Clip, frames_in
+from torchslam.learning.dataset import Clip, frames_in
 from torchslam.learning.losses import relative_ate
 
 FRAMES = 8

@@ -13,7 +13,7 @@ from torchslam import Features
 RADIUS = 5  # of the patch around a keypoint, pixels
 NUM_INPUTS = (2 * RADIUS + 1) ** 2
 REACH = 3.0  # pixels a keypoint may move along x and along y
-NOISE = 0.02  # grey value below which contrast is not amplified
+NOISE = 0.02  # gray value below which contrast is not amplified
 
 
 class SubPixel(nn.Module):
@@ -48,7 +48,7 @@ class SubPixel(nn.Module):
 
 
 class Remembering(nn.Module):
-    """A front end that, asked for the very images it was asked for last, answers without looking again."""
+    """A front end that caches the features of its last images."""
 
     def __init__(self, front_end: nn.Module) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class Remembering(nn.Module):
 
 
 def patches(images: Tensor, keypoints: Tensor) -> Tensor:
-    """(B, N, NUM_INPUTS) grey values around keypoints (B, N, 2), row by row, with mean 0 and deviation 1."""
+    """(B, N, NUM_INPUTS) gray values around keypoints (B, N, 2), row by row, with mean 0 and deviation 1."""
     height, width = images.shape[-2:]
     axis = torch.arange(-RADIUS, RADIUS + 1, device=images.device, dtype=images.dtype)
     around = torch.cartesian_prod(axis, axis).flip(-1)  # (x, y)

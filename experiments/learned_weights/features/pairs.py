@@ -1,4 +1,4 @@
-"""Two views at a time: how well matched keypoints tell the motion between them."""
+"""Pairs of views: how well matched keypoints determine the relative pose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam import Camera, Features, estimate_relative_pose, match
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import RelativePose, se3_inverse
-from torchslam.learning.clips import Clip, frames_in
+from torchslam.learning.dataset import Clip, frames_in
 from torchslam.learning.losses import motion_difference
 
 APART_S = 0.3
@@ -79,7 +79,7 @@ def matched_pixels(features: Features) -> tuple[Tensor, Tensor]:
 
 
 def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
-    """The motion that matches (M, 2) tell, as the system's start does: by those within a threshold."""
+    """The relative pose of matches (M, 2) within a threshold, as in map initialization."""
     return estimate_relative_pose(
         pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX, kernel="truncated", min_samples=64
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 from experiments.common import table
 from experiments.learned_weights.features.pairs import PairErrors
 
-BLOCK = 5  # neighbouring pairs that are drawn together: they see much of the same
+BLOCK = 5  # neighboring pairs that are drawn together: they see much of the same
 DRAWS = 4000
 ERRORS = ("rotation error", "direction error", "rotation between halves", "direction between halves")
 
@@ -97,7 +97,7 @@ def ratio(logs: list[Tensor], block: int) -> str:
 def bootstrap(logs: list[Tensor], block: int) -> tuple[float, float]:
     """95 % interval of the exponential of the mean of several parts' values, drawn anew within each part.
 
-    Runs of `block` neighbours are drawn as one.
+    Runs of `block` neighbors are drawn as one.
     """
     generator = torch.Generator().manual_seed(0)
     totals, counts = torch.zeros(DRAWS, dtype=torch.float64), torch.zeros(DRAWS, dtype=torch.float64)

@@ -22,7 +22,7 @@ from experiments.learned_weights.features.tracks import Tracks
 from experiments.learned_weights.features.training import Settings, train
 from torchslam import ORB, ClipSLAM, XFeat
 from torchslam.data.sequence import Sequence
-from torchslam.learning.clips import frames_in
+from torchslam.learning.dataset import frames_in
 
 HERE = Path(__file__).parent
 WEIGHTS = Path(__file__).parents[3] / "shared" / "weights" / "xfeat.safetensors"
@@ -84,7 +84,7 @@ def measure(candidates: Mapping[str, nn.Module], parts: dict[str, Part], device:
 
 
 def parts_of(shares: dict[str, tuple[float, float]], pairs: int, clips: int) -> dict[str, Part]:
-    """Parts of the sequences that are at hand."""
+    """Parts of the available sequences."""
     return {
         name: Part.of(sequence, share, pairs, clips)
         for name, share in shares.items()

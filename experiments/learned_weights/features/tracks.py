@@ -1,4 +1,4 @@
-"""Localisation problems whose matches are chosen once: keypoints followed through views around a base frame.
+"""Localization problems whose matches are chosen once: keypoints followed through views around a base frame.
 
 The front end stays as it is and matching is discrete, so both are done before the training. What is left of an image
 are its keypoints and the patches around them.
@@ -21,7 +21,7 @@ VIEWS_S = (-0.4, -0.2, 0.0, 0.2, 0.4)  # seconds from the base frame
 MAX_DISTANCE = 0.25  # 1 - cosine
 MAX_ERROR = 4.0  # pixels; matches further from the true poses are taken for wrong ones
 MIN_PARALLAX = 0.01  # radians
-MIN_VIEWS = 3  # that see a track: two make the point, the third is localised
+MIN_VIEWS = 3  # that see a track: two make the point, the third is localized
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Training through the error of poses: small draws of tracks, triangulated and localised in every step."""
+"""Training through the error of poses: small draws of tracks, triangulated and localized in every step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIN_TRACKS = 6
 
 @dataclass(frozen=True)
 class Settings:
-    """steps: of the optimiser; problems: of a step; tracks: of a problem, drawn anew every time
+    """steps: of the optimizer; problems: of a step; tracks: of a problem, drawn anew every time
 
     Of few tracks a pose says more about each: the error is the sum of all their errors.
     """
@@ -36,7 +36,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Draw:
-    """B problems of K tracks, and the view that is localised in all of them. Shapes as in `Tracks`."""
+    """B problems of K tracks, and the view that is localized in all of them. Shapes as in `Tracks`."""
 
     frames: Tensor
     indices: Tensor
@@ -45,7 +45,7 @@ class Draw:
 
 
 def draw(tracks: Tracks, settings: Settings, generator: torch.Generator) -> Draw:
-    """Some problems, and of each some tracks that the localised view and two others see."""
+    """Some problems, and of each some tracks that the localized view and two others see."""
     rows = torch.randint(len(tracks), (settings.problems,), generator=generator)
     query = int(torch.randint(tracks.frames.shape[1], (1,), generator=generator))
     seen = tracks.seen[rows]
@@ -69,10 +69,10 @@ def drawn_pixels(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tens
     return straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
 
 
-def localisation_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
+def localization_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
     """Errors (B, 2) of position, as a share of the median depth, and rotation, radians; (B,) whether there is a pose.
 
-    Points are triangulated with the true poses of the other views; the world is the true camera of the localised one,
+    Points are triangulated with the true poses of the other views; the world is the true camera of the localized one,
     where its refinement starts as well.
     """
     pixels, pinhole = drawn_pixels(front_end, tracks, drawn)
@@ -100,7 +100,7 @@ def localisation_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tup
 
 def pose_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
     """() the mean over problems of what grows like the logarithm of both errors, so that a few hopeless do not rule."""
-    errors, success = localisation_errors(front_end, tracks, drawn)
+    errors, success = localization_errors(front_end, tracks, drawn)
     each = (errors / UNIT).log1p().sum(-1)
     return torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
 

@@ -82,7 +82,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Least squares over the matches that agree with the true pose, as nobody can know: a bound, and no fair one.
+    """Least squares over the matches that agree with the true pose, unknown in practice: a lower bound of the error.
 
     It also picks, among matches of equal quality, those whose noise happens to point towards the truth.
     """

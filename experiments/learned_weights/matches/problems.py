@@ -1,8 +1,8 @@
-"""Localisation problems from real images: where is a frame, given points triangulated from a few frames before?
+"""Localization problems from real images: where is a frame, given points triangulated from a few frames before?
 
 Points come from matches of a base frame with two frames before it, triangulated with the reference poses; a later
 frame is matched to them by descriptor alone. Every problem is made in both directions of time. Its world is the base
-frame's camera, so errors are in metres without any alignment.
+frame's camera, so errors are in meters without any alignment.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torch import Tensor
 from torchslam.data.sequence import Sequence
 from torchslam.features import ORB, hamming, match
 from torchslam.geometry import Camera, estimate_absolute_pose, se3_inverse, transform, triangulate_many
-from torchslam.learning.clips import frames_in
+from torchslam.learning.dataset import frames_in
 from torchslam.types import Features
 
 REFERENCES_S = (0.2, 0.4)  # seconds before the base frame that points are triangulated with
-QUERIES_S = (0.5, 1.0, 2.0)  # seconds after it that frames are localised
+QUERIES_S = (0.5, 1.0, 2.0)  # seconds after it that frames are localized
 BASES_PER_SECOND = 10
 MAX_MATCHES = 400
 MIN_MATCHES = 30
@@ -65,7 +65,7 @@ class Cues:
 
 @dataclass(frozen=True)
 class Problems:
-    """P localisation problems of N matches, padded.
+    """P localization problems of N matches, padded.
 
     points:      (P, N, 3) in the camera frame of the base
     covariances: (P, N, 3, 3) of the points, for keypoints as good as one pixel of their level
@@ -102,7 +102,7 @@ class Problems:
 
     @property
     def camera(self) -> Camera:
-        """One per problem; the size only tells how far a point that does not project counts as off."""
+        """One per problem; the size only determines the error of a point that does not project."""
         zero = torch.zeros_like(self.focals)
         return Camera("pinhole", torch.stack([self.focals, self.focals, zero, zero], -1), (640, 480))
 
@@ -182,7 +182,7 @@ def make_problems(sequence: Sequence, part: range, T_cw: Tensor) -> Problems:
         landmarks = _triangulate(frames, base, references)
         queries = [base + direction * offset for offset in ahead]
         problems += [
-            _localisation(frames, references, base, query, landmarks)
+            _localization(frames, references, base, query, landmarks)
             for query in queries
             if frames.usable([query], part)
         ]
@@ -262,7 +262,7 @@ def _covariances(points: Tensor, T_vb: Tensor, weights: Tensor, camera: Camera, 
     return torch.where((singular == 0)[:, None, None], covariances, eye)
 
 
-def _localisation(
+def _localization(
     frames: _Frames, references: list[int], base: int, query: int, landmarks: _Landmarks
 ) -> Problems | None:
     """The problem of one query frame, still without RANSAC; None where it has too few matches."""

@@ -1,8 +1,8 @@
-"""Reference poses: those of a bundle adjustment over all frames of a sequence, in the metres of its ground truth.
+"""Reference poses: those of a bundle adjustment over all frames of a sequence, in the meters of its ground truth.
 
-What sensors say is good to centimetres, and that is as large as the errors of the problems; adjusted poses explain the
+What sensors say is good to centimeters, and that is as large as the errors of the problems; adjusted poses explain the
 images to fractions of a pixel. That such a reference favours methods like the one that made it is known (Brachmann et
-al., "On the limits of pseudo ground truth in visual camera re-localisation", 2021): the given poses are kept beside.
+al., "On the limits of pseudo ground truth in visual camera re-localization", 2021): the given poses are kept beside.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ _BLOCK_S = 1.0  # problems that begin in the same second share frames: they are 
 
 @dataclass(frozen=True)
 class PartResult:
-    """Errors on one part by method: (S, P, 2) metres and radians of S seeds, one where nothing is trained."""
+    """Errors on one part by method: (S, P, 2) meters and radians of S seeds, one where nothing is trained."""
 
     problems: Problems
     errors: dict[str, Tensor]
@@ -75,7 +75,7 @@ def gain(parts: list[PartResult]) -> str:
     spread = f" ± {100 * float(gains.std()):.1f}" if len(gains) > 1 else ""
     mean = f"{100 * float(gains.mean()):+.1f}{spread} %"
     if max(int(part.blocks().max()) for part in parts) == 0:
-        return mean  # a single block tells nothing about the spread
+        return mean  # a single block does not determine the spread
     low, high = _interval(parts)
     return f"{mean} ({100 * low:+.0f} to {100 * high:+.0f})"
 
@@ -104,5 +104,5 @@ def error_table(parts: dict[str, PartResult]) -> str:
 
 def _cell(errors: Tensor) -> str:
     """Median errors (S, P, 2) in words, the mean over seeds."""
-    metres, radians = errors.median(1).values.mean(0).tolist()
-    return f"{100 * metres:.2f} cm, {math.degrees(radians):.3f}°"
+    meters, radians = errors.median(1).values.mean(0).tolist()
+    return f"{100 * meters:.2f} cm, {math.degrees(radians):.3f}°"

@@ -28,7 +28,7 @@ class Settings:
 
 
 def losses(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
-    """(P,) how large the errors of position and rotation are in units (P, 2) of metres and radians.
+    """(P,) how large the errors of position and rotation are in units (P, 2) of meters and radians.
 
     Grows like a logarithm, so that the problems in the middle count, not the hopeless ones; zero on failure.
     """
@@ -41,7 +41,7 @@ def losses(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
 
 @torch.no_grad()
 def expected_errors(problems: Problems) -> Tensor:
-    """(P, 2) standard deviations of position (metres) and rotation (radians) by the covariance of equal weights."""
+    """(P, 2) standard deviations of position (meters) and rotation (radians) by the covariance of equal weights."""
     parts = [problems[start : start + _CHUNK] for start in range(0, len(problems), _CHUNK)]
     refined = [refine(part, None, UNIFORM.kernel, UNIFORM.scale) for part in parts]
     variances = torch.cat([result.covariance.diagonal(dim1=-2, dim2=-1) for result in refined])

@@ -16,11 +16,11 @@ KERNEL: Kernel = "cauchy"
 SCALE = 1.0
 ITERATIONS = 10
 TOLERANCE = 1e-7
-NEIGHBOURHOOD = 0.06  # radius in focal lengths
+NEIGHBORHOOD = 0.06  # radius in focal lengths
 
 
 class InContext(nn.Module):
-    """A number for each match from its cues, the match seen beside the mean of its problem; zero at first."""
+    """A score of each match from its cues and the mean over its problem; initially zero."""
 
     def __init__(self, num_cues: int, width: int, seed: int) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ def crowd_and_support(
 ) -> tuple[Tensor, Tensor]:
     """(P, N) logarithm of the number of matches nearby over its mean, and the share of inliers among the others.
 
-    Errors of neighbours are alike: their points were made from the same frames, and move with the same objects.
+    Errors of neighbors are alike: their points were made from the same frames, and move with the same objects.
 
     positions: (P, N, 2); radius: of what is nearby in their units, one or (P, 1, 1); inliers, mask: (P, N) bool
     """
@@ -119,7 +119,7 @@ class _Head(InContext):
 
 
 def describe(problems: Problems, T: Tensor) -> Tensor:
-    """What the network knows of each match, free of units and of about unit size: (P, N, NUM_FEATURES).
+    """Inputs of the network for each match, without unit and of about unit size: (P, N, NUM_FEATURES).
 
     Residuals, depths and propagated variances are those at the poses T (P, 4, 4).
     """
@@ -135,7 +135,7 @@ def describe(problems: Problems, T: Tensor) -> Tensor:
     growth = (cues.scales_query * depths_q / (cues.scales_base * depths_b)).log()
     turn = cues.turns - masked_median(cues.turns, mask)
     x = problems.pixels / problems.focals[:, None, None]
-    crowd, support = crowd_and_support(x, NEIGHBOURHOOD, inliers, mask)
+    crowd, support = crowd_and_support(x, NEIGHBORHOOD, inliers, mask)
     columns = [
         cues.distances / 32 - 1,
         4 * (cues.distances / cues.seconds_query.clamp_min(1)) - 3,

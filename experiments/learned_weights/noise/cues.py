@@ -1,4 +1,4 @@
-"""What a keypoint of ORB shows that may tell how far off it is: level, response, contrast, form, neighborhood."""
+"""Cues for the accuracy of an ORB keypoint: level, response, contrast, shape, neighborhood."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ sharpness: the median gradient of the image's keypoints, which motion blur lower
 RADIUS = 4
 _BITS = 256
 _NEAR = 0.5  # scales: keypoints of two levels at one place are no nearer than that to each other
-_FLAT = 1.0  # gray value: the noise of a camera, below which a contrast says nothing
+_FLAT = 1.0  # gray value: the noise of a camera, below which contrast is meaningless
 
 
 @dataclass(frozen=True)

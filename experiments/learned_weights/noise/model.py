@@ -1,4 +1,4 @@
-"""From cues to the information of a keypoint, and a front end that says it."""
+"""A model from cues to the information of a keypoint, and a front end with it."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def load(path: str | Path) -> NoiseModel:
 
 
 class Informed(nn.Module):
-    """ORB whose keypoints say how far off they are: `--features experiments.learned_weights.noise.model:Informed`.
+    """ORB with predicted information of its keypoints: `--features experiments.learned_weights.noise.model:Informed`.
 
     weights: a file that `save` wrote
     """

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from tests.learning.test_clip import FRAMES, BentEyes
+from tests.learning.test_clip_slam import FRAMES, BentEyes
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, turn
 from torchslam import Camera, ClipSLAM, Features
@@ -19,8 +19,8 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import SequenceError
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import rigid, se3_inverse, so3_exp
-from torchslam.learning import clips as clips_module
-from torchslam.learning.clips import (
+from torchslam.learning import dataset
+from torchslam.learning.dataset import (
     Batches,
     Clip,
     Clips,
@@ -71,7 +71,7 @@ class Knowing(nn.Module):
 def chosen(
     monkeypatch: pytest.MonkeyPatch, walk: Walk, has_truth: bool = True, **options: object
 ) -> list[tuple[int, int, int]]:
-    monkeypatch.setattr(clips_module, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
+    monkeypatch.setattr(dataset, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
     told = Told(se3_inverse(true_T_cw(walk)), has_truth)
     return Clips([told], **options).chosen  # type: ignore[arg-type]
 
@@ -90,8 +90,8 @@ def simulated(poses: Tensor, near: float = 50.0, far: float = 70.0) -> Features:
 def test_parallax_is_the_angle_at_the_points(depths: tuple[float, float]) -> None:
     """A step of 0.1 before points at a depth z is an angle of about 0.1 / z, however the camera turns."""
     R = so3_exp(torch.tensor([0.0, 0.05, 0.02]).double())
-    centres = torch.tensor([[0.0, 0, 0], [0.1, 0, 0]]).double()
-    T_cw = se3_inverse(rigid(torch.stack([torch.eye(3).double(), R]), centres))
+    centers = torch.tensor([[0.0, 0, 0], [0.1, 0, 0]]).double()
+    T_cw = se3_inverse(rigid(torch.stack([torch.eye(3).double(), R]), centers))
     features, camera = simulated(T_cw, *depths), Walk(still(2)).camera
     found = parallax(features[:1], features[1:], camera, T_cw[1, :3, :3] @ T_cw[0, :3, :3].mT)
     assert found == pytest.approx(0.1 / math.sqrt(0.05**2 * depths[0] * depths[1]), rel=0.1)
@@ -148,7 +148,7 @@ def test_a_clip_has_the_frames_it_says() -> None:
     assert torch.equal(clip.T_cw, true_T_cw(walk)[2:15:3])
     assert clip.known.all()
     assert int(clip.number) == 7
-    with pytest.raises(SequenceError, match="5 frames from 10, 3 apart, lie not within its 20"):
+    with pytest.raises(SequenceError, match="5 frames from 10, 3 apart, exceed its 20 frames"):
         Clip.of(walk, 10, frames=5, stride=3)
     assert int(Clip.of(walk, 7, frames=5, stride=3).images[-1, 0, 0, 0]) == 19
     blind = Clip.of(Told(arc(20), has_truth=False), 2, frames=5, stride=3)
@@ -182,7 +182,7 @@ def test_a_batch_has_a_camera_for_each_clip() -> None:
         torch.testing.assert_close(batch.camera.project(points.expand(2, 1, 3))[0][row], alone)
     with pytest.raises(ValueError, match=r"one model.*fisheye.*pinhole"):
         stack_cameras([walks[0].camera, FISHEYE])
-    with pytest.raises(ValueError, match="one number and size"):
+    with pytest.raises(ValueError, match="same number and size"):
         collate([Clip.of(walks[0], 0, frames=frames, stride=2) for frames in (3, 4)])
 
 
@@ -198,13 +198,13 @@ def test_batches_show_every_clip_once_an_epoch_and_resume_anywhere() -> None:
     assert rows(0, 14, seed=1) != whole
     shares = [rows(0, 7, rank=rank, ranks=2) for rank in range(2)]
     assert [row for pair in zip(*shares, strict=True) for row in pair] == whole
-    with pytest.raises(ValueError, match="batches of 3 of 0"):
+    with pytest.raises(ValueError, match="batch size 3, 0 clips"):
         Batches(0, 3)
 
 
 def test_clips_come_through_a_loader(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(40, length=2.0))
-    monkeypatch.setattr(clips_module, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
+    monkeypatch.setattr(dataset, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
     clips = Clips([Told(se3_inverse(true_T_cw(walk)))], frames=4, per_sequence=3)
     batches = Batches(len(clips), 2)
     loader = DataLoader(clips, batch_sampler=batches, collate_fn=collate)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.learning.test_clip import CONFIG, FRAMES, BentEyes, clip_of, derivative
+from tests.learning.test_clip_slam import CONFIG, FRAMES, BentEyes, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
 from torchslam.evaluation import ate
@@ -114,7 +114,7 @@ def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
     assert clip_slam.pose(ClipGraph.stack(graphs[:1]), features[:1]).T_cw.shape == (1, FRAMES, 4, 4)
     with pytest.raises(ValueError, match="one clip each"):
         ClipGraph.stack([ClipGraph.stack(graphs), graphs[0]])
-    with pytest.raises(ValueError, match="equally many frames"):
+    with pytest.raises(ValueError, match="same number of frames"):
         ClipGraph.stack([graphs[0], replace(graphs[1], frames=4)])
     with pytest.raises(ValueError, match=f"2 clips of {FRAMES} frames"):
         clip_slam.pose(ClipGraph.stack(graphs), features[:1])
@@ -144,8 +144,8 @@ def test_what_started_no_map_has_no_pose_later() -> None:
     graph = clip_slam.build_graph(images, walk.camera)
     assert graph.runs == (None,)
     poses = clip_slam.pose(graph, clip_slam.extract(images))
-    assert graph.reasons == poses.reason
-    assert poses.reason[0].startswith("no map was initialised")
+    assert graph.reasons == poses.reasons
+    assert poses.reasons[0].startswith("no map was initialized")
     assert poses.T_cw.shape == (4, 4, 4)
     assert poses.T_cw.requires_grad
 
@@ -168,9 +168,9 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     together = clip_slam.pose(ClipGraph.stack(looked), features)
     alone = [clip_slam.pose(*one) for one in zip(looked, features, strict=True)]
     assert together.success.tolist() == [True, False, True, False]
-    assert together.reason == tuple(each.reason[0] for each in alone)
-    assert together.reason[1].startswith("no map was initialised")
-    assert "not determined" in together.reason[3]
+    assert together.reasons == tuple(each.reasons[0] for each in alone)
+    assert together.reasons[1].startswith("no map was initialized")
+    assert "not determined" in together.reasons[3]
     assert [graph is None for graph in together.graphs] == [False, True, False, False]
     assert [solution is None for solution in together.solutions] == [False, True, False, False]
     assert torch.equal(together.posed, torch.stack([each.posed for each in alone]))

@@ -137,21 +137,21 @@ def test_a_clip_without_a_map_has_no_pose_and_a_gradient_of_zero() -> None:
     poses = ClipSLAM(eyes)(images, walk.camera)
     assert not poses.posed.any()
     assert not poses.success
-    (reason,) = poses.reason
+    (reason,) = poses.reasons
     assert reason.startswith(
-        "no map was initialised in 4 frames: the camera stands still"
+        "no map was initialized in 4 frames: the camera stands still"
     )  # as a run says it
-    assert poses.failures == 1.0
+    assert poses.failure_rate == 1.0
     assert poses.graphs == poses.solutions == (None,)
     assert torch.equal(poses.T_cw, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
     assert ate(poses.T_cw, truth, poses.posed).isnan()
     for choice in ("raise", "skip"):
         with pytest.raises(
-            ClipError, match="1 of 1 clips failed; clip 0: no map was initialised in 4 frames"
+            ClipError, match="1 of 1 clips failed; clip 0: no map was initialized in 4 frames"
         ):
             clip_loss(poses, truth, on_failure=choice)
-    loss, failures = clip_loss(poses, truth, on_failure=2.5)
-    assert (float(loss.detach()), failures) == (2.5, 1.0)
+    loss, failure_rate = clip_loss(poses, truth, on_failure=2.5)
+    assert (float(loss.detach()), failure_rate) == (2.5, 1.0)
     loss.backward()
     assert eyes.bend.grad == 0
 
@@ -165,9 +165,9 @@ def test_a_failed_clip_is_no_clip_without_error() -> None:
     success, reason = torch.tensor([True, False, True]), ("", "no map started", "")
     poses = ClipPoses(T_cw, posed, success, reason, (None,) * 3, (None,) * 3)
     errors = ate(T_cw, truth, posed)[[0, 2]]
-    loss, failures = clip_loss(poses, truth, on_failure="skip")
+    loss, failure_rate = clip_loss(poses, truth, on_failure="skip")
     torch.testing.assert_close(loss, errors.mean())
-    assert failures == pytest.approx(1 / 3)
+    assert failure_rate == pytest.approx(1 / 3)
     torch.testing.assert_close(clip_loss(poses, truth, on_failure=3.0).loss, (errors.sum() + 3) / 3)
     (gradient,) = torch.autograd.grad(loss, T_cw)
     assert gradient.isfinite().all()

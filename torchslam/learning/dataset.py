@@ -1,4 +1,4 @@
-"""Clips of sequences to learn from: chosen once, by what their images show, and read when they are asked for."""
+"""A data set of clips of sequences: selected once by the parallax of their images, read on access."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import SequenceError
 from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse
-from torchslam.learning.clip import ClipGraph, ClipSLAM
+from torchslam.learning.clip_slam import ClipGraph, ClipSLAM
 from torchslam.learning.training import seed_of
 from torchslam.types import Features
 
 MIN_MATCHES = 50
-"""Between the first and the last frame of a clip: with fewer, its frames hardly show the same."""
+"""Between the first and the last frame of a clip; with fewer they hardly overlap."""
 MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""
-_KEYPOINTS = 500  # of the images that clips are chosen by
+_KEYPOINTS = 500  # per image when selecting clips
 
 
 @dataclass(frozen=True)
 class Clip:
     """T frames of a sequence, or B clips of T frames.
 
-    images: (T, 1, H, W) or (B, T, 1, H, W) float32 in [0, 1]
-    T_cw:   (T, 4, 4) or (B, T, 4, 4) float64 true poses, world to camera, metres; the identity where unknown
-    known:  (T,) or (B, T) bool, where there is a true pose
-    camera: params (K,) or (B, K)
-    number: () or (B,) int64 in the data set that it is of
+    Attributes:
+        images: (T, 1, H, W) or (B, T, 1, H, W) float32 in [0, 1].
+        T_cw: (T, 4, 4) or (B, T, 4, 4) float64 true poses, world to camera, meters; the identity where unknown.
+        known: (T,) or (B, T) bool, where there is a true pose.
+        camera: With params (K,) or (B, K).
+        number: () or (B,) int64 index in the data set.
     """
 
     images: Tensor
@@ -55,14 +56,14 @@ class Clip:
         number: int = 0,
         supervised: bool = False,
     ) -> Clip:
-        """The frames `start`, `start + stride`, ... of a sequence.
+        """Read the frames `start`, `start + stride`, ... of a sequence.
 
-        Raises SequenceError where it has not so many or, if `supervised`, has no true pose of one of them.
+        Raises SequenceError if the sequence is too short or, if `supervised`, lacks the true pose of one of them.
         """
         indices = range(start, start + frames * stride, stride)
         if indices[-1] >= len(sequence):
             raise SequenceError(
-                f"{sequence.name}: {frames} frames from {start}, {stride} apart, lie not within its {len(sequence)}"
+                f"{sequence.name}: {frames} frames from {start}, {stride} apart, exceed its {len(sequence)} frames"
             )
         found = [sequence[index] for index in indices]
         known = torch.tensor([frame.T_cw_groundtruth is not None for frame in found])
@@ -79,19 +80,21 @@ class Clip:
         )
 
     def to(self, device: torch.device | str) -> Clip:
-        """With its images on a device; geometry stays where it is."""
+        """Move the images to a device; poses and camera stay."""
         return replace(self, images=self.images.to(device))
 
 
 def collate(clips: Several[Clip]) -> Clip:
-    """B clips, of one each, with a camera for each, as `DataLoader(collate_fn=collate)` asks for.
+    """Stack clips of one each into one of B clips, with a camera for each; for `DataLoader(collate_fn=collate)`.
 
-    Clips with and without distortion go together: no distortion is one with coefficients of zero. Raises ValueError for
-    clips of different sizes or numbers of frames, and for a fisheye beside other cameras.
+    Pinhole cameras get distortion coefficients of zero where others are distorted. Raises ValueError for different
+    sizes or numbers of frames, and for fisheye cameras mixed with others.
     """
     sizes = {tuple(clip.images.shape) for clip in clips}
     if len(sizes) > 1 or len({clip.camera.size for clip in clips}) > 1:
-        raise ValueError(f"clips of a batch must have frames of one number and size, not {sorted(sizes)}")
+        raise ValueError(
+            f"clips of a batch must have the same number and size of frames, not {sorted(sizes)}"
+        )
     return Clip(
         torch.stack([clip.images for clip in clips]),
         torch.stack([clip.T_cw for clip in clips]),
@@ -102,7 +105,7 @@ def collate(clips: Several[Clip]) -> Clip:
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """One camera with params (B, K) of B cameras (K,) of one size; pinholes become distorted where others are."""
+    """Stack B cameras of one size into one with params (B, K); pinholes are padded where others are distorted."""
     models = {camera.model for camera in cameras}
     if models == {"pinhole", "radial_tangential"}:
         width = max(camera.params.shape[-1] for camera in cameras)
@@ -114,29 +117,33 @@ def stack_cameras(cameras: Several[Camera]) -> Camera:
 
 
 def frames_in(seconds: float, sequence: Sequence) -> int:
-    """Frames that make up a time, at least one."""
+    """The number of frames in a time, at least one."""
     return max(1, round(seconds * sequence.frame_rate))
 
 
 class Clips(Dataset[Clip]):
-    """Clips of sequences that move enough to show depth, in the order of sequences and time.
+    """Clips of sequences with enough motion to determine depth, ordered by sequence and time.
 
         clips = Clips([open_sequence("redkitchen")], per_sequence=100)
         loader = DataLoader(clips, batch_sampler=Batches(len(clips), 4), collate_fn=collate)
 
-    A clip begins at a frame drawn at random. Its frames are 1, 2, 4, ... apart: by the least such stride with which
-    matches between its first and its last frame have a parallax of `min_parallax` in the median. A start for which
-    there is none before fewer than `MIN_MATCHES` match is left out. The same arguments give the same clips. Raises
-    CalibrationError for a sequence without a camera, FrameError where an image to choose by cannot be read.
+    A clip starts at a random frame. Its stride is the least of 1, 2, 4, ... for which matches between the first and
+    the last frame have a median parallax of `min_parallax`. Starts without such a stride, or with fewer than
+    `MIN_MATCHES` matches, are skipped. The same arguments give the same clips. `chosen` has (sequence, start, stride)
+    of each clip.
 
-    frames:       of a clip
-    per_sequence: at most so many clips of each sequence, beginning at different frames
-    min_parallax: radians
-    max_stride:   frames
-    supervised:   whether every frame of a clip must have a true pose
-    seed:         of the starts
+    Args:
+        sequences: Sequences with cameras.
+        frames: T, frames of a clip.
+        per_sequence: Maximum number of clips of each sequence, starting at different frames.
+        min_parallax: Radians.
+        max_stride: Frames.
+        supervised: Whether every frame of a clip must have a true pose.
+        seed: Of the starts.
 
-    chosen:       (sequence, start, stride) of each clip
+    Raises:
+        CalibrationError: A sequence without a camera.
+        FrameError: An image that cannot be read.
     """
 
     def __init__(
@@ -167,24 +174,30 @@ class Clips(Dataset[Clip]):
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Clip:
-        """Raises FrameError where an image cannot be read."""
+        """Read a clip. Raises FrameError if an image cannot be read."""
         sequence, start, stride = self.chosen[number]
         return Clip.of(self.sequences[sequence], start, self.frames, stride, number)
 
 
 class Batches(Sampler[list[int]]):
-    """Batches of a data set's numbers without end, for `DataLoader(batch_sampler=...)`; every epoch in a new order.
+    """Endless batches of indices for `DataLoader(batch_sampler=...)`, in a new order every epoch.
 
-    Each batch is a function of its number and of the arguments alone: a training that goes on says with `first` where.
+    Each batch depends only on its number and on the arguments, so resumed training sets `first`.
 
-    length: of the data set; batch: clips of a batch, on each of `ranks` processes, of which this is number `rank`
+    Args:
+        length: Of the data set.
+        batch: Clips of a batch, on each process.
+        seed: Of the order.
+        first: Number of the first batch.
+        rank: Of this process.
+        ranks: Number of processes.
     """
 
     def __init__(
         self, length: int, batch: int, seed: int = 0, first: int = 0, rank: int = 0, ranks: int = 1
     ) -> None:
         if length < 1 or batch < 1:
-            raise ValueError(f"batches of {batch} of {length} clips are none")
+            raise ValueError(f"batches need at least one clip: batch size {batch}, {length} clips")
         self.length, self.batch, self.seed, self.first = length, batch, seed, first
         self.rank, self.ranks = rank, ranks
 
@@ -203,10 +216,9 @@ class Batches(Sampler[list[int]]):
 
 
 class GraphCache:
-    """Graphs of the clips of a data set, each built once, by a copy of the front end as it is now.
+    """Graphs of the clips of a data set, each built once, by a copy of the initial front end.
 
-    So what is seen of a clip does not depend on when in a training it first came: one that is resumed, with a front end
-    that begins as it did, sees the same.
+    The graph of a clip therefore does not depend on when it first occurs, and resumed training sees the same graphs.
     """
 
     def __init__(self, clip_slam: ClipSLAM) -> None:
@@ -214,7 +226,7 @@ class GraphCache:
         self._graphs: dict[int, ClipGraph] = {}
 
     def __call__(self, clips: Clip) -> ClipGraph:
-        """The graph of a batch as `collate` makes it."""
+        """Return the graph of a batch made by `collate`."""
         numbers = clips.number.tolist()
         for row, number in enumerate(numbers):
             if number not in self._graphs:
@@ -224,10 +236,16 @@ class GraphCache:
 
 @torch.no_grad()
 def parallax(first: Features, second: Features, camera: Camera, R_21: Tensor | None = None) -> float:
-    """The median angle, radians, between the rays of matches, the rotation of the camera undone.
+    """Measure the median angle between the rays of matches after rotation compensation, in radians.
 
-    first, second: of one image each; R_21: (3, 3) from the first camera to the second, estimated where it is None.
-    Zero where fewer than `MIN_MATCHES` match, or where nobody can tell how the camera moved.
+    Args:
+        first: Features of one image.
+        second: Features of another one.
+        camera: Of both.
+        R_21: (3, 3) rotation from the first camera to the second; estimated if None.
+
+    Returns:
+        Radians; zero with fewer than `MIN_MATCHES` matches, or if the relative pose cannot be estimated.
     """
     matches = match(first, second)
     rows = matches.mask[0].nonzero().squeeze(-1)
@@ -246,7 +264,7 @@ def parallax(first: Features, second: Features, camera: Camera, R_21: Tensor | N
 
 
 class _Seen:
-    """What there is in the frames of a sequence that clips are chosen by; every image is read once."""
+    """Features and poses of a sequence for selecting clips; every image is read once."""
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
@@ -254,7 +272,7 @@ class _Seen:
         self._features: dict[int, Features] = {}
 
     def stride(self, start: int, steps: int, least: float, most: int) -> int:
-        """The least of 1, 2, 4, ... `most` with which the frame `steps` strides later shows parallax; 0 for none."""
+        """The least of 1, 2, 4, ... `most` with enough parallax to the frame `steps` strides later; 0 for none."""
         stride = 1
         while stride <= most and start + steps * stride < len(self._sequence):
             first, second = start, start + steps * stride
