@@ -56,7 +56,7 @@ def main() -> None:
         names = sorted(results())
     else:
         mutmut(
-            "torchslam.tracking.unposed_frames.*"
+            "torchslam.tracking.backward_tracking.*"
         )  # a few, so that all mutants are made and the tests are timed
         names = sorted(name for name in results() if options.within in name)
         if 0 < options.sample < len(names):

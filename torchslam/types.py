@@ -166,7 +166,7 @@ class FrameFeatures:
         if weights is None:
             return self
         factors = torch.ones_like(self.scales).index_put((keypoints,), weights)
-        return replace(self, information=self.noise.stated().weighed(factors).information)
+        return replace(self, information=self.noise.with_explicit_information().scaled(factors).information)
 
     @property
     def scale_range(self) -> tuple[float, float]:
@@ -289,7 +289,10 @@ class Trajectory:
 
 
 class Reason(StrEnum):
-    """Effect of a frame on the state of the system, the text of `StepResult.reason`; some reasons add numbers."""
+    """Why a frame has no pose, an uncertain one or became a keyframe: the text of `StepResult.reason`.
+
+    Texts with fields in braces belong to a `Rejection`, which has the numbers.
+    """
 
     NEW_REFERENCE = "took a reference frame"
     STARTED = "started the map"
@@ -298,6 +301,50 @@ class Reason(StrEnum):
     LOST = "lost"
     LOST_AT_START = "lost right after the start: starting anew"
     STATIC_OVERLAY = "some of the image does not move with the scene and is left out"
+
+    # initialization
+    FEW_MATCHES = "too few matches with the reference frame: {count}, {needed} are needed"
+    STATIC_AMBIGUOUS = "some of the image stays in place, and it is not clear what moves"
+    STATIC_REMAINDER = "what still matches stays in place, the rest has gone: took a new reference frame"
+    STANDSTILL = "the camera stands still: the image moved by {pixels:.1f} px"
+    STANDSTILL_IN_PART = "{ratio:.0%} of the image stands still, and of the rest: {rejection}"
+    MOVING_OBJECT = "something may move before a camera that stands still: a {model} explains it"
+    PURE_ROTATION = "the camera only turns: a rotation explains the matches"
+    PLANAR_SCENE = "the scene looks planar: a homography explains the matches"
+    AMBIGUOUS_MOTION = "ambiguous motion: the {model} allows several"
+    BEHIND_CAMERA = "matches behind a camera: only {ratio:.0%} lie in front of both"
+    FEW_PARALLAX_POINTS = "too little parallax: {count} points have enough, {needed} are needed"
+    LOW_MEAN_PARALLAX = "too little parallax: {mean:.1f} degrees in the mean, {needed} are needed"
+    UNCERTAIN_DEPTHS = "depths too uncertain: {count} of {matches} known well, {ratio:.0%} are needed"
+    FEW_REFINED_POINTS = "too few points survive refinement: {count}, {needed} are needed"
+    FRAMES_UNEXPLAINED = "bad start: it explains {count} of {frames} frames"
+
+    # pose validation
+    LOW_INLIER_RATIO = "only {ratio:.0%} of {matches} matches agree with the pose"
+    UNCERTAIN_POSITION = "the position is known to {std:.3f} of the scene's depth"
+    UNCERTAIN_ROTATION = "the rotation is known to {degrees:.2f} degrees"
+    JUMP = "jumped by {translation:.2f} of the scene's depth and {degrees:.0f} degrees"
+    LARGE_ERRORS = "the matches of the last frames are off by {sigma:.1f} times their noise in the median"
+    LOW_EXPLAINED_RATIO = "the map explains only {ratio:.0%} of the image"
+    LOW_COVERAGE_RATIO = "only {ratio:.0%} of the image shows what the map expects there"
+    MOVING_MAJORITY = "most of the image moves by itself"
+    MOVING_REMAINDER = "{count} matches in the rest of the image move against the map"
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why a pose or an initialization is rejected; as text, the reason with its numbers."""
+
+    reason: Reason
+    values: dict[str, float | str | Rejection] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, reason: Reason, **values: float | str | Rejection) -> Rejection:
+        """A reason with the values of the fields of its text."""
+        return cls(reason, values)
+
+    def __str__(self) -> str:
+        return self.reason.value.format(**self.values)
 
 
 class State(Enum):

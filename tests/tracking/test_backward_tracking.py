@@ -17,9 +17,10 @@ from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, track_back
 from torchslam.tracking.pose_confirmation import PendingFrame
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 
 SCENE = Scene.of(300)
+ODD = Rejection(Reason.PURE_ROTATION)
 AWAY = pose(0, 0, 0, 0, 3.0)  # looks back: sees nothing
 
 
@@ -31,19 +32,19 @@ class Ledger:
         self.tried: list[int] = []
         self.dropped = 0
 
-    def take(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+    def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         self.taken[view.index] = estimate.T_cw
 
-    def try_out(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
+    def add_tentative(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
         self.tried.append(view.index)
         return False
 
-    def keep(self, submap: Submap, held: list[PendingFrame]) -> None:
+    def commit(self, submap: Submap, held: list[PendingFrame]) -> None:
         for view, estimate, T_cr, reference in held:
             self.taken[view.index] = estimate.T_cw
             torch.testing.assert_close(T_cr @ submap.map.T_cw[reference], estimate.T_cw)
 
-    def drop(self, submap: Submap) -> None:
+    def rollback(self, submap: Submap) -> None:
         self.dropped += 1
 
 
@@ -70,7 +71,7 @@ def back(
 def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
     """The frames that come as these to be judged, from the first on, seem strange."""
     asked = count()
-    monkeypatch.setattr(backwards, "why_strange", lambda *_: "odd" if next(asked) in doubtful else "")
+    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD if next(asked) in doubtful else None)
 
 
 def test_frames_before_the_map_get_their_true_poses() -> None:

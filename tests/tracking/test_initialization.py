@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, centre, pose
 from torchslam.config import InitializationConfig, load_config
 from torchslam.geometry import KeypointNoise, Triangulation, transform
-from torchslam.tracking.initialization import Initializer, is_good, refine_pair, why_not
+from torchslam.tracking.initialization import Initializer, check_two_view_map, is_good, refine_pair
 from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
@@ -23,15 +23,21 @@ SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
 def tried(
     T_cw: Tensor, *overrides: str, scene: Scene = SCENE, noise: float = 0.0
 ) -> tuple[TwoViewMap | None, str]:
-    """The last answer for views at T_cw (F, 4, 4)."""
+    """The last result for views at T_cw (F, 4, 4): a map, or the text of its rejection."""
     return tried_views([scene.view(index, T, noise=noise) for index, T in enumerate(T_cw)], *overrides)
 
 
 def tried_views(views: list[FrameFeatures], *overrides: str) -> tuple[TwoViewMap | None, str]:
     initializer = Initializer(CAMERA, load_config(None, overrides))
     for view in views:
-        answer = initializer.step(view)
-    return answer
+        result = step(initializer, view)
+    return result
+
+
+def step(initializer: Initializer, view: FrameFeatures) -> tuple[TwoViewMap | None, str]:
+    """The result for one view: a map, or the text of its rejection."""
+    result = initializer.step(view)
+    return (result, "") if isinstance(result, TwoViewMap) else (None, str(result))
 
 
 def pair(T_cw: Tensor) -> Tensor:
@@ -62,7 +68,7 @@ def test_the_first_view_is_the_reference_until_it_is_too_old() -> None:
         (3, "took"),
         (4, "the"),
     ):
-        assert initializer.step(SCENE.view(index, pose()))[1].startswith(reason)
+        assert step(initializer, SCENE.view(index, pose()))[1].startswith(reason)
     assert initializer.reference.index == 3
     assert [view.index for view in initializer.views] == [3, 4]
 
@@ -72,8 +78,8 @@ def test_too_few_matches_make_a_new_reference() -> None:
     both = len(torch.nonzero(views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)]))
     assert tried(pair(SIDE), f"initialization.min_matches={both}")[0] is not None
     initializer = Initializer(CAMERA, load_config(None, [f"initialization.min_matches={both + 1}"]))
-    initializer.step(views[0])
-    start, reason = initializer.step(views[1])
+    step(initializer, views[0])
+    start, reason = step(initializer, views[1])
     assert start is None
     assert reason == f"too few matches with the reference frame: {both}, {both + 1} are needed"
     assert initializer.views == [views[1]]
@@ -128,8 +134,8 @@ def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
     views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
     some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
     initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
-    initializer.step(views[0])
-    start, reason = initializer.step(some)
+    step(initializer, views[0])
+    start, reason = step(initializer, some)
     assert start is not None, reason
     moving = SCENE.shows(1)[start.keypoints_2] >= round(share * len(SCENE))
     assert moving.double().mean() > 0.98
@@ -143,10 +149,10 @@ def test_what_stays_on_epipolar_lines_but_behind_the_camera_is_left_out(T_cw: Te
     views = [SCENE.view(0, pose(), noise=0.2), SCENE.view(1, T_cw, noise=0.2)]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
     initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
-    initializer.step(views[0])
-    start, reason = initializer.step(some)
+    step(initializer, views[0])
+    start, reason = step(initializer, some)
     assert start is not None, reason
-    assert len(initializer.still) > 80
+    assert len(initializer.static_pixels) > 80
     wanted = T_cw[:3, 3] / T_cw[:3, 3].norm()
     torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=0.02, rtol=0)
 
@@ -159,9 +165,9 @@ def test_what_is_as_far_as_infinity_within_the_noise_belongs_to_the_scene(
     views = [SCENE.view(0, pose()), SCENE.view(1, pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0))]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
     initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
-    initializer.step(views[0])
-    initializer.step(some)
-    assert (len(initializer.still) > 80) is left_out
+    step(initializer, views[0])
+    step(initializer, some)
+    assert (len(initializer.static_pixels) > 80) is left_out
 
 
 def test_a_thing_that_moves_before_a_camera_that_stands_is_no_scene() -> None:
@@ -266,7 +272,7 @@ def test_by_parallax_a_point_is_good_from_an_angle_on() -> None:
 def reason_for(count: int, total: int, matches: int, share: float = 0.15, **changes: object) -> str:
     good = torch.arange(total) < count
     settings = replace(InitializationConfig(), **changes)  # type: ignore[arg-type]
-    return why_not(good, seen([math.radians(4.9)] * total), matches, settings, share)
+    return str(check_two_view_map(good, seen([math.radians(4.9)] * total), matches, settings, share) or "")
 
 
 def test_why_points_are_no_start() -> None:
@@ -286,9 +292,11 @@ def test_most_points_must_lie_in_front() -> None:
     for behind, fine in ((20, True), (21, False)):
         some = seen([0.1] * 100)
         some = replace(some, mask=torch.arange(100) >= behind)
-        reason = why_not(torch.ones(100, dtype=torch.bool), some, 100, InitializationConfig(), 0.15)
-        assert (reason == "") is fine
-        assert fine or reason == "matches behind a camera: only 79% lie in front of both"
+        reason = check_two_view_map(
+            torch.ones(100, dtype=torch.bool), some, 100, InitializationConfig(), 0.15
+        )
+        assert (reason is None) is fine
+        assert fine or str(reason) == "matches behind a camera: only 79% lie in front of both"
 
 
 def refined(scales: Tensor, off: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -68,7 +68,7 @@ def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
     estimate = finder.locate(here.map, view, matches, here.tracking.local_points)
     assert estimate is not None
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
-    near = finder.covisible_keyframes(here.map, there[alive][:30])
+    near = finder.local_keyframes(here.map, int(here.map.observers(there[alive][:30]).argmax()))
     assert near.tolist() == [0, 1]
     assert set(estimate.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
     assert estimate.inliers > 60

@@ -10,9 +10,10 @@ from tests.scene import Scene, pose
 from torchslam.config import Config, load_config
 from torchslam.map.atlas import TrackingState
 from torchslam.tracking.pose_confirmation import PoseConfirmation
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 
 SCENE = Scene.of(10)
+ODD = Rejection(Reason.PURE_ROTATION)
 
 
 def frame(index: int) -> tuple[FrameFeatures, PoseEstimate, TrackingState]:
@@ -22,68 +23,68 @@ def frame(index: int) -> tuple[FrameFeatures, PoseEstimate, TrackingState]:
 
 
 def test_nothing_is_held_at_first() -> None:
-    probation = PoseConfirmation(Config())
-    assert not probation
-    assert not probation.is_relocalized
-    assert probation.views() == []
+    confirmation = PoseConfirmation(Config())
+    assert not confirmation.is_holding
+    assert not confirmation.is_relocalized
+    assert confirmation.views() == []
 
 
 def test_two_certain_frames_confirm_a_doubtful_one() -> None:
-    probation = PoseConfirmation(Config())
-    probation.push(*frame(0), "odd")
-    assert probation
-    assert probation.reason == "to be confirmed by 2 more frames"
-    probation.push(*frame(1), "")
-    assert probation
-    assert probation.reason == "to be confirmed by 1 more frames"
-    probation.push(*frame(2), "")
-    assert not probation
-    assert not probation.is_relocalized
-    assert [view.index for view in probation.views()] == [0, 1, 2]
+    confirmation = PoseConfirmation(Config())
+    confirmation.push(*frame(0), ODD)
+    assert confirmation.is_holding
+    assert confirmation.reason == "to be confirmed by 2 more frames"
+    confirmation.push(*frame(1), None)
+    assert confirmation.is_holding
+    assert confirmation.reason == "to be confirmed by 1 more frames"
+    confirmation.push(*frame(2), None)
+    assert not confirmation.is_holding
+    assert not confirmation.is_relocalized
+    assert [view.index for view in confirmation.views()] == [0, 1, 2]
 
 
 def test_another_doubt_begins_the_count_again() -> None:
-    probation = PoseConfirmation(Config())
-    for index, doubt in enumerate(["odd", "", "odd", ""]):
-        probation.push(*frame(index), doubt)
-        assert probation
-    probation.push(*frame(4), "")
-    assert not probation
+    confirmation = PoseConfirmation(Config())
+    for index, doubt in enumerate([ODD, None, ODD, None]):
+        confirmation.push(*frame(index), doubt)
+        assert confirmation.is_holding
+    confirmation.push(*frame(4), None)
+    assert not confirmation.is_holding
 
 
 def test_what_came_back_needs_more_confirmations() -> None:
-    probation = PoseConfirmation(load_config(None, ["relocalization.num_confirming_frames=3"]))
-    probation.start_after_relocalization(*frame(0))
-    assert probation
-    assert probation.is_relocalized
-    assert probation.reason == "to be confirmed by 3 more frames"
-    probation.push(*frame(1), "")
-    probation.push(*frame(2), "odd")
-    assert probation.reason == "to be confirmed by 3 more frames"
+    confirmation = PoseConfirmation(load_config(None, ["relocalization.num_confirming_frames=3"]))
+    confirmation.start_after_relocalization(*frame(0))
+    assert confirmation.is_holding
+    assert confirmation.is_relocalized
+    assert confirmation.reason == "to be confirmed by 3 more frames"
+    confirmation.push(*frame(1), None)
+    confirmation.push(*frame(2), ODD)
+    assert confirmation.reason == "to be confirmed by 3 more frames"
     for index in (3, 4):
-        probation.push(*frame(index), "")
-        assert probation
-    probation.push(*frame(5), "")
-    assert not probation
-    assert [view.index for view in probation.views()] == [0, 1, 2, 3, 4, 5]
+        confirmation.push(*frame(index), None)
+        assert confirmation.is_holding
+    confirmation.push(*frame(5), None)
+    assert not confirmation.is_holding
+    assert [view.index for view in confirmation.views()] == [0, 1, 2, 3, 4, 5]
 
 
 def test_coming_back_forgets_what_was_held_before() -> None:
-    probation = PoseConfirmation(Config())
-    probation.push(*frame(7), "odd")
-    probation.start_after_relocalization(*frame(8))
-    assert [view.index for view in probation.views()] == [8]
+    confirmation = PoseConfirmation(Config())
+    confirmation.push(*frame(7), ODD)
+    confirmation.start_after_relocalization(*frame(8))
+    assert [view.index for view in confirmation.views()] == [8]
 
 
 def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
-    probation = PoseConfirmation(Config())
+    confirmation = PoseConfirmation(Config())
     frames = [frame(index) for index in range(3)]
-    probation.start_after_relocalization(*frames[0])
+    confirmation.start_after_relocalization(*frames[0])
     for held in frames[1:]:
-        probation.push(*held, "odd")
-    released = probation.confirm()
-    assert not probation
-    assert probation.views() == []
+        confirmation.push(*held, ODD)
+    released = confirmation.confirm()
+    assert not confirmation.is_holding
+    assert confirmation.views() == []
     assert [one[0] for one in released] == [view for view, _, _ in frames]
     assert [one[1] for one in released] == [estimate for _, estimate, _ in frames]
     assert all(
@@ -93,38 +94,38 @@ def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
 
 
 def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
-    probation = PoseConfirmation(Config())
-    probation.push(*frame(0), "odd")
-    probation.push(*frame(1), "")
-    assert [held[0].index for held in probation.pop_all()] == [0, 1]
-    assert probation.views() == []
-    assert probation.reason == "to be confirmed by 1 more frames"
-    probation.push(*frame(2), "")
-    assert not probation
-    assert [held[0].index for held in probation.confirm()] == [2]
+    confirmation = PoseConfirmation(Config())
+    confirmation.push(*frame(0), ODD)
+    confirmation.push(*frame(1), None)
+    assert [held[0].index for held in confirmation.pop_all()] == [0, 1]
+    assert confirmation.views() == []
+    assert confirmation.reason == "to be confirmed by 1 more frames"
+    confirmation.push(*frame(2), None)
+    assert not confirmation.is_holding
+    assert [held[0].index for held in confirmation.confirm()] == [2]
 
 
 def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_ones() -> None:
-    probation = PoseConfirmation(Config())
+    confirmation = PoseConfirmation(Config())
     for index in range(5):
-        probation.push(*frame(index), "odd", is_mapped=index > 2)
-    assert probation.reason == "to be confirmed by 5 more frames"
+        confirmation.push(*frame(index), ODD, is_mapped=index > 2)
+    assert confirmation.reason == "to be confirmed by 5 more frames"
     for index in range(5, 9):
-        probation.push(*frame(index), "", is_mapped=True)
-        assert probation
-    probation.push(*frame(9), "", is_mapped=True)
-    assert not probation
-    probation.confirm()
-    probation.push(*frame(10), "odd", is_mapped=True)  # who was believed begins anew
-    assert probation.reason == "to be confirmed by 2 more frames"
+        confirmation.push(*frame(index), None, is_mapped=True)
+        assert confirmation.is_holding
+    confirmation.push(*frame(9), None, is_mapped=True)
+    assert not confirmation.is_holding
+    confirmation.confirm()
+    confirmation.push(*frame(10), ODD, is_mapped=True)  # who was believed begins anew
+    assert confirmation.reason == "to be confirmed by 2 more frames"
 
 
 def test_no_more_than_so_many_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.tracking.pose_confirmation.MAX_PENDING_FRAMES", 3)
-    probation = PoseConfirmation(Config())
+    confirmation = PoseConfirmation(Config())
     for index in range(3):
-        assert not probation.is_full
-        probation.push(*frame(index), "odd")
-    assert probation.is_full
-    probation.pop_all()
-    assert not probation.is_full
+        assert not confirmation.is_full
+        confirmation.push(*frame(index), ODD)
+    assert confirmation.is_full
+    confirmation.pop_all()
+    assert not confirmation.is_full

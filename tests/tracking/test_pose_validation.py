@@ -14,7 +14,7 @@ from tests.scene import pose
 from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
 from torchslam.map.atlas import TrackingState
-from torchslam.tracking.pose_validation import deviations, jump, why_doubt
+from torchslam.tracking.pose_validation import deviations, jump, validate_pose
 from torchslam.types import PoseEstimate
 
 SETTINGS = PoseValidationConfig()
@@ -29,7 +29,7 @@ def doubt(
     estimate: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained_ratio: float = 1.0
 ) -> str:
     tracking = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
-    return why_doubt(estimate, expected, tracking, SETTINGS)
+    return str(validate_pose(estimate, expected, tracking, SETTINGS) or "")
 
 
 def test_a_certain_pose_is_believed() -> None:

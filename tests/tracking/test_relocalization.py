@@ -79,7 +79,8 @@ def test_those_beside_one_that_failed_in_another_world_are_tried() -> None:
 
 def test_beside_a_candidate_are_as_many_as_the_local_map_has() -> None:
     right, _ = worlds()
-    assert relocalizer("tracking.local_keyframes=2")._near(right.map, 5).tolist() == [5, 4, 3]
+    localizer = relocalizer("tracking.local_keyframes=2").tracker.localizer
+    assert localizer.local_keyframes(right.map, 5).tolist() == [5, 4, 3]
 
 
 def test_a_pose_that_is_doubted_is_no_pose() -> None:

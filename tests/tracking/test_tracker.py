@@ -15,11 +15,11 @@ from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.map.atlas import Submap
 from torchslam.tracking.correspondences import Projected, project_points
 from torchslam.tracking.match_selection import (
-    CELLS,
+    GRID,
     MATURE_OBSERVATIONS,
     MAX_CELL_WEIGHT,
     MAX_MATCHES_PER_CELL,
-    cells,
+    cell_numbers,
     coverage_ratio,
     explained_ratio,
     grid_weights,
@@ -296,8 +296,8 @@ def test_cells_number_the_image_row_by_row() -> None:
     pixels = torch.tensor(
         [[0.0, 0], [39.9, 39.9], [40.0, 0], [0, 40.0], [319.4, 239.4], [-0.5, -0.5], [320.0, 240.0]]
     ).double()
-    assert cells(pixels, (320, 240)).tolist() == [0, 0, 1, 8, 47, 0, 47]
-    assert CELLS == (8, 6)
+    assert cell_numbers(pixels, (320, 240)).tolist() == [0, 0, 1, 8, 47, 0, 47]
+    assert GRID == (8, 6)
 
 
 def test_old_points_are_heard_alone_where_they_are_enough() -> None:

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from tests.scene import CAMERA, Scene, pose
 from torchslam.map.atlas import Atlas
+from torchslam.tracking.backward_tracking import UnposedFrames
 from torchslam.tracking.provisional_map import ProvisionalMap
-from torchslam.tracking.unposed_frames import UnposedFrames
 from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(5)

@@ -1,68 +1,105 @@
-"""The way back in time: frames from before a world was known, or from while it was lost."""
+"""Backward tracking: poses of frames from before the initialization of a map, or from while the camera was lost."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Iterator
 from typing import Protocol
 
 from torchslam.config import Config
 from torchslam.map.atlas import Submap
 from torchslam.tracking.pose_confirmation import PendingFrame, PoseConfirmation
-from torchslam.tracking.pose_validation import why_strange, why_unsound
+from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate
 
-MAX_CONSECUTIVE_FAILURES = 5  # frames in a row without a sound pose that end the way back
+MAX_CONSECUTIVE_FAILURES = 5
+"""Frames in a row without a plausible pose that end backward tracking."""
+
+
+class UnposedFrames:
+    """The latest frames without a pose, ordered by frame index; at most `limit` of them."""
+
+    def __init__(self, limit: int) -> None:
+        self._views: deque[FrameFeatures] = deque(maxlen=limit)
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __iter__(self) -> Iterator[FrameFeatures]:
+        return iter(self._views)
+
+    def add(self, *views: FrameFeatures) -> None:
+        """Add frames, and sort if they are older than the newest one."""
+        is_unordered = len(self._views) and views and views[0].index < self._views[-1].index
+        self._views.extend(views)
+        if is_unordered:
+            self._set(sorted(self._views, key=lambda view: view.index))
+
+    def remove(self, views: list[FrameFeatures]) -> None:
+        """Remove frames that have a pose now."""
+        posed = {view.index for view in views}
+        self._set([view for view in self._views if view.index not in posed])
+
+    def _set(self, views: list[FrameFeatures]) -> None:
+        self._views.clear()
+        self._views.extend(views)
 
 
 class Builder(Protocol):
-    """What becomes of the frames on the way."""
+    """Receiver of the frames of backward tracking."""
 
-    def take(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> object:
-        """A frame is believed."""
+    def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> object:
+        """Add a frame with a certain pose."""
 
-    def try_out(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
-        """A frame is held back: map it on trial if that is due; whether anything is on trial."""
+    def add_tentative(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
+        """Map an uncertain frame tentatively, if a keyframe is due; return whether there are tentative keyframes."""
 
-    def keep(self, submap: Submap, held: list[PendingFrame]) -> object:
-        """What was held back is believed after all, with what was mapped on trial."""
+    def commit(self, submap: Submap, frames: list[PendingFrame]) -> object:
+        """Keep the tentative keyframes, and add the frames that were held back."""
 
-    def drop(self, submap: Submap) -> object:
-        """What was held back is not believed: nothing is left of what was mapped on trial."""
+    def rollback(self, submap: Submap) -> object:
+        """Discard the tentative keyframes."""
 
 
 def track_back(
     tracker: Tracker, submap: Submap, views: Iterable[FrameFeatures], config: Config, builder: Builder
 ) -> list[FrameFeatures]:
-    """Follow a camera from the track of `submap` through frames given from the latest to the earliest.
+    """Track frames backward in time, starting from the tracking state of `submap`.
 
-    As forwards, frames that agree with the map but are not what it leads to expect are held back and mapped on trial:
-    they are kept where enough certain ones follow, or the way leads to the earliest frame. It ends where several in a
-    row have no sound pose; what is held back then is not kept. Returns the frames that are.
+    Frames with uncertain poses are held back and mapped tentatively, as forward in time; they are kept if enough
+    certain frames follow or the earliest frame is reached. Tracking ends after `MAX_CONSECUTIVE_FAILURES`.
+
+    Args:
+        views: from the latest to the earliest
+
+    Returns:
+        The frames that got a pose.
     """
     posed: list[FrameFeatures] = []
-    probation = PoseConfirmation(config)
-    misses = 0
+    confirmation = PoseConfirmation(config)
+    failures = 0
     for view in views:
-        expected = None if submap.tracking.velocity is None else tracker.predict(submap)
-        estimate = tracker.track(submap, view, is_sure=not probation)
-        if estimate is None or why_unsound(estimate, expected, config.pose_validation):
-            misses += 1
-            if misses == MAX_CONSECUTIVE_FAILURES:
-                builder.drop(submap)
+        predicted = None if submap.tracking.velocity is None else tracker.predict(submap)
+        estimate = tracker.track(submap, view, is_sure=not confirmation.is_holding)
+        if estimate is None or check_pose_quality(estimate, predicted, config.pose_validation):
+            failures += 1
+            if failures == MAX_CONSECUTIVE_FAILURES:
+                builder.rollback(submap)
                 return posed
             continue
-        misses = 0
-        doubt = why_strange(estimate, submap.tracking, config.pose_validation)
-        if not doubt and not probation:
-            builder.take(submap, view, estimate)
+        failures = 0
+        rejection = check_map_agreement(estimate, submap.tracking, config.pose_validation)
+        if rejection is None and not confirmation.is_holding:
+            builder.add_frame(submap, view, estimate)
             posed.append(view)
             continue
-        is_mapped = builder.try_out(submap, view, estimate)
-        probation.push(view, estimate, submap.tracking, doubt, is_mapped)
-        if not probation or probation.is_full:
-            posed += probation.views()
-            builder.keep(submap, probation.pop_all() if probation else probation.confirm())
-    posed += probation.views()
-    builder.keep(submap, probation.pop_all())
+        is_mapped = builder.add_tentative(submap, view, estimate)
+        confirmation.push(view, estimate, submap.tracking, rejection, is_mapped)
+        if not confirmation.is_holding or confirmation.is_full:
+            posed += confirmation.views()
+            frames = confirmation.pop_all() if confirmation.is_holding else confirmation.confirm()
+            builder.commit(submap, frames)
+    posed += confirmation.views()
+    builder.commit(submap, confirmation.pop_all())
     return posed

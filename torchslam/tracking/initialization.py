@@ -1,4 +1,4 @@
-"""The first map: two views, their relative pose, triangulated points, and whether they are worth a start."""
+"""Two-view initialization of a map: relative pose, triangulation, refinement, and the checks of the result."""
 
 from __future__ import annotations
 
@@ -15,44 +15,43 @@ from torchslam.geometry import (
     Triangulation,
     epipolar_offsets,
     estimate_relative_pose,
-    fits,
+    passes_gate,
     transform,
     triangulate,
 )
 from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
-from torchslam.types import FrameFeatures, Reason, TwoViewMap
+from torchslam.types import FrameFeatures, Reason, Rejection, TwoViewMap
 
 TRIANGULATION_GATE_SIGMA = (
     3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined
 )
-MIN_STATIC_RATIO = 0.1  # of the matches, from which on it is asked whether they belong to the scene
-MIN_MATCHED_RATIO = 0.35  # of the keypoints that match where the camera stands still, at least
-MIN_EXPLAINED_RATIO = 0.5  # of them that the motion of the others must explain
+MIN_STATIC_RATIO = 0.1  # of the matches stay in place: below, they count as part of the scene
+MIN_MATCHED_RATIO = 0.35  # of the keypoints match if the camera stands still
+MIN_EXPLAINED_RATIO = 0.5  # of the matches in place that the motion of the others must explain
 
 
 class Initializer:
-    """Tries every frame against a reference frame until two of them make a map worth having."""
+    """Matches every frame with a reference frame until two of them give a map."""
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
         self.matcher = make_matcher(config.matching, matcher)
         self.config = config
-        self.views: list[FrameFeatures] = []  # the reference and what came after it
-        # pixels (n, 2) that the last view showed not to move with the scene
-        self.still = camera.params.new_zeros(0, 2)
-        self.planar_views = 0  # in which a plane explained the matches with the reference
+        self.views: list[FrameFeatures] = []  # the reference and the frames after it
+        self.static_pixels = camera.params.new_zeros(0, 2)  # (n, 2) in the last view, not of the scene
+        self.num_planar_views = 0  # whose matches with the reference a homography explained
 
     @property
     def reference(self) -> FrameFeatures:
         return self.views[0]
 
-    def step(self, view: FrameFeatures) -> tuple[TwoViewMap | None, str]:
-        """A start, or None and the reason in words."""
-        self.still = self.still[:0]
+    def step(self, view: FrameFeatures) -> TwoViewMap | Rejection:
+        """Try to initialize a map with the next frame."""
+        self.static_pixels = self.static_pixels[:0]
         if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
             self._refer_to(view)
-            return None, Reason.NEW_REFERENCE
+            return Rejection(Reason.NEW_REFERENCE)
         self.views.append(view)
         pairs = run_matcher(self.matcher, self.reference, view)
         first, second = pairs.first, pairs.second
@@ -60,87 +59,91 @@ class Initializer:
         least = self.config.initialization.min_matches
         if len(first) < least:
             self._refer_to(view)
-            return None, f"too few matches with the reference frame: {len(first)}, {least} are needed"
+            return Rejection.of(Reason.FEW_MATCHES, count=len(first), needed=least)
         return self._relate(view, first, second)
 
     def _refer_to(self, view: FrameFeatures) -> None:
-        """Begin anew with another reference frame: what an earlier one said of planes is no reason to believe one."""
+        """Start again with another reference frame."""
         self.views = [view]
-        self.planar_views = 0
+        self.num_planar_views = 0
 
-    def _relate(self, view: FrameFeatures, first: Tensor, second: Tensor) -> tuple[TwoViewMap | None, str]:
-        """The relative pose of the two views, unless the image stands still."""
+    def _relate(self, view: FrameFeatures, first: Tensor, second: Tensor) -> TwoViewMap | Rejection:
+        """Initialize from matches with the reference, unless the camera stands still."""
         settings = self.config.initialization
         motion = torch.linalg.vector_norm(view.keypoints[second] - self.reference.keypoints[first], dim=-1)
         moved = float(motion.median())
         if moved >= settings.min_motion_px:
             scene = self._scene(view, first, second, motion)
             if scene is None:
-                return None, "some of the image stays in place, and it is not clear what moves"
+                return Rejection(Reason.STATIC_AMBIGUOUS)
             return self._relate_moving(view, first[scene], second[scene], scene_only=False)
         if len(first) < MIN_MATCHED_RATIO * int(self.reference.mask.sum()):
-            self.still = view.keypoints[second[motion < settings.max_static_px]]
+            self.static_pixels = view.keypoints[second[motion < settings.max_static_px]]
             self._refer_to(view)
-            return None, "what still matches stays in place, the rest has gone: took a new reference frame"
+            return Rejection(Reason.STATIC_REMAINDER)
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
         moving = motion >= settings.min_motion_px
         if int(moving.sum()) < settings.min_matches:
-            return None, f"the camera stands still: the image moved by {moved:.1f} px"
-        start, reason = self._relate_moving(view, first[moving], second[moving], scene_only=True)
-        share = 1 - float(moving.double().mean())
-        return start, reason and f"{share:.0%} of the image stands still, and of the rest: {reason}"
+            return Rejection.of(Reason.STANDSTILL, pixels=moved)
+        result = self._relate_moving(view, first[moving], second[moving], scene_only=True)
+        if isinstance(result, TwoViewMap):
+            return result
+        ratio = 1 - float(moving.double().mean())
+        return Rejection.of(Reason.STANDSTILL_IN_PART, ratio=ratio, rejection=result)
 
     def _relate_moving(
         self, view: FrameFeatures, first: Tensor, second: Tensor, scene_only: bool
-    ) -> tuple[TwoViewMap | None, str]:
-        """The relative pose from matches that moved.
+    ) -> TwoViewMap | Rejection:
+        """Initialize from matches that moved.
 
-        scene_only: they are a part of all matches, and may be a thing that moves before a camera that stands
-        still; only depth tells a scene apart from that.
+        Args:
+            scene_only: the other matches stayed in place, so that these may be an object that moves in front of a
+                standing camera: only an essential matrix, which needs depth, is accepted
         """
         settings = self.config.initialization
         relative = self._relative_pose(view, first, second)
         model = relative.model[0]
         if scene_only and model != "essential":
-            return None, f"something may move before a camera that stands still: a {model} explains it"
+            return Rejection.of(Reason.MOVING_OBJECT, model=model)
         if model == "rotation":
-            return None, "the camera only turns: a rotation explains the matches"
-        self.planar_views += model == "homography"
-        if model == "homography" and self.planar_views < settings.min_planar_frames:
+            return Rejection(Reason.PURE_ROTATION)
+        self.num_planar_views += model == "homography"
+        if model == "homography" and self.num_planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
-            return None, "the scene looks planar: a homography explains the matches"
+            return Rejection(Reason.PLANAR_SCENE)
         if not bool(relative.success[0]):
-            return None, f"ambiguous motion: the {model} allows several"
+            return Rejection.of(Reason.AMBIGUOUS_MOTION, model=model)
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
-        least_share = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
-        return self._judge(view, relative.T_21[0], first[inliers], second[inliers], least_share)
+        min_good_ratio = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
+        return self._triangulate(view, relative.T_21[0], first[inliers], second[inliers], min_good_ratio)
 
     def _scene(self, view: FrameFeatures, first: Tensor, second: Tensor, motion: Tensor) -> Tensor | None:
-        """(n,) bool, which matches belong to the scene: without those that stay in place, unless the motion of the
-        others explains them too, as it does far points and what the camera turns around: on their epipolar lines, and
-        not behind the camera. None where nobody can tell.
+        """(n,) bool, which matches belong to the scene; None if it cannot be decided.
+
+        Matches that stay in place do not, unless the motion of the others explains them, as it does far points and
+        what the camera turns around: they are on their epipolar lines and not behind the camera.
         """
-        everyone = torch.ones_like(motion, dtype=torch.bool)
+        everything = torch.ones_like(motion, dtype=torch.bool)
         still = motion < self.config.initialization.max_static_px
         if (
             int(still.sum()) < MIN_STATIC_RATIO * len(motion)
             or int((~still).sum()) < self.config.initialization.min_matches
         ):
-            return everyone
+            return everything
         others = self._relative_pose(view, first[~still], second[~still])
         if others.model[0] != "essential":
-            return None if self._relative_pose(view, first, second).model[0] == "essential" else everyone
+            return None if self._relative_pose(view, first, second).model[0] == "essential" else everything
         pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
         across, along = epipolar_offsets(others.T_21[0], pixels_1, pixels_2, self.camera, self.camera)
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
-            return everyone
-        self.still = view.keypoints[second[still]]
+            return everything
+        self.static_pixels = view.keypoints[second[still]]
         return ~still
 
     def _relative_pose(self, view: FrameFeatures, first: Tensor, second: Tensor) -> RelativePose:
-        """The motion from the reference frame to a view by matching keypoints (n,), (n,) of the two."""
+        """The relative pose of a view from matching keypoints (n,), (n,) of the reference and of it."""
         return estimate_relative_pose(
             self.reference.keypoints[first][None],
             view.keypoints[second][None],
@@ -152,40 +155,40 @@ class Initializer:
             min_samples=64,
         )
 
-    def _judge(
-        self, view: FrameFeatures, T_cw: Tensor, first: Tensor, second: Tensor, least_share: float
-    ) -> tuple[TwoViewMap | None, str]:
-        """Triangulate, refine both together, and count the points that are worth something."""
+    def _triangulate(
+        self, view: FrameFeatures, T_cw: Tensor, first: Tensor, second: Tensor, min_good_ratio: float
+    ) -> TwoViewMap | Rejection:
+        """Triangulate, refine pose and points together, and check that enough points are accurate."""
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
         noise = view.noise[second]
         known = self.reference.noise[first]
-        noise = (known.stated() if noise.information.shape[-1] else known).worse(noise)
+        noise = (known.with_explicit_information() if noise.information.shape[-1] else known).pairwise_max(
+            noise
+        )
         seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)
-        good = is_good(seen, errors.amax(0), noise.tolerance, self.camera, settings)
-        reason = why_not(good, seen, len(first), settings, least_share)
-        if reason:
-            return None, reason
+        good = is_good(seen, errors.amax(0), noise.gate_sigma, self.camera, settings)
+        rejection = check_two_view_map(good, seen, len(first), settings, min_good_ratio)
+        if rejection:
+            return rejection
         keep = torch.nonzero(good)[:, 0]
         poses, points_w, accurate = refine_pair(
             T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera
         )
         if int(accurate.sum()) < settings.min_points:
-            return (
-                None,
-                f"too few points survive refinement: {int(accurate.sum())}, {settings.min_points} are needed",
-            )
+            count = int(accurate.sum())
+            return Rejection.of(Reason.FEW_REFINED_POINTS, count=count, needed=settings.min_points)
         keep = keep[accurate]
-        return TwoViewMap(self.reference, view, poses, points_w[accurate], first[keep], second[keep]), ""
+        return TwoViewMap(self.reference, view, poses, points_w[accurate], first[keep], second[keep])
 
 
 def is_good(
     seen: Triangulation, errors: Tensor, sigmas: Tensor, camera: Camera, settings: InitializationConfig
 ) -> Tensor:
-    """(n,) which triangulated points count for a start.
+    """(n,) triangulated points that are known well enough for a map.
 
     errors: (n,) the larger of the two squared errors, in units of the noise; sigmas: (n,) px
 
@@ -193,31 +196,29 @@ def is_good(
     z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
     With "parallax": when the angle is large enough.
     """
-    is_close = fits(errors, TRIANGULATION_GATE_SIGMA**2)
+    is_close = passes_gate(errors, TRIANGULATION_GATE_SIGMA**2)
     if settings.criterion == "parallax":
         return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
     relative_std = sigmas / (camera.focal * seen.angles.clamp(min=1e-9))
     return seen.mask & is_close & (relative_std < settings.max_depth_std)
 
 
-def why_not(
-    good: Tensor, seen: Triangulation, matches: int, settings: InitializationConfig, least_share: float
-) -> str:
-    """Why these points are no start; empty when they are."""
+def check_two_view_map(
+    good: Tensor, seen: Triangulation, matches: int, settings: InitializationConfig, min_good_ratio: float
+) -> Rejection | None:
+    """Why triangulated points are not enough for a map; None if they are."""
     count = int(good.sum())
     in_front = float(seen.mask.float().mean())
     if in_front < 0.8:
-        return f"matches behind a camera: only {in_front:.0%} lie in front of both"
+        return Rejection.of(Reason.BEHIND_CAMERA, ratio=in_front)
     if count < settings.min_points:
-        return f"too little parallax: {count} points have enough, {settings.min_points} are needed"
+        return Rejection.of(Reason.FEW_PARALLAX_POINTS, count=count, needed=settings.min_points)
     if settings.criterion == "parallax":
         mean, least = math.degrees(float(seen.angles[seen.mask].mean())), settings.min_mean_parallax_deg
-        return (
-            f"too little parallax: {mean:.1f} degrees in the mean, {least} are needed" if mean < least else ""
-        )
-    if count < least_share * matches:
-        return f"depths too uncertain: {count} of {matches} known well, {least_share:.0%} are needed"
-    return ""
+        return Rejection.of(Reason.LOW_MEAN_PARALLAX, mean=mean, needed=least) if mean < least else None
+    if count < min_good_ratio * matches:
+        return Rejection.of(Reason.UNCERTAIN_DEPTHS, count=count, matches=matches, ratio=min_good_ratio)
+    return None
 
 
 def refine_pair(
@@ -225,8 +226,9 @@ def refine_pair(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Bundle adjustment of two views with the first one fixed.
 
-    Returns the second pose (4, 4), with the length of the baseline as it was, the points (n, 3) and which of them
-    (n,) agree with both views.
+    Returns:
+        The second pose (4, 4) with the length of the baseline unchanged, the points (n, 3), and which of them (n,) are
+        inliers of both views.
     """
     n = len(points_w)
     device = points_w.device
@@ -246,4 +248,4 @@ def refine_pair(
     points_w = solution.points_w * factor
     points_c = transform(torch.stack([T[0], refined]), points_w)
     errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), camera)
-    return refined, points_w, fits(errors).all(0)
+    return refined, points_w, passes_gate(errors).all(0)

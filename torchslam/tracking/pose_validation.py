@@ -1,4 +1,4 @@
-"""May a pose be believed? By how much agrees with it, how sure it is, and whether the motion is possible."""
+"""Validation of pose estimates: inlier ratio, covariance, motion, and agreement of the image with the map."""
 
 from __future__ import annotations
 
@@ -11,61 +11,67 @@ from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.map.atlas import TrackingState
-from torchslam.types import PoseEstimate
+from torchslam.types import PoseEstimate, Reason, Rejection
 
 
-def why_doubt(
+def validate_pose(
     estimate: PoseEstimate,
     predicted_T_cw: Tensor | None,
     tracking: TrackingState,
     settings: PoseValidationConfig,
-) -> str:
-    """Why a pose should not be built on, in words; empty when it may be.
+) -> Rejection | None:
+    """Why the map must not be extended from a pose; None if it may.
 
-    predicted_T_cw: (4, 4) where the camera was expected; None where nothing was
-    track: what the frames before it were like
+    Args:
+        predicted_T_cw: (4, 4) pose that the motion model predicts; None without a prediction
+        tracking: state with the averages over the frames up to this one
     """
-    return why_unsound(estimate, predicted_T_cw, settings) or why_strange(estimate, tracking, settings)
+    quality = check_pose_quality(estimate, predicted_T_cw, settings)
+    return quality or check_map_agreement(estimate, tracking, settings)
 
 
-def why_unsound(estimate: PoseEstimate, predicted_T_cw: Tensor | None, settings: PoseValidationConfig) -> str:
-    """Why a pose is not even what its own matches say; empty when it is. Arguments as of `why_doubt`."""
-    share = estimate.inliers / max(estimate.matches, 1)
-    if share < settings.min_inlier_ratio:
-        return f"only {share:.0%} of {estimate.matches} matches agree with the pose"
+def check_pose_quality(
+    estimate: PoseEstimate, predicted_T_cw: Tensor | None, settings: PoseValidationConfig
+) -> Rejection | None:
+    """Why a pose is wrong by its own matches, its covariance or its motion; None if it is plausible."""
+    ratio = estimate.inliers / max(estimate.matches, 1)
+    if ratio < settings.min_inlier_ratio:
+        return Rejection.of(Reason.LOW_INLIER_RATIO, ratio=ratio, matches=estimate.matches)
     position, rotation = deviations(estimate)
     if position > settings.max_position_std:
-        return f"the position is known to {position:.3f} of the scene's depth"
+        return Rejection.of(Reason.UNCERTAIN_POSITION, std=position)
     if rotation > settings.max_rotation_std_deg:
-        return f"the rotation is known to {rotation:.2f} degrees"
+        return Rejection.of(Reason.UNCERTAIN_ROTATION, degrees=rotation)
     if predicted_T_cw is None:
-        return ""
+        return None
     moved, turned = jump(estimate, predicted_T_cw)
     if moved > settings.max_jump or turned > settings.max_turn_deg:
-        return f"jumped by {moved:.2f} of the scene's depth and {turned:.0f} degrees"
-    return ""
+        return Rejection.of(Reason.JUMP, translation=moved, degrees=turned)
+    return None
 
 
-def why_strange(estimate: PoseEstimate, tracking: TrackingState, settings: PoseValidationConfig) -> str:
-    """Why the images of late are not what the map leads to expect; empty when they are."""
+def check_map_agreement(
+    estimate: PoseEstimate, tracking: TrackingState, settings: PoseValidationConfig
+) -> Rejection | None:
+    """Why the recent images disagree with what the map predicts; None if they agree."""
     if tracking.error > settings.max_squared_error:
-        return f"the matches of the last frames are off by {tracking.error**0.5:.1f} times their noise in the median"
+        return Rejection.of(Reason.LARGE_ERRORS, sigma=tracking.error**0.5)
     if tracking.explained_ratio < settings.min_explained_ratio:
-        return f"the map explains only {tracking.explained_ratio:.0%} of the image"
+        return Rejection.of(Reason.LOW_EXPLAINED_RATIO, ratio=tracking.explained_ratio)
     if estimate.coverage_ratio < settings.min_coverage_ratio:
-        return f"only {estimate.coverage_ratio:.0%} of the image shows what the map expects there"
-    return ""
+        return Rejection.of(Reason.LOW_COVERAGE_RATIO, ratio=estimate.coverage_ratio)
+    return None
 
 
 def deviations(estimate: PoseEstimate) -> tuple[float, float]:
-    """Standard deviations of the position, as a share of the depth of the scene, and of the rotation, in degrees."""
+    """Standard deviations of the position, as a ratio of the scene's depth, and of the rotation, in degrees."""
     variances = estimate.covariance.diagonal().tolist()
     position = max(sum(variances[:3]), 0.0) ** 0.5 / max(estimate.depth, 1e-12)
     return position, math.degrees(max(sum(variances[3:]), 0.0) ** 0.5)
 
 
 def jump(estimate: PoseEstimate, predicted_T_cw: Tensor) -> tuple[float, float]:
-    """How far a pose is from where it was expected: in shares of the depth of the scene, and in degrees."""
+    """Distance of a pose from the predicted one, as a ratio of the scene's depth and in degrees."""
     motion = estimate.T_cw @ se3_inverse(predicted_T_cw)
     moved = float(torch.linalg.vector_norm(motion[:3, 3])) / max(estimate.depth, 1e-12)
     return moved, math.degrees(float(rotation_angle(motion[:3, :3])))

@@ -1,4 +1,4 @@
-"""Where is the camera now? Predict, match the local map, localize, and go on from there."""
+"""Frame-to-map tracking: predict the pose, match the local map, estimate the pose, update the tracking state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.matcher import Matcher, MatchIndices, make_matcher
 from torchslam.types import FrameFeatures, PoseEstimate
 
-EMA_RATE = 0.1  # share of the newest frame in what the track remembers: that of the last ten or so
+EMA_RATE = 0.1
+"""Weight of the newest frame in the moving averages of the tracking state."""
 
 
 class Tracker:
@@ -32,13 +33,16 @@ class Tracker:
     counts: whether points remember when and how often they were seen; without it, tracking leaves the map as it is
     """
 
-    counts = True
-
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher)
         self.settings = config.tracking
         self.matching = config.matching
+        self.counts = True
+
+    def set_counting(self, counts: bool) -> None:
+        """Choose whether observations are counted in the map; without it, tracking does not change the map."""
+        self.counts = counts
 
     # --- the track -------------------------------------------------------------------------------------------
 
@@ -56,8 +60,7 @@ class Tracker:
 
     def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
         """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
-        near = slam_map.covisible(keyframe, self.settings.local_keyframes)
-        local_keyframes = torch.cat([near.new_tensor([keyframe]), near])
+        local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
         recent = self.settings.recent_frames if self.counts else 0
         if recent:
             last_seen = slam_map.points["last_seen_frame"]

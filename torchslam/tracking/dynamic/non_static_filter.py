@@ -1,4 +1,4 @@
-"""What is not matched, as it does not belong to the scene: pixels that stay in place, things that move."""
+"""Filter for keypoints that do not belong to the static scene: static overlays and moving objects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchslam.types import FrameFeatures, PoseEstimate
 
 
 class NonStaticFilter:
-    """Watches for both, as far as the configuration wants it."""
+    """Masks out keypoints of static overlays and moving objects, as far as each is enabled."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.config = config
@@ -20,24 +20,24 @@ class NonStaticFilter:
         self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
 
     def mask_out(self, view: FrameFeatures) -> FrameFeatures:
-        """The view without the keypoints that are known not to belong; views come in order of time."""
-        self._seen = view
-        self._steady = self.static_overlay.mask_out(view)
-        return self.independent_motion.mask_out(self._steady)
+        """The view without the keypoints known not to belong to the scene; call it once per frame, in order."""
+        self._view = view
+        self._without_overlays = self.static_overlay.mask_out(view)
+        return self.independent_motion.mask_out(self._without_overlays)
 
     def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
-        """What of the newest view moves against the scene, by the pose that was found for it."""
+        """Detect keypoints of the newest view that move against the scene, given the view's pose."""
         if not self.config.independent_motion.enabled:
             return NOTHING
-        return self.independent_motion.observe(self._steady, estimate)
+        return self.independent_motion.observe(self._without_overlays, estimate)
 
     def update_overlay(self, T_cw: Tensor, depth: float) -> bool:
-        """Whether pixels of the newest view became known to stay; its pose (4, 4), and the depth of the scene."""
+        """Update the overlays with the newest view and its pose (4, 4); return whether there are new ones."""
         if not self.config.static_overlay.enabled:
             return False
-        return self.static_overlay.observe(self._seen, T_cw, depth) > 0
+        return self.static_overlay.observe(self._view, T_cw, depth) > 0
 
     def forget_last(self) -> None:
-        """The next frame cannot be compared with the ones before: its pose is in another world."""
+        """Compare the next frame with no earlier one: its pose is in another submap."""
         self.static_overlay.forget_last()
         self.independent_motion.forget_last()

@@ -1,7 +1,7 @@
-"""What does not move with the scene: logos, subtitles, dirt on the lens, a part of the car.
+"""Detection of static overlays: logos, subtitles, dirt on the lens, a part of the car.
 
-A pixel stays in place although the camera moved so much that no point of the scene would have: seen twice in different
-stretches of the way, it is left out of everything from then on.
+Evidence is a keypoint that stays at its pixel although the camera moved so far that every point of the scene would have
+moved. Pixels with evidence from two different camera motions are masked out from then on.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from torch import Tensor
 from torchslam.config import MatchingConfig, StaticOverlayConfig
 from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.tracking.match_selection import image_cells
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
 
-_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth: where the points of a scene lie
-_SAMPLE = 8  # every so many-th keypoint is asked first whether the camera moved far enough to tell
-_PAUSE = 4  # frames that are not compared after one in which nothing stayed
+_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the possible depths of a keypoint
+_SAMPLE = 8  # stride of the keypoints in the first test whether the camera moved far enough
+_PAUSE = 4  # frames without a comparison after one that found no overlay
 
 
 @dataclass(frozen=True)
 class _Look:
-    """A frame to compare later ones with.
+    """A posed frame to compare later ones with.
 
-    view:     what it saw; T_wc: (4, 4) where it was
     pixels:   (n, 2) of its keypoints
-    points_c: (d, n, 3) where the points of these may be, by their depth
+    points_c: (d, n, 3) their points at the possible depths
     """
 
     view: FrameFeatures
@@ -45,7 +45,7 @@ class _Look:
 
 
 class StaticOverlayDetector:
-    """Collects evidence of pixels that stay, cell by cell."""
+    """Collects evidence of static overlays in a grid of image cells."""
 
     def __init__(self, camera: Camera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
         self.camera = camera
@@ -58,20 +58,26 @@ class StaticOverlayDetector:
         self._pause = 0
 
     def mask_out(self, view: FrameFeatures) -> FrameFeatures:
-        """The view without the keypoints that are known to stay."""
+        """The view without the keypoints of known overlays."""
         if not bool((self.evidence >= self.settings.min_evidence).any()):
             return view
         return replace(view, mask=view.mask & ~self.covers(view.keypoints))
 
     def covers(self, pixels: Tensor) -> Tensor:
-        """(n,) bool: pixels (n, 2) that are known to stay."""
+        """(n,) bool, which pixels (n, 2) belong to a known overlay."""
         row, column = self._cells(pixels)
         return self.evidence[row, column] >= self.settings.min_evidence
 
     def observe(self, view: FrameFeatures, T_cw: Tensor, depth: float) -> int:
-        """Compare a posed frame with an earlier one; returns how many cells became known to stay.
+        """Compare a posed frame with an earlier one.
 
-        view: with all its keypoints; T_cw: (4, 4); depth: median depth of the scene
+        Args:
+            view: with all its keypoints
+            T_cw: (4, 4)
+            depth: median depth of the scene
+
+        Returns:
+            The number of cells that became known overlays.
         """
         last = self._last
         if last is None or view.session != last.view.session:
@@ -96,26 +102,30 @@ class StaticOverlayDetector:
         return int((self.evidence >= self.settings.min_evidence).sum()) - before
 
     def add(self, pixels: Tensor) -> None:
-        """Evidence from elsewhere: pixels (m, 2) that stayed while the scene moved."""
+        """Add evidence from another source: pixels (m, 2) that stayed in place while the scene moved."""
         if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
             self._add(pixels)
 
     def _must_move(self, last: _Look, T_cw: Tensor, step: int = 1) -> Tensor:
-        """(n,) whether a point of the scene seen at a keypoint, every `step`-th of them, moved, whatever its depth."""
+        """(n,) whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
         moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
         distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
         return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
 
     def _is_far(self, must_move: Tensor) -> bool:
-        """Whether the camera moved far enough to tell: enough of some keypoints (n,) bool had to move."""
+        """Whether the camera moved far enough for a comparison: enough of the keypoints (n,) had to move."""
         return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
 
+    def restore(self, evidence: Tensor) -> None:
+        """Continue from the evidence of a checkpoint."""
+        self.evidence.copy_(evidence)
+
     def forget_last(self) -> None:
-        """The next frame cannot be compared with the ones before: its pose is in another world."""
+        """Compare the next frame with no earlier one: its pose is in another submap."""
         self._last = None
 
     def _stayed(self, earlier: FrameFeatures, view: FrameFeatures, candidates: Tensor) -> Tensor:
-        """(m, 2) pixels of the candidates (N,) among the keypoints of an earlier view that look the same now."""
+        """(m, 2) pixels in `view` of candidates (N,), keypoints of an earlier view matched at their old pixel."""
         rows = torch.nonzero(candidates)[:, 0]
         matches = match_by_projection(
             earlier.descriptors[rows][None],
@@ -129,7 +139,7 @@ class StaticOverlayDetector:
         return view.keypoints[matches.indices_2[0][matches.mask[0]]]
 
     def _add(self, pixels: Tensor) -> None:
-        """One more piece of evidence for the cells of pixels (m, 2) and those around them, each cell once."""
+        """Increment the evidence of the cells of pixels (m, 2) and of their neighbors, each cell once."""
         row, column = self._cells(pixels)
         hit = torch.zeros_like(self.evidence)
         for down in (-1, 0, 1):
@@ -138,9 +148,11 @@ class StaticOverlayDetector:
         self.evidence += hit
 
     def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        cells = torch.div(pixels, self.settings.cell_px, rounding_mode="floor").long()
+        """Rows and columns (n,) of `evidence` for pixels (n, 2)."""
         rows, columns = self.evidence.shape
-        return cells[:, 1].clamp(0, rows - 1), cells[:, 0].clamp(0, columns - 1)
+        size = (self.settings.cell_px, self.settings.cell_px)
+        column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
+        return row, column
 
 
 def distances_to_segments(points: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
