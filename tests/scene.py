@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.map.simulated import tracked_at
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures
 
@@ -104,27 +104,27 @@ def world_in(
     seen:  (P,) bool, points that the map has; all without it. Row r of the map is point argsort(rows_of)[r].
     The camera is followed from the last keyframe.
     """
-    world = Submap.empty(number, CAMERA.params)
+    submap = Submap.empty(number, CAMERA.params)
     rows = rows_of(scene)
     known = torch.ones(len(scene), dtype=torch.bool) if seen is None else seen
     ids: Tensor | None = None
     for offset, true in enumerate(T_cw):
         view = scene.view(first + offset, true, noise=noise)
-        keyframe = world.map.add_keyframe(view, moved(true, S_ws))
+        keyframe = submap.map.add_keyframe(view, moved(true, S_ws))
         if ids is None:
             order = torch.argsort(rows)
-            ids = world.map.add_points(
+            ids = submap.map.add_points(
                 transform(S_ws, scene.points_w[order]), scene.descriptors[order], keyframe
             )
         at = torch.nonzero(view.mask & known[scene.shows(first + offset)])[:, 0]
-        world.map.observe(keyframe, at, rows[scene.shows(first + offset)[at]])
-        tracked = tracked_at(world.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
-        world.history.add(view, tracked, UNTOUCHED, keyframe)
-    world.map.refresh(torch.arange(len(T_cw)))
-    lonely = torch.nonzero(world.map.points["times_observed"] == 0)[:, 0]
-    world.map.invalidate(lonely)
-    Tracker(CAMERA, Config()).follow(world, len(T_cw) - 1)
-    return world
+        submap.map.observe(keyframe, at, rows[scene.shows(first + offset)[at]])
+        estimate = tracked_at(submap.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
+        submap.posed_frames.add(view, estimate, UNTOUCHED, keyframe)
+    submap.map.refresh(torch.arange(len(T_cw)))
+    lonely = torch.nonzero(submap.map.points["times_observed"] == 0)[:, 0]
+    submap.map.invalidate(lonely)
+    Tracker(CAMERA, Config()).reset_to_keyframe(submap, len(T_cw) - 1)
+    return submap
 
 
 def moved(T_cw: Tensor, S_ws: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from tests.map.simulated import tracked_at
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import Config
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 from torchslam.tracking.tracker import Tracker
 
 KEYFRAMES = 30
@@ -41,29 +41,29 @@ def around(count: int = KEYFRAMES) -> Tensor:
 def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
     """Once around in the frame of the first camera; per keyframe the unit shrinks by `scale` and the way bends."""
     scene, T_cw = ring(), around()
-    world = Submap.empty(0, CAMERA.params)
+    submap = Submap.empty(0, CAMERA.params)
     rows: dict[tuple[int, bool], int] = {}
     early: set[int] = set()
     for keyframe, true in enumerate(T_cw):
         view = scene.view(keyframe, true)
         at = torch.nonzero(view.mask)[:, 0]
         seen = scene.shows(keyframe)[at].tolist()
-        world.map.add_keyframe(view, true)
+        submap.map.add_keyframe(view, true)
         names = [(point, keyframe >= LATE and point in early) for point in seen]
         fresh = [name for name in names if name not in rows]
         rows |= {name: len(rows) + offset for offset, name in enumerate(fresh)}
         if fresh:
             born = torch.tensor([point for point, _ in fresh])
-            world.map.add_points(scene.points_w[born], scene.descriptors[born], keyframe)
+            submap.map.add_points(scene.points_w[born], scene.descriptors[born], keyframe)
         if keyframe < EARLY:
             early.update(seen)
         ids = torch.tensor([rows[name] for name in names])
-        world.map.observe(keyframe, at, ids)
-        world.history.add(view, tracked_at(true, ids, at), pose(), keyframe)
-    world.map.refresh(torch.arange(KEYFRAMES))
-    world.correct(drifted(T_cw, scale, twist))
-    Tracker(CAMERA, Config()).follow(world, END)
-    return world
+        submap.map.observe(keyframe, at, ids)
+        submap.posed_frames.add(view, tracked_at(true, ids, at), pose(), keyframe)
+    submap.map.refresh(torch.arange(KEYFRAMES))
+    submap.apply_sim3_correction(drifted(T_cw, scale, twist))
+    Tracker(CAMERA, Config()).reset_to_keyframe(submap, END)
+    return submap
 
 
 def drifted(T_cw: Tensor, scale: float, twist: float) -> Tensor:

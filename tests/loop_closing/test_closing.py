@@ -10,13 +10,20 @@ from tests.loop_closing.ring import END, around, ring, ring_world
 from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, sim3_inverse
-from torchslam.geometry.alignment import umeyama
-from torchslam.loop_closing.closing import close_loop, corrected, join, other_visits, sew, sew_on, weld
-from torchslam.loop_closing.loop_closer import LoopCloser
+from torchslam.geometry.similarity import umeyama
+from torchslam.loop_closing.loop_closer import (
+    LoopCloser,
+    close_loop,
+    earlier_visit_keyframes,
+    essential_graph_solution,
+    fuse_and_adjust,
+    fuse_landmarks,
+    fuse_with_earlier_visits,
+    merge_maps,
+)
 from torchslam.loop_closing.loop_detector import LoopCandidate
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, relate
-from torchslam.map.atlas import Atlas
-from torchslam.map.submap import Submap
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, estimate_relative_sim3
+from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking.tracker import Tracker
 
 CONFIG = Config()
@@ -25,28 +32,28 @@ ROWS = rows_of(SCENE)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
-def error(world: Submap) -> float:
+def error(submap: Submap) -> float:
     """The root mean square error of the keyframes, aligned to the truth."""
-    estimate, truth = centre(world.map.T_cw), centre(around())
+    estimate, truth = centre(submap.map.T_cw), centre(around())
     scale, R, t = umeyama(estimate, truth)
     return float((scale * estimate @ R.mT + t - truth).square().sum(-1).mean().sqrt())
 
 
-def loop(world: Submap) -> LoopCandidate:
-    relation = relate(world.map, END, world.map, 0, CAMERA, CONFIG)
+def loop(submap: Submap) -> LoopCandidate:
+    relation = estimate_relative_sim3(submap.map, END, submap.map, 0, CAMERA, CONFIG)
     assert relation is not None
-    return LoopCandidate(world, END, world, 0, relation)
+    return LoopCandidate(submap, END, submap, 0, relation)
 
 
 def test_a_way_that_drifted_comes_back() -> None:
-    world = ring_world(scale=1.01, twist=0.002)
-    assert error(world) > 0.1
-    points = world.map.num_points
-    close_loop(loop(world), CAMERA, CONFIG)
-    assert error(world) < 2e-3
+    submap = ring_world(scale=1.01, twist=0.002)
+    assert error(submap) > 0.1
+    points = submap.map.num_points
+    close_loop(loop(submap), CAMERA, CONFIG)
+    assert error(submap) < 2e-3
     visible = {int(p) for k, T in enumerate(around()) for p in visible_points(k, T)}
-    assert world.map.num_points <= len(visible) + 0.02 * points < points
-    assert int(world.map.observers(world.map.points_seen_by(torch.tensor([0])))[END]) > 50
+    assert submap.map.num_points <= len(visible) + 0.02 * points < points
+    assert int(submap.map.observers(submap.map.points_seen_by(torch.tensor([0])))[END]) > 50
 
 
 def visible_points(keyframe: int, T_cw: Tensor) -> Tensor:
@@ -55,39 +62,39 @@ def visible_points(keyframe: int, T_cw: Tensor) -> Tensor:
 
 
 def test_the_graph_alone_spreads_the_drift_over_the_way() -> None:
-    world = ring_world(scale=1.01, twist=0.002)
-    found = loop(world)
-    S_cw = corrected(found)
-    torch.testing.assert_close(S_cw[0], world.map.T_cw[0])
+    submap = ring_world(scale=1.01, twist=0.002)
+    found = loop(submap)
+    S_cw = essential_graph_solution(found)
+    torch.testing.assert_close(S_cw[0], submap.map.T_cw[0])
     # the loop is closed: the end lies to the place as it was recognised to, but for what the other ties pull
-    wanted = world.map.T_cw[END] @ sim3_inverse(found.relation.S_21) @ se3_inverse(world.map.T_cw[0])
+    wanted = submap.map.T_cw[END] @ sim3_inverse(found.relation.S_21) @ se3_inverse(submap.map.T_cw[0])
     closed = S_cw[END] @ sim3_inverse(S_cw[0])
-    before = world.map.T_cw[END] @ se3_inverse(world.map.T_cw[0])
+    before = submap.map.T_cw[END] @ se3_inverse(submap.map.T_cw[0])
     assert float((closed - wanted).norm()) < 0.15 * float((before - wanted).norm())
     unit = torch.linalg.det(S_cw[:, :3, :3]) ** (1 / 3)
     assert (unit.diff() < 0).all() or (unit.diff() > 0).all()
-    world.correct(S_cw)
-    assert error(world) < 0.1
+    submap.apply_sim3_correction(S_cw)
+    assert error(submap) < 0.1
 
 
 def test_without_a_drift_nothing_moves() -> None:
-    world = ring_world()
-    T_cw = world.map.T_cw.clone()
-    close_loop(loop(world), CAMERA, CONFIG)
-    torch.testing.assert_close(world.map.T_cw, T_cw, atol=1e-4, rtol=0)
-    torch.testing.assert_close(world.history.T_cw(world.map), T_cw, atol=1e-4, rtol=0)
+    submap = ring_world()
+    T_cw = submap.map.T_cw.clone()
+    close_loop(loop(submap), CAMERA, CONFIG)
+    torch.testing.assert_close(submap.map.T_cw, T_cw, atol=1e-4, rtol=0)
+    torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), T_cw, atol=1e-4, rtol=0)
 
 
 def test_the_final_adjustment_can_be_left_out() -> None:
     for override in ("loop_closing.global_bundle_adjustment=false", "bundle_adjustment.local=false"):
-        world = ring_world(scale=1.01, twist=0.002)
-        found = loop(world)
-        T_cw = corrected(found)
+        submap = ring_world(scale=1.01, twist=0.002)
+        found = loop(submap)
+        T_cw = essential_graph_solution(found)
         close_loop(found, CAMERA, load_config(None, [override]))
         unit = torch.linalg.det(T_cw[:, :3, :3]) ** (1 / 3)
-        torch.testing.assert_close(world.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
-        torch.testing.assert_close(world.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])
-        assert len(world.map.points_seen_by(torch.tensor([0]))) > 0
+        torch.testing.assert_close(submap.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
+        torch.testing.assert_close(submap.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])
+        assert len(submap.map.points_seen_by(torch.tensor([0]))) > 0
 
 
 @pytest.mark.parametrize("asks", ["younger", "older"])
@@ -100,28 +107,28 @@ def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
         found = LoopCandidate(older, 3, younger, 2, RelativeSim3(S_21, 0, 0, 0))
     camera = younger if asks == "younger" else older
     last = moved(camera.T_cw, sim3_inverse(S_21)) if asks == "younger" else camera.T_cw.clone()
-    world, keyframe = join(found, CAMERA, CONFIG)
-    assert world is older
-    assert world.map.num_keyframes == 8
+    submap, keyframe = merge_maps(found, CAMERA, CONFIG)
+    assert submap is older
+    assert submap.map.num_keyframes == 8
     assert len(younger.map.keyframes) == 0
-    assert int(world.map.keyframes["frame_index"][keyframe]) == (103 if asks == "younger" else 3)
-    torch.testing.assert_close(world.map.T_cw, torch.cat([sideways(4), OTHER]), atol=1e-5, rtol=0)
-    torch.testing.assert_close(world.T_cw, last, atol=1e-5, rtol=0)
-    torch.testing.assert_close(world.history.T_cw(world.map), world.map.T_cw, atol=1e-5, rtol=0)
-    once = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
-    assert len(once) == world.map.num_points  # every point of the scene is there once
-    shared = world.map.observers(world.map.points_seen_by(torch.tensor([1])))
+    assert int(submap.map.keyframes["frame_index"][keyframe]) == (103 if asks == "younger" else 3)
+    torch.testing.assert_close(submap.map.T_cw, torch.cat([sideways(4), OTHER]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(submap.T_cw, last, atol=1e-5, rtol=0)
+    torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), submap.map.T_cw, atol=1e-5, rtol=0)
+    once = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
+    assert len(once) == submap.map.num_points  # every point of the scene is there once
+    shared = submap.map.observers(submap.map.points_seen_by(torch.tensor([1])))
     assert int(shared[6]) > 100
 
 
 def test_welding_merges_around_both_places(S_21: Tensor) -> None:
-    world = world_in(SCENE, sideways(4))
-    world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
-    count = world.map.num_points
-    weld(world, 5, 1, CAMERA, CONFIG)
-    assert world.map.num_points < 0.6 * count
-    looks = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
-    assert len(looks) == world.map.num_points
+    submap = world_in(SCENE, sideways(4))
+    submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
+    count = submap.map.num_points
+    fuse_and_adjust(submap, 5, 1, CAMERA, CONFIG)
+    assert submap.map.num_points < 0.6 * count
+    looks = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
+    assert len(looks) == submap.map.num_points
 
 
 # --- two visits -------------------------------------------------------------------------------------------------
@@ -131,72 +138,72 @@ VISIT = 4  # keyframes
 
 def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     """A place seen by four keyframes, then something else, then by four others: of its points `tied` are tied."""
-    world = world_in(SCENE, sideways(VISIT))
+    submap = world_in(SCENE, sideways(VISIT))
     if between:
-        world.absorb(world_in(SCENE, sideways(2), S_ws=pose(50.0), first=50), pose(-50.0) @ pose(0, 0, 90.0))
-    first = world.map.num_keyframes
-    world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
-    looks = world.map.points["descriptors"].long() @ torch.arange(1, 33)
-    early, late = (world.map.points_seen_by(torch.arange(start, start + VISIT)) for start in (0, first))
+        submap.merge(world_in(SCENE, sideways(2), S_ws=pose(50.0), first=50), pose(-50.0) @ pose(0, 0, 90.0))
+    first = submap.map.num_keyframes
+    submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
+    looks = submap.map.points["descriptors"].long() @ torch.arange(1, 33)
+    early, late = (submap.map.points_seen_by(torch.arange(start, start + VISIT)) for start in (0, first))
     same = torch.nonzero(looks[late][:, None] == looks[early])[:tied]
-    world.map.replace(late[same[:, 0]], early[same[:, 1]])
-    world.map.refresh(torch.arange(world.map.num_keyframes))
-    Tracker(CAMERA, CONFIG).follow(world, world.map.num_keyframes - 1)
-    return world
+    submap.map.replace(late[same[:, 0]], early[same[:, 1]])
+    submap.map.refresh(torch.arange(submap.map.num_keyframes))
+    Tracker(CAMERA, CONFIG).reset_to_keyframe(submap, submap.map.num_keyframes - 1)
+    return submap
 
 
 def test_who_was_here_at_another_time(S_21: Tensor) -> None:
-    world = two_visits(S_21)
-    last = world.map.num_keyframes - 1
-    assert set(other_visits(world.map, last).tolist()) == {0, 1, 2, 3}
-    assert other_visits(world.map, 3).tolist() == []
-    assert other_visits(two_visits(S_21, tied=14).map, last).tolist() == []
-    assert other_visits(two_visits(S_21, between=False).map, last - 2).tolist() == []
+    submap = two_visits(S_21)
+    last = submap.map.num_keyframes - 1
+    assert set(earlier_visit_keyframes(submap.map, last).tolist()) == {0, 1, 2, 3}
+    assert earlier_visit_keyframes(submap.map, 3).tolist() == []
+    assert earlier_visit_keyframes(two_visits(S_21, tied=14).map, last).tolist() == []
+    assert earlier_visit_keyframes(two_visits(S_21, between=False).map, last - 2).tolist() == []
 
 
 def test_time_is_that_of_the_frames(S_21: Tensor) -> None:
-    world = two_visits(S_21)
-    frames = world.map.keyframes["frame_index"]
+    submap = two_visits(S_21)
+    frames = submap.map.keyframes["frame_index"]
     frames[:] = frames.max() - frames  # the last keyframe came first
-    assert other_visits(world.map, world.map.num_keyframes - 1).tolist() == []
-    assert set(other_visits(world.map, 0).tolist()) == {6, 7, 8, 9}
+    assert earlier_visit_keyframes(submap.map, submap.map.num_keyframes - 1).tolist() == []
+    assert set(earlier_visit_keyframes(submap.map, 0).tolist()) == {6, 7, 8, 9}
 
 
 def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> None:
-    world = two_visits(S_21)
-    last = world.map.num_keyframes - 1
+    submap = two_visits(S_21)
+    last = submap.map.num_keyframes - 1
     early = torch.arange(VISIT)
-    before = int(world.map.observers(world.map.points_seen_by(early))[last])
-    sew_on(world, last, CAMERA, CONFIG)
-    seen = world.map.points_seen_by(torch.tensor([last]))
-    visible = world.map.points_seen_by(early)
-    after = int(world.map.observers(visible)[last])
+    before = int(submap.map.observers(submap.map.points_seen_by(early))[last])
+    fuse_with_earlier_visits(submap, last, CAMERA, CONFIG)
+    seen = submap.map.points_seen_by(torch.tensor([last]))
+    visible = submap.map.points_seen_by(early)
+    after = int(submap.map.observers(visible)[last])
     assert after > 2 * before
-    assert int(world.map.observers(seen)[early].min()) > 0.8 * after
+    assert int(submap.map.observers(seen)[early].min()) > 0.8 * after
     # the track looks for what is alive
-    assert bool(world.map.points["is_valid"][world.track.local_points].all())
-    assert bool(world.map.points["is_valid"][world.track.seen_last].all())
-    assert bool(torch.isin(seen, world.track.local_points).all())
+    assert bool(submap.map.points["is_valid"][submap.tracking.local_points].all())
+    assert bool(submap.map.points["is_valid"][submap.tracking.last_inlier_points].all())
+    assert bool(torch.isin(seen, submap.tracking.local_points).all())
 
 
 def test_without_an_earlier_visit_nothing_is_tied(S_21: Tensor) -> None:
-    world = two_visits(S_21, tied=0)
-    table = world.map.keyframes["point_ids"].clone()
-    sew_on(world, world.map.num_keyframes - 1, CAMERA, CONFIG)
-    assert torch.equal(world.map.keyframes["point_ids"], table)
+    submap = two_visits(S_21, tied=0)
+    table = submap.map.keyframes["point_ids"].clone()
+    fuse_with_earlier_visits(submap, submap.map.num_keyframes - 1, CAMERA, CONFIG)
+    assert torch.equal(submap.map.keyframes["point_ids"], table)
 
 
 def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
     """What one side's keyframes see no point at is filled by the points of the other side, and the other way round."""
-    world = two_visits(S_21, tied=0, between=False)
+    submap = two_visits(S_21, tied=0, between=False)
     here, there = torch.arange(VISIT, 2 * VISIT), torch.arange(VISIT)
     for one in (1, VISIT + 2):
-        seen = world.map.keyframes["point_ids"][one]
+        seen = submap.map.keyframes["point_ids"][one]
         keypoints = torch.nonzero(seen >= 0)[:, 0]
-        world.map.forget(torch.full_like(keypoints, one), keypoints)
-    sew(world.map, here, there, CAMERA, CONFIG)
-    assert int(world.map.observers(world.map.points_seen_by(here))[1]) > 100
-    assert int(world.map.observers(world.map.points_seen_by(there))[VISIT + 2]) > 100
+        submap.map.forget(torch.full_like(keypoints, one), keypoints)
+    fuse_landmarks(submap.map, here, there, CAMERA, CONFIG)
+    assert int(submap.map.observers(submap.map.points_seen_by(here))[1]) > 100
+    assert int(submap.map.observers(submap.map.points_seen_by(there))[VISIT + 2]) > 100
 
 
 def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) -> None:
@@ -206,11 +213,11 @@ def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) ->
         "loop_closing.global_bundle_adjustment=false",
         "loop_closing.global_bundle_adjustment=true",
     ):
-        world = world_in(SCENE, sideways(4))
-        world.absorb(world_in(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
-        weld(world, 5, 1, CAMERA, load_config(None, [override]))
-        looks = {tuple(row) for row in world.map.points["descriptors"][world.map.valid_points()].tolist()}
-        counts.append((world.map.num_points, len(looks)))
+        submap = world_in(SCENE, sideways(4))
+        submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
+        fuse_and_adjust(submap, 5, 1, CAMERA, load_config(None, [override]))
+        looks = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
+        counts.append((submap.map.num_points, len(looks)))
     (loose, _), (tied, different) = counts
     assert loose > 1.2 * different
     assert tied == different
@@ -218,12 +225,12 @@ def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) ->
 
 def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
     for enabled in (True, False):
-        world, worlds = two_visits(S_21), Atlas(CAMERA.params)
-        worlds._worlds = [world]
+        submap, atlas = two_visits(S_21), Atlas(CAMERA.params)
+        atlas._submaps = [submap]
         memory = LoopCloser(
-            CAMERA, load_config(None, [f"loop_closing.enabled={str(enabled).lower()}"]), worlds
+            CAMERA, load_config(None, [f"loop_closing.enabled={str(enabled).lower()}"]), atlas
         )
-        last = world.map.num_keyframes - 1
-        points = world.map.num_points
-        assert memory.recognize(world, last) is None
-        assert (world.map.num_points < points) is enabled
+        last = submap.map.num_keyframes - 1
+        points = submap.map.num_points
+        assert memory.detect(submap, last) is None
+        assert (submap.map.num_points < points) is enabled

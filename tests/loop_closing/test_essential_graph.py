@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 
 from tests.scene import Scene, pose
-from torchslam.loop_closing.essential_graph import STRONG, essential_edges
+from torchslam.loop_closing.loop_closer import STRONG, essential_edges
 from torchslam.map.map import Map
 
 

@@ -30,15 +30,15 @@ def blurred(descriptors: Tensor, share: float, seed: int = 0) -> Tensor:
 
 
 def places_of(*keys: int) -> KeyframeDatabase:
-    places = KeyframeDatabase()
+    database = KeyframeDatabase()
     for key in keys:
-        places.add(key, *image(key))
-    return places
+        database.add(key, *image(key))
+    return database
 
 
 def answer_alike(left: KeyframeDatabase, right: KeyframeDatabase) -> bool:
     """Whether both know the same keyframes by the same words and codes."""
-    answers = [[places.query(*image(key)) for key in range(5)] for places in (left, right)]
+    answers = [[database.query(*image(key)) for key in range(5)] for database in (left, right)]
     return all(
         torch.equal(one[0], two[0]) and torch.equal(one[1], two[1]) for one, two in zip(*answers, strict=True)
     )
@@ -101,10 +101,10 @@ def test_floats_become_bits_that_keep_their_angles(generator: torch.Generator) -
 def test_known_scores() -> None:
     # One word each: rare ones, of one image in two, weigh log(3)^2, the common one log(3 / 2)^2.
     words = noise(3, 32)
-    places = KeyframeDatabase(words)
-    places.add(4, words[[0, 1]], torch.ones(2, dtype=torch.bool))
-    places.add(2, words[[0, 2]], torch.ones(2, dtype=torch.bool))
-    keys, scores = places.query(words[[0, 1]], torch.ones(2, dtype=torch.bool))
+    database = KeyframeDatabase(words)
+    database.add(4, words[[0, 1]], torch.ones(2, dtype=torch.bool))
+    database.add(2, words[[0, 2]], torch.ones(2, dtype=torch.bool))
+    keys, scores = database.query(words[[0, 1]], torch.ones(2, dtype=torch.bool))
     rare, common = math.log(3) ** 2, math.log(3 / 2) ** 2
     assert keys.tolist() == [4, 2]
     assert scores.tolist() == pytest.approx([1.0, common / (rare + common)], rel=1e-5)
@@ -140,10 +140,10 @@ def test_only_the_strongest_count() -> None:
 
 
 def test_more_keyframes_than_the_first_room_and_equal_scores_by_key() -> None:
-    places = KeyframeDatabase()
+    database = KeyframeDatabase()
     for key in reversed(range(200)):
-        places.add(key, *image(key % 100))
-    keys, scores = places.query(*image(42))
+        database.add(key, *image(key % 100))
+    keys, scores = database.query(*image(42))
     assert keys[:2].tolist() == [42, 142]
     assert scores[:2].tolist() == pytest.approx([1.0, 1.0])
     assert sorted(keys.tolist()) == list(range(200))
@@ -154,26 +154,26 @@ def test_nothing_to_ask_and_nothing_to_remember() -> None:
     nothing = torch.zeros(0, 32, dtype=torch.uint8), torch.zeros(0, dtype=torch.bool)
     keys, scores = KeyframeDatabase().query(*image(0))
     assert len(keys) == len(scores) == 0
-    places = places_of(1)
-    places.add(2, *nothing)
-    assert places.query(*image(1))[0].tolist() == [1, 2]
-    assert places.query(*image(1))[1].tolist() == pytest.approx([1.0, 0.0])
-    assert places.query(*nothing)[1].tolist() == [0.0, 0.0]
+    database = places_of(1)
+    database.add(2, *nothing)
+    assert database.query(*image(1))[0].tolist() == [1, 2]
+    assert database.query(*image(1))[1].tolist() == pytest.approx([1.0, 0.0])
+    assert database.query(*nothing)[1].tolist() == [0.0, 0.0]
 
 
 # --- changes -------------------------------------------------------------------------------------------------
 
 
 def test_removal_leaves_no_trace_and_its_room_is_used_again() -> None:
-    places = places_of(0, 1, 2, 3)
-    places.remove(torch.tensor([1, 2]))
-    assert answer_alike(places, places_of(0, 3))
-    places.add(2, *image(2))
-    assert answer_alike(places, places_of(0, 2, 3))
-    assert (len(places), 1 in places, 2 in places) == (3, False, True)
+    database = places_of(0, 1, 2, 3)
+    database.remove(torch.tensor([1, 2]))
+    assert answer_alike(database, places_of(0, 3))
+    database.add(2, *image(2))
+    assert answer_alike(database, places_of(0, 2, 3))
+    assert (len(database), 1 in database, 2 in database) == (3, False, True)
     with pytest.raises(KeyError):
-        places.remove([0, 8])
-    assert len(places) == 3
+        database.remove([0, 8])
+    assert len(database) == 3
 
 
 @pytest.mark.parametrize("key", [-1, 0])
@@ -188,30 +188,30 @@ def test_a_key_must_be_new(key: int) -> None:
 def test_floats_choose_their_words_and_keep_them(generator: torch.Generator) -> None:
     floats = torch.nn.functional.normalize(torch.randn(6, 100, 64, generator=generator), dim=-1)
     mask = torch.ones(100, dtype=torch.bool)
-    places = KeyframeDatabase()
-    places.add(0, floats[0, :63], mask[:63])  # too few to name the words
-    assert places.query(floats[0], mask)[1].tolist() == [0.0]
+    database = KeyframeDatabase()
+    database.add(0, floats[0, :63], mask[:63])  # too few to name the words
+    assert database.query(floats[0], mask)[1].tolist() == [0.0]
     for key in range(1, 6):
-        places.add(key, floats[key], mask)
-    assert torch.equal(places._words, binary(floats[1]))
+        database.add(key, floats[key], mask)
+    assert torch.equal(database._words, binary(floats[1]))
     close = torch.nn.functional.normalize(
         floats + 0.02 * torch.randn(6, 100, 64, generator=generator), dim=-1
     )
     for key in range(1, 6):
-        keys, scores = places.query(close[key], mask)
+        keys, scores = database.query(close[key], mask)
         assert int(keys[0]) == key
         assert float(scores[0]) > 3 * float(scores[1])
 
 
 def test_on_any_device(device: torch.device) -> None:
-    places, expected = KeyframeDatabase(), places_of(0, 1, 2)
+    database, expected = KeyframeDatabase(), places_of(0, 1, 2)
     for key in range(3):
         descriptors, mask = image(key)
-        places.add(key, descriptors.to(device), mask.to(device))
-    places.remove([0])
+        database.add(key, descriptors.to(device), mask.to(device))
+    database.remove([0])
     expected.remove([0])
     descriptors, mask = image(1)
-    answers = places.query(descriptors.to(device), mask.to(device))
+    answers = database.query(descriptors.to(device), mask.to(device))
     assert all(answer.device.type == device.type for answer in answers)
     for answer, known in zip(answers, expected.query(descriptors, mask), strict=True):
         torch.testing.assert_close(answer.cpu(), known)
@@ -222,14 +222,14 @@ def test_on_any_device(device: torch.device) -> None:
 
 def test_the_true_place_wins_among_rendered_ones() -> None:
     # Frames 160 on pass the places of the first round again, on another sway.
-    orb, places = ORB(500), KeyframeDatabase()
+    orb, database = ORB(500), KeyframeDatabase()
     sequence = open_sequence("synthetic:room?frames=320")
     for index in range(0, 160, 3):
         features = orb(sequence[index].image)
-        places.add(index, features.descriptors[0], features.mask[0])
+        database.add(index, features.descriptors[0], features.mask[0])
     for index in (160, 205, 250, 295):
         features = orb(sequence[index].image)
-        keys, scores = places.query(features.descriptors[0], features.mask[0])
+        keys, scores = database.query(features.descriptors[0], features.mask[0])
         away = ((keys - index + 80) % 160 - 80).abs()
         assert len(keys) == 54
         assert int(away[0]) <= 6
@@ -238,13 +238,13 @@ def test_the_true_place_wins_among_rendered_ones() -> None:
 
 @pytest.mark.parametrize("floats", [False, True])
 def test_a_keyframe_that_is_there_asks_as_its_image_does(floats: bool) -> None:
-    places = KeyframeDatabase()
+    database = KeyframeDatabase()
     for key in range(4):
         descriptors, mask = image(key % 3, count=100)
         if floats:
             descriptors = torch.nn.functional.normalize(descriptors.float() - 127, dim=-1)
-        places.add(key, descriptors, mask)
-        for one, other in zip(places.like(key), places.query(descriptors, mask), strict=True):
+        database.add(key, descriptors, mask)
+        for one, other in zip(database.query_by_key(key), database.query(descriptors, mask), strict=True):
             assert torch.equal(one, other)
     with pytest.raises(KeyError):
-        places.like(7)
+        database.query_by_key(7)

@@ -18,27 +18,26 @@ from torchslam.loop_closing.loop_detector import (
     LoopCandidate,
     LoopClosureRecord,
     LoopDetector,
-    agree,
+    are_consistent,
+    covisible_twice,
     may_have_drifted,
-    two_steps_around,
 )
 from torchslam.loop_closing.relative_sim3 import RelativeSim3, rescaling
-from torchslam.map.atlas import Atlas
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Atlas, Submap
 
 SCENE = Scene.of(300)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
-def recognizer(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetector:
+def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetector:
     """One that knows all keyframes of these worlds."""
-    worlds, places = Atlas(CAMERA.params), KeyframeDatabase()
-    worlds._worlds = list(held)
-    for world in held:
-        for keyframe in range(world.map.num_keyframes):
-            view = world.map.view(keyframe)
-            places.add(world.map.key(keyframe), view.descriptors, view.mask)
-    return LoopDetector(CAMERA, load_config(None, overrides), worlds, places)
+    atlas, database = Atlas(CAMERA.params), KeyframeDatabase()
+    atlas._submaps = list(held)
+    for submap in held:
+        for keyframe in range(submap.map.num_keyframes):
+            view = submap.map.view(keyframe)
+            database.add(submap.map.key(keyframe), view.descriptors, view.mask)
+    return LoopDetector(CAMERA, load_config(None, overrides), atlas, database)
 
 
 def two_worlds(S_21: Tensor) -> tuple[Submap, Submap]:
@@ -50,17 +49,17 @@ def two_worlds(S_21: Tensor) -> tuple[Submap, Submap]:
 
 def test_another_world_of_the_same_place_is_recognised(S_21: Tensor) -> None:
     one, other = two_worlds(S_21)
-    found = recognizer(one, other).recognize(other, 3)
+    found = loop_detector(one, other).detect(other, 3)
     assert found is not None
-    assert (found.world, found.keyframe, found.other) == (other, 3, one)
+    assert (found.submap, found.keyframe, found.other) == (other, 3, one)
     assert not found.is_loop
     torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
-    assert found.recall == LoopClosureRecord(frame=103, place=found.place, world=1, other=0)
+    assert found.closure == LoopClosureRecord(frame=103, place=found.place, submap=1, other=0)
 
 
 def test_a_loop_that_drifted_is_recognised() -> None:
-    world = ring_world(scale=1.01, twist=0.002)
-    found = recognizer(world).recognize(world, END)
+    submap = ring_world(scale=1.01, twist=0.002)
+    found = loop_detector(submap).detect(submap, END)
     assert found is not None
     assert found.is_loop
     assert found.place in (0, 1, 2)
@@ -70,16 +69,16 @@ def test_a_loop_that_drifted_is_recognised() -> None:
 
 
 def test_a_place_that_was_never_left_is_no_news() -> None:
-    world = world_in(SCENE, sideways(6))
-    assert recognizer(world).recognize(world, 5) is None
+    submap = world_in(SCENE, sideways(6))
+    assert loop_detector(submap).detect(submap, 5) is None
 
 
 def test_a_place_that_looks_alike_elsewhere_is_no_loop() -> None:
     """A hundred metres on everything looks the same; no drift takes a camera that far on a way of a hundred metres."""
-    world = world_in(SCENE, sideways(4))
-    world.absorb(world_in(SCENE, OTHER, first=50), pose(0, 0, 100.0))
-    assert recognizer(world).recognize(world, 7) is None
-    found = recognizer(world, overrides=("loop_closing.max_drift=1.1",)).recognize(world, 7)
+    submap = world_in(SCENE, sideways(4))
+    submap.merge(world_in(SCENE, OTHER, first=50), pose(0, 0, 100.0))
+    assert loop_detector(submap).detect(submap, 7) is None
+    found = loop_detector(submap, overrides=("loop_closing.max_drift=1.1",)).detect(submap, 7)
     assert found is not None
     torch.testing.assert_close(found.relation.S_21, pose(0, 0, -100.0), atol=1e-5, rtol=0)
 
@@ -87,21 +86,21 @@ def test_a_place_that_looks_alike_elsewhere_is_no_loop() -> None:
 def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
     one, other = two_worlds(S_21)
     other.map.keyframes["keypoints"][:3] += 40.0  # these see nothing where it should be
-    assert recognizer(one, other).recognize(other, 3) is None
-    alone = recognizer(one, other, overrides=("loop_closing.min_confirming_keyframes=0",))
-    assert alone.recognize(other, 3) is not None
+    assert loop_detector(one, other).detect(other, 3) is None
+    alone = loop_detector(one, other, overrides=("loop_closing.min_confirming_keyframes=0",))
+    assert alone.detect(other, 3) is not None
     one, other = two_worlds(S_21)
     other.map.keyframes["keypoints"][:1] += 40.0
-    assert recognizer(one, other).recognize(other, 3) is not None
+    assert loop_detector(one, other).detect(other, 3) is not None
     assert (
-        recognizer(one, other, overrides=("loop_closing.min_confirming_keyframes=3",)).recognize(other, 3)
+        loop_detector(one, other, overrides=("loop_closing.min_confirming_keyframes=3",)).detect(other, 3)
         is None
     )
 
 
 def test_what_two_steps_reach() -> None:
     slam_map = ring_world().map
-    near = two_steps_around(slam_map, 10)
+    near = covisible_twice(slam_map, 10)
     shared = slam_map.observers(slam_map.points_seen_by(torch.tensor([10])))
     assert set(torch.nonzero(shared)[:, 0].tolist()) <= set(near.tolist())
     furthest = int(torch.nonzero(shared)[-1])
@@ -120,11 +119,11 @@ def way() -> Submap:
 
 
 def drifts(
-    S_21: Tensor, world: Submap | None = None, keyframe: int = 10, place: int = 0, **settings: float
+    S_21: Tensor, submap: Submap | None = None, keyframe: int = 10, place: int = 0, **settings: float
 ) -> bool:
     relation = RelativeSim3(S_21, 0, 0, 0)
     return may_have_drifted(
-        world or way(), keyframe, place, relation, replace(LoopClosingConfig(), **settings)
+        submap or way(), keyframe, place, relation, replace(LoopClosingConfig(), **settings)
     )
 
 
@@ -138,11 +137,11 @@ def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
 
 
 def test_the_way_is_that_in_which_the_frames_came() -> None:
-    world = way()
-    world.map.keyframes["frame_index"][:] = torch.tensor([0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10])
+    submap = way()
+    submap.map.keyframes["frame_index"][:] = torch.tensor([0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10])
     # to and fro: 2, 2, 2, 2, then 7 back, 2, 2, 2, 2 and 1: 24 metres
-    assert drifts(pose(0, 4.79), world)
-    assert not drifts(pose(0, 4.81), world)
+    assert drifts(pose(0, 4.79), submap)
+    assert not drifts(pose(0, 4.81), submap)
 
 
 def test_the_position_is_that_of_the_camera() -> None:
@@ -176,7 +175,7 @@ def answers(S_1: Tensor, S_2: Tensor, same: bool = True) -> bool:
     one, other = world_in(SCENE, sideways(4)), world_in(SCENE, sideways(4), number=1)
     third = other if same else world_in(SCENE, sideways(4), number=2)
     first = LoopCandidate(one, 2, other, 1, RelativeSim3(S_1, 0, 0, 0))
-    return agree(first, LoopCandidate(one, 2, third, 1, RelativeSim3(S_2, 0, 0, 0)))
+    return are_consistent(first, LoopCandidate(one, 2, third, 1, RelativeSim3(S_2, 0, 0, 0)))
 
 
 def about(S: Tensor) -> Tensor:
@@ -213,8 +212,8 @@ def test_of_different_worlds_nothing_can_be_said() -> None:
 def test_two_places_that_both_might_be_it_are_none(S_21: Tensor) -> None:
     """A world with two corridors that look the same: which of them it is, nobody knows."""
     twin = world_in(SCENE, sideways(4), first=0)
-    twin.absorb(world_in(SCENE, sideways(4), first=50), pose(100.0))
+    twin.merge(world_in(SCENE, sideways(4), first=50), pose(100.0))
     one = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
-    assert recognizer(twin, one).recognize(one, 3) is None
-    assert recognizer(twin, one, overrides=("loop_closing.max_candidates=1",)).recognize(one, 3) is not None
+    assert loop_detector(twin, one).detect(one, 3) is None
+    assert loop_detector(twin, one, overrides=("loop_closing.max_candidates=1",)).detect(one, 3) is not None
     assert Config().loop_closing.max_candidates == 3

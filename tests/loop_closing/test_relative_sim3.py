@@ -14,13 +14,13 @@ from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, t
 from torchslam.geometry.similarity import Similarity
 from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
-    agreeing,
-    confirms,
-    find,
-    neighbourhood,
-    relate,
+    estimate_relative_sim3,
+    inlier_matches,
+    match_by_sim3_pose,
+    neighborhood,
     rescaling,
     seen_from,
+    verify,
 )
 from torchslam.map.map import Map
 
@@ -38,7 +38,7 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
 
 
 def related(map_1: Map, map_2: Map, *overrides: str) -> RelativeSim3 | None:
-    return relate(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
+    return estimate_relative_sim3(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
 
 
 def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
@@ -56,7 +56,7 @@ def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
 
 def test_the_other_way_round_it_is_the_inverse(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
-    relation = relate(map_2, 1, map_1, 2, CAMERA, Config())
+    relation = estimate_relative_sim3(map_2, 1, map_1, 2, CAMERA, Config())
     assert relation is not None
     torch.testing.assert_close(relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
 
@@ -90,7 +90,7 @@ def test_no_more_samples_are_drawn_than_would_have_found_enough_matches(
 
 def test_a_map_is_related_to_itself_by_nothing_at_all() -> None:
     slam_map = world_in(SCENE, ONE).map
-    relation = relate(slam_map, 3, slam_map, 0, CAMERA, Config())
+    relation = estimate_relative_sim3(slam_map, 3, slam_map, 0, CAMERA, Config())
     assert relation is not None
     torch.testing.assert_close(relation.S_21, pose(), atol=1e-6, rtol=0)
 
@@ -165,17 +165,17 @@ def test_a_keyframe_confirms_what_it_sees_where_it_should_be(S_21: Tensor) -> No
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
     right = RelativeSim3(S_21, 0, 0, 0)
-    assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert verify(right, map_1, 3, map_2, near, CAMERA, Config())
     for wrong in (
         pose(0.5) @ S_21,
         pose(0, 0, 0, 0, 0.1) @ S_21,
         rescaling(torch.tensor(1.3).double()) @ S_21,
     ):
-        assert not confirms(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
+        assert not verify(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:20])
-    assert confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert verify(right, map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:19])
-    assert not confirms(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert not verify(right, map_1, 3, map_2, near, CAMERA, Config())
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(4.85, True), (4.95, False)])
@@ -184,8 +184,8 @@ def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees
     T_12 = moved(ONE[2], S_21)
     keypoints, scales = map_1.keyframes["keypoints"], map_1.keyframes["scales"]
     keypoints[2, :, 0] += offset * scales[2]
-    ids, _ = find(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
-    good, at = agreeing(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+    ids, _ = match_by_sim3_pose(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+    good, at = inlier_matches(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
     assert len(ids) > 100
     assert (len(good) > 100) is agrees
     assert len(good) > 100 or len(good) < 0.1 * len(ids)  # a stray one is near another's place
@@ -198,14 +198,14 @@ def test_points_are_looked_for_eight_pixels_around(S_21: Tensor) -> None:
         map_1, map_2 = maps(S_21)
         map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
         T_12 = moved(ONE[2], S_21)
-        ids, _ = find(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+        ids, _ = match_by_sim3_pose(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
         assert (len(ids) > 100) is found
 
 
 def test_a_neighbourhood_is_a_keyframe_and_those_that_share_most_with_it() -> None:
     slam_map = world_in(SCENE, sideways(5)).map
-    assert neighbourhood(slam_map, 4, 2).tolist() == [4, 3, 2]
-    assert neighbourhood(slam_map, 0).tolist() == [0, 1, 2, 3, 4]
+    assert neighborhood(slam_map, 4, 2).tolist() == [4, 3, 2]
+    assert neighborhood(slam_map, 0).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_camera_is_seen_from_the_other_map(S_21: Tensor) -> None:

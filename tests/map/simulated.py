@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.types import FrameFeatures, PoseEstimate
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
@@ -51,7 +50,7 @@ def tracked_at(
         "covariance": 1e-6 * torch.eye(6, dtype=T_cw.dtype),
         "depth": 4.0,
         "error": 1.0,
-        "coverage": 1.0,
+        "coverage_ratio": 1.0,
     }
     count = len(point_ids) if matches is None else matches
     return PoseEstimate(T_cw, point_ids, keypoints, count, **(certain | values))  # type: ignore[arg-type]
@@ -71,8 +70,8 @@ def simulated_world(
     cloud_w = torch.rand(points, 3, generator=generator, dtype=torch.float64) * 2 - 1
     cloud_w[:, 2] += 4.0
     T_cw = path(frames)
-    world = Submap.empty(number, CAMERA.params.double())
-    slam_map = world.map
+    submap = Submap.empty(number, CAMERA.params.double())
+    slam_map = submap.map
     ids = torch.full((points,), -1)
     for index in range(frames):
         view = view_of(index, T_cw[index], cloud_w, generator, session)
@@ -86,27 +85,27 @@ def simulated_world(
             slam_map.observe(keyframe, seen, ids[seen])
         seen = seen[ids[seen] >= 0]
         T_cr = T_cw[index] @ se3_inverse(slam_map.T_cw[keyframe])
-        world.history.add(view, tracked_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
+        submap.posed_frames.add(view, tracked_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
     everyone = torch.arange(slam_map.num_keyframes)
     slam_map.refresh(everyone)
     slam_map.keyframes["covariances"][:] = spreads(len(everyone), 6, generator)
     last = int(everyone[-1])
-    world.track = TrackingState(
+    submap.tracking = TrackingState(
         T_cr=T_cw[-1] @ se3_inverse(slam_map.T_cw[last]),
         reference=last,
         reference_size=10,
         velocity=T_cw[-1] @ se3_inverse(T_cw[-2]),
-        seen_last=slam_map.points_seen_by(everyone[-1:]),
+        last_inlier_points=slam_map.points_seen_by(everyone[-1:]),
         local_keyframes=everyone.flip(0),
         local_points=slam_map.points_seen_by(everyone),
     )
-    return world
+    return submap
 
 
-def reprojection_errors(world: Submap) -> Tensor:
+def reprojection_errors(submap: Submap) -> Tensor:
     """(O, 2) pixels, keyframe by keyframe, of all observations by the map."""
-    seen = world.map.observations()
+    seen = submap.map.observations()
     points_c = transform(
-        world.map.T_cw[seen.keyframe_index], world.map.positions_w[seen.point_index][:, None]
+        submap.map.T_cw[seen.keyframe_index], submap.map.positions_w[seen.point_index][:, None]
     )
     return CAMERA.project(points_c[:, 0])[0] - seen.pixels

@@ -7,45 +7,44 @@ import torch
 from tests.map.simulated import simulated_world
 from tests.scene import CAMERA, Scene, pose, sideways, world_in
 from torchslam.geometry import se3_inverse
-from torchslam.map.atlas import Atlas
-from torchslam.map.compaction import RowRemap, stand_in
+from torchslam.map.atlas import Atlas, TrackingState
+from torchslam.map.compaction import RowRemap, replacement_keyframe
 from torchslam.map.map import Map
-from torchslam.map.tracking_state import TrackingState
 
 
 def test_worlds_are_numbered_as_they_begin_and_numbers_are_not_used_again() -> None:
-    worlds = Atlas(CAMERA.params)
-    assert worlds.main() is None
-    begun = [worlds.begin() for _ in range(3)]
-    assert [world.number for world in begun] == [0, 1, 2]
-    worlds.forget(begun[2])
-    worlds.forget(begun[0])
-    assert list(worlds) == [begun[1]]
-    assert len(worlds) == 1
-    assert worlds.begin().number == 3
-    assert begun[1].map.num_keyframes == 0
-    assert begun[1].track.T_cr.dtype == CAMERA.params.dtype
+    submaps = Atlas(CAMERA.params)
+    assert submaps.main() is None
+    created = [submaps.create() for _ in range(3)]
+    assert [submap.number for submap in created] == [0, 1, 2]
+    submaps.remove(created[2])
+    submaps.remove(created[0])
+    assert list(submaps) == [created[1]]
+    assert len(submaps) == 1
+    assert submaps.create().number == 3
+    assert created[1].map.num_keyframes == 0
+    assert created[1].tracking.T_cr.dtype == CAMERA.params.dtype
 
 
 def test_the_main_world_is_that_of_most_frames() -> None:
     held = [simulated_world(frames=frames, number=number) for number, frames in enumerate((9, 12, 12))]
-    worlds = Atlas(CAMERA.params)
-    worlds._worlds = held
-    assert worlds.main() is held[1]
-    worlds.forget(held[1])
-    assert worlds.main() is held[2]
+    submaps = Atlas(CAMERA.params)
+    submaps._submaps = held
+    assert submaps.main() is held[1]
+    submaps.remove(held[1])
+    assert submaps.main() is held[2]
 
 
 def test_a_keyframe_is_found_by_its_name_in_whichever_world_it_is() -> None:
     scene = Scene.of(30)
     held = [world_in(scene, sideways(3), first=first) for first in (0, 40)]
-    worlds = Atlas(CAMERA.params)
-    empty = worlds.begin()
-    worlds._worlds += held
-    for world in held:
+    submaps = Atlas(CAMERA.params)
+    empty = submaps.create()
+    submaps._submaps += held
+    for submap in held:
         for row in range(3):
-            assert worlds.find(world.map.key(row)) == (world, row)
-    assert worlds.find(7) is None
+            assert submaps.find(submap.map.key(row)) == (submap, row)
+    assert submaps.find(7) is None
     assert empty.map.row(0) == -1
     assert Map().row(0) == -1
     single = world_in(scene, sideways(1), first=5)
@@ -54,16 +53,16 @@ def test_a_keyframe_is_found_by_its_name_in_whichever_world_it_is() -> None:
 
 
 def test_a_second_camera_has_a_track_of_its_own() -> None:
-    world = simulated_world()
-    before = world.T_cw.clone()
-    aside = world.aside()
-    aside.track.reference = 0
-    aside.track.T_cr = pose(1.0)
-    assert aside.map is world.map
-    assert aside.history is world.history
-    torch.testing.assert_close(world.T_cw, before)
-    aside.track = TrackingState.nowhere(before)
-    torch.testing.assert_close(world.T_cw, before)
+    submap = simulated_world()
+    before = submap.T_cw.clone()
+    aside = submap.fork()
+    aside.tracking.reference = 0
+    aside.tracking.T_cr = pose(1.0)
+    assert aside.map is submap.map
+    assert aside.posed_frames is submap.posed_frames
+    torch.testing.assert_close(submap.T_cw, before)
+    aside.tracking = TrackingState.empty(before)
+    torch.testing.assert_close(submap.T_cw, before)
 
 
 def test_the_nearest_of_those_that_share_most_stands_in() -> None:
@@ -72,11 +71,11 @@ def test_the_nearest_of_those_that_share_most_stands_in() -> None:
     T_cw[3, 0, 3], T_cw[3, 1, 3] = T_cw[2, 0, 3] - 0.05, 0.02  # nearer to 2 than 1 is
     slam_map = world_in(Scene.of(200), T_cw).map
     centres = se3_inverse(slam_map.T_cw)[:, :3, 3]
-    for goes in ([2], [2, 3], [2, 3, 1], [0, 2]):
+    for removed in ([2], [2, 3], [2, 3, 1], [0, 2]):
         gone = torch.zeros(6, dtype=torch.bool)
-        gone[goes] = True
+        gone[removed] = True
         distance = (centres - centres[2]).norm(dim=-1).masked_fill(gone, torch.inf)
-        assert stand_in(slam_map, 2, gone) == int(distance.argmin())
+        assert replacement_keyframe(slam_map, 2, gone) == int(distance.argmin())
 
 
 def test_of_many_only_those_that_share_most_stand_in() -> None:
@@ -90,8 +89,8 @@ def test_of_many_only_those_that_share_most_stand_in() -> None:
         torch.nonzero(slam_map.keyframes["point_ids"][1] >= 0)[3:, 0],
     )
     gone = torch.tensor([True, False, False])
-    assert stand_in(slam_map, 0, gone, count=1) == 2
-    assert stand_in(slam_map, 0, gone, count=2) == 1
+    assert replacement_keyframe(slam_map, 0, gone, count=1) == 2
+    assert replacement_keyframe(slam_map, 0, gone, count=2) == 1
 
 
 def test_two_renumberings_one_after_the_other() -> None:
@@ -100,4 +99,4 @@ def test_two_renumberings_one_after_the_other() -> None:
     both = one.then(two)
     assert both.keyframes.tolist() == [-1, -1, 0]
     assert both.points.tolist() == [-1, -1, 2, 0]
-    assert both.heirs.tolist() == [0, 0, 0]
+    assert both.replacement.tolist() == [0, 0, 0]

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
+from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, read_map, write_atlas
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
 from torchslam.types import FrameFeatures, PoseEstimate
 from torchslam.utils.atomic_write import PART, write_whole
 
 
 @pytest.fixture
-def world(slam_map: Map) -> Submap:
+def submap(slam_map: Map) -> Submap:
     """The small run's map, with a few frames between its keyframes, in two sessions."""
     made = Submap.empty(0, slam_map.T_cw)
     made.map = slam_map
@@ -31,35 +31,35 @@ def world(slam_map: Map) -> Submap:
         )
         ids = torch.arange(4 + index)
         seen = PoseEstimate(slam_map.T_cw[0], ids, ids, 20, torch.eye(6, dtype=torch.float64), 1.0)
-        made.history.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
+        made.posed_frames.add(view, seen, torch.eye(4, dtype=torch.float64), 0)
     return made
 
 
 @pytest.fixture
-def worlds(world: Submap) -> list[Submap]:
+def submaps(submap: Submap) -> list[Submap]:
     """Number 0 with something in it, number 2 without."""
-    return [world, Submap.empty(2, world.map.T_cw)]
+    return [submap, Submap.empty(2, submap.map.T_cw)]
 
 
 @pytest.fixture
-def path(tmp_path: Path, worlds: list[Submap], camera: Camera) -> Path:
-    write_atlas(tmp_path / "map.safetensors", worlds, camera, sessions=2)
+def path(tmp_path: Path, submaps: list[Submap], camera: Camera) -> Path:
+    write_atlas(tmp_path / "map.safetensors", submaps, camera, sessions=2)
     return tmp_path / "map.safetensors"
 
 
-def tables(world: Submap) -> list[dict[str, Tensor]]:
-    history = world.history
-    kept = (world.map.points, world.map.keyframes, history.frames, history.observations)
+def tables(submap: Submap) -> list[dict[str, Tensor]]:
+    posed_frames = submap.posed_frames
+    kept = (submap.map.points, submap.map.keyframes, posed_frames.frames, posed_frames.observations)
     return [table.columns() for table in kept]
 
 
-def test_worlds_and_camera_come_back_as_they_were(path: Path, worlds: list[Submap], camera: Camera) -> None:
+def test_worlds_and_camera_come_back_as_they_were(path: Path, submaps: list[Submap], camera: Camera) -> None:
     saved = read_atlas(path)
-    assert [world.number for world in saved.worlds] == [0, 2]
-    assert saved.worlds.begun == 3
-    assert saved.worlds.begin().number == 3
+    assert [submap.number for submap in saved.atlas] == [0, 2]
+    assert saved.atlas.num_created == 3
+    assert saved.atlas.create().number == 3
     assert saved.sessions == 2
-    for before, after in zip(worlds, saved.worlds, strict=False):
+    for before, after in zip(submaps, saved.atlas, strict=False):
         for expected, found in zip(tables(before), tables(after), strict=True):
             assert expected.keys() == found.keys()
             for name, column in expected.items():
@@ -79,20 +79,22 @@ def test_a_loaded_map_can_grow(path: Path) -> None:
     assert loaded.num_points == before + 2
 
 
-def test_same_worlds_give_same_bytes_also_when_read(path: Path, worlds: list[Submap], camera: Camera) -> None:
-    write_atlas(path.with_name("two"), worlds, camera, sessions=2)
+def test_same_worlds_give_same_bytes_also_when_read(
+    path: Path, submaps: list[Submap], camera: Camera
+) -> None:
+    write_atlas(path.with_name("two"), submaps, camera, sessions=2)
     assert path.with_name("two").read_bytes() == path.read_bytes()
     saved = read_atlas(path)
-    write_atlas(path.with_name("three"), saved.worlds, saved.camera, saved.sessions)
+    write_atlas(path.with_name("three"), saved.atlas, saved.camera, saved.sessions)
     assert path.with_name("three").read_bytes() == path.read_bytes()
 
 
-def test_frames_of_later_sessions_are_left_out(path: Path, worlds: list[Submap], camera: Camera) -> None:
-    write_atlas(path, worlds, camera, sessions=1)
-    world = next(iter(read_atlas(path).worlds))
-    assert world.history.frames["session"].tolist() == [0, 0]
-    assert world.history.observations["frame_row"].tolist() == [0] * 5 + [1] * 6
-    write_atlas(path, worlds, camera, sessions=0)
+def test_frames_of_later_sessions_are_left_out(path: Path, submaps: list[Submap], camera: Camera) -> None:
+    write_atlas(path, submaps, camera, sessions=1)
+    submap = next(iter(read_atlas(path).atlas))
+    assert submap.posed_frames.frames["session"].tolist() == [0, 0]
+    assert submap.posed_frames.observations["frame_row"].tolist() == [0] * 5 + [1] * 6
+    write_atlas(path, submaps, camera, sessions=0)
     with pytest.raises(ResultsError, match="session from 0 to 0"):  # of keyframes: they are never left out
         read_atlas(path)
 
@@ -107,9 +109,9 @@ def test_no_worlds_are_a_file_too(tmp_path: Path, camera: Camera) -> None:
 def test_the_device_is_that_asked_for(path: Path, device: torch.device) -> None:
     saved = read_atlas(path, device)
     assert saved.camera.params.device.type == device.type
-    for world in saved.worlds:
-        assert world.track.T_cr.device.type == device.type
-        assert all(rows.device.type == device.type for table in tables(world) for rows in table.values())
+    for submap in saved.atlas:
+        assert submap.tracking.T_cr.device.type == device.type
+        assert all(rows.device.type == device.type for table in tables(submap) for rows in table.values())
 
 
 # --- what is no map ------------------------------------------------------------------------------------------
@@ -172,7 +174,7 @@ def change(name: str, how: Callable[[Tensor], Tensor]) -> Callable[[Tensors], ob
     return lambda tensors: tensors.__setitem__(name, how(tensors[name]).contiguous())
 
 
-P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames", "observations"))
+P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames", "observations"))
 
 
 @pytest.mark.parametrize(
@@ -181,25 +183,25 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (without("camera.params"), "the camera's parameters are missing"),
         (change("camera.params", lambda rows: rows[:3]), "a pinhole camera has 4 parameters"),
         (put("camera.params", 0, float("nan")), "not a row of finite numbers"),
-        (without(P + "is_valid"), "world 0, points: missing is_valid"),
-        (without(K + "mask"), "world 0, keyframes: missing mask"),
-        (lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)), "points: foreign colour"),
+        (without(P + "is_valid"), "submap 0, points: missing is_valid"),
+        (without(K + "mask"), "submap 0, keyframes: missing mask"),
+        (lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)), "points: unknown colour"),
         (
-            lambda tensors: tensors.__setitem__("worlds.0.trees.age", torch.zeros(1)),
-            "foreign tensor trees.age",
+            lambda tensors: tensors.__setitem__("submaps.0.trees.age", torch.zeros(1)),
+            "unknown tensor trees.age",
         ),
         (
-            lambda tensors: tensors.__setitem__("worlds.1.points.age", torch.zeros(1)),
-            "foreign tensors: worlds.1",
+            lambda tensors: tensors.__setitem__("submaps.1.points.age", torch.zeros(1)),
+            "unknown tensors: submaps.1",
         ),
-        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "foreign tensors: trees"),
+        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "unknown tensors: trees"),
         (
             change(P + "positions_w", lambda rows: rows[:, :2]),
             r"positions_w: rows must have the shape \(3,\)",
         ),
         (
             change(P + "positions_w", Tensor.float),
-            "positions_w: torch.float32 beside a camera in torch.float64",
+            "positions_w: torch.float32 but the camera is torch.float64",
         ),
         (change(K + "timestamp", Tensor.float), "timestamp: torch.float32"),
         (change(P + "is_valid", Tensor.long), "is_valid: must be of kind bool"),
@@ -215,16 +217,16 @@ P, K, F, O = (f"worlds.0.{table}." for table in ("points", "keyframes", "frames"
         (put(P + "first_keyframe", 5, 6), "first_keyframe from 0 to 6, there are 0 to 5"),
         (put(P + "first_keyframe", 5, -1), "first_keyframe from -1 to 5, there are 0 to 5"),
         (put(P + "replaced_by", 5, 120), "replaced_by from -1 to 120, there are -1 to 119"),
-        (put(P + "replaced_by", 5, 5), "replaced_by goes in a circle"),
+        (put(P + "replaced_by", 5, 5), "replaced_by has a cycle"),
         (
             lambda tensors: tensors[P + "replaced_by"][:120].copy_(torch.arange(1, 121) % 120),
-            "replaced_by goes in a circle",
+            "replaced_by has a cycle",
         ),
         (put(K + "point_ids", 0, 120), "point_ids from -1 to 120, there are -1 to 119"),
         (put(K + "point_ids", 0, -2), "point_ids from -2"),
         (put(K + "session", 0, 2), "session from 0 to 2, there are 0 to 1"),
         (put(F + "session", 0, -1), "session from -1 to 1, there are 0 to 1"),
-        (put(K + "frame_index", 1, 0), "two keyframes are of the same frame"),
+        (put(K + "frame_index", 1, 0), "two keyframes have the same session and frame index"),
         (put(K + "frame_index", 1, -1), "frame_index from -1 to 25, there are 0"),
         (put(F + "reference_keyframe", 0, 6), "reference_keyframe from 0 to 6, there are 0 to 5"),
         (put(O + "frame_row", 0, 3), "frame_row from 0 to 3, there are 0 to 2"),
@@ -248,7 +250,7 @@ def test_a_long_line_of_heirs_is_no_circle(path: Path) -> None:
     about, tensors = described(path), load_file(str(path))
     tensors[P + "replaced_by"][:119] = torch.arange(1, 120)
     save_file(tensors, str(path), metadata={"torchslam": json.dumps(about)})
-    assert read_map(path)[0].resolve(torch.tensor([0])).tolist() == [119]
+    assert read_map(path)[0].follow_merges(torch.tensor([0])).tolist() == [119]
 
 
 @pytest.mark.parametrize(
@@ -258,14 +260,14 @@ def test_a_long_line_of_heirs_is_no_circle(path: Path) -> None:
         ({"camera": {"model": "pinhole"}}, "'size' is missing"),
         ({"camera": {"model": "pinhole", "size": [160]}}, "not enough values"),
         ({"camera": {"model": "pinhole", "size": [160, "high"]}}, "an image of 160 x high pixels"),
-        ({"worlds": [0, 0]}, "numbers must differ"),
-        ({"worlds": [0, 2], "begun": 2}, "must differ and lie below"),
-        ({"worlds": 3}, "must be an iterable"),
-        ({"worlds": ["a"]}, "must be numbers"),
+        ({"submaps": [0, 0]}, "numbers must differ"),
+        ({"submaps": [0, 2], "num_created": 2}, "must differ and lie below"),
+        ({"submaps": 3}, "must be an iterable"),
+        ({"submaps": ["a"]}, "must be numbers"),
         ({"sessions": -1}, "must be numbers"),
         ({"sessions": None}, "must be numbers"),
         ({"sessions": 1}, "session from 0 to 1, there are 0 to 0"),
-        ({"worlds": []}, "foreign tensors"),
+        ({"submaps": []}, "unknown tensors"),
     ],
 )
 def test_descriptions_that_do_not_fit_are_refused(path: Path, changes: dict[str, Any], message: str) -> None:

@@ -96,7 +96,7 @@ def test_merging_moves_observations_and_leaves_one_per_keyframe(small_map: Map) 
 def test_merged_points_resolve_to_their_last_heir(small_map: Map) -> None:
     small_map.replace(torch.tensor([5]), torch.tensor([4]))
     small_map.replace(torch.tensor([4]), torch.tensor([0]))
-    assert small_map.resolve(torch.tensor([5, 4, 0, 1])).tolist() == [0, 0, 0, 1]
+    assert small_map.follow_merges(torch.tensor([5, 4, 0, 1])).tolist() == [0, 0, 0, 1]
 
 
 def test_refresh_takes_direction_scale_and_descriptor_from_the_newest_keyframe(small_map: Map) -> None:
@@ -150,11 +150,11 @@ def test_covariances_are_taken_over_and_unknown_ones_leave_what_is_there(small_m
     frames[0] = 0
     points = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
     everyone = torch.arange(3)
-    small_map.take_covariances(everyone, torch.tensor([4, 1]), Marginals(frames, points, frames[:0]))
-    small_map.take_covariances(everyone, torch.tensor([4, 1]), Marginals(0 * frames, 0 * points, frames[:0]))
+    small_map.set_covariances(everyone, torch.tensor([4, 1]), Marginals(frames, points, frames[:0]))
+    small_map.set_covariances(everyone, torch.tensor([4, 1]), Marginals(0 * frames, 0 * points, frames[:0]))
     assert torch.equal(small_map.keyframes["covariances"], frames)
     assert small_map.points["covariances_w"].diagonal(dim1=1, dim2=2).sum(-1).tolist() == [0, 3, 0, 0, 3, 0]
-    torch.testing.assert_close(small_map.centre_covariances_w()[1:], points)
+    torch.testing.assert_close(small_map.center_covariances_w()[1:], points)
 
 
 def test_what_many_keyframes_share_is_what_each_of_them_shares(small_map: Map) -> None:
@@ -175,4 +175,4 @@ def test_around_are_the_nearest_of_each() -> None:
     asked = torch.tensor([6, 1])
     near = [slam_map.covisible(keyframe, 2) for keyframe in asked.tolist()]
     assert [len(some) for some in near] == [2, 2]
-    assert torch.equal(slam_map.around(asked, 2), torch.unique(torch.cat([asked, *near])))
+    assert torch.equal(slam_map.covisibility_union(asked, 2), torch.unique(torch.cat([asked, *near])))

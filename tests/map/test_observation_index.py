@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.map.simulated import CAMERA
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.file import read_map, write_atlas
 from torchslam.map.map import NO_POINT, Map
-from torchslam.map.observation_index import ObservationIndex, first_of_each, most
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
+from torchslam.map.observation_index import ObservationIndex, first_of_each, top_rows
 from torchslam.types import FrameFeatures
 
 KEYPOINTS, DESCRIPTOR = 6, 4
@@ -80,9 +79,9 @@ def change_map(slam_map: Map, change: Change) -> None:
         slam_map.invalidate(torch.unique(living[torch.tensor(numbers) % len(living)]))
     elif kind == "replace" and len(living) > 1:
         chosen = torch.unique(living[torch.tensor(numbers) % len(living)])
-        heirs = living[~torch.isin(living, chosen)]
-        if len(heirs):
-            slam_map.replace(chosen, heirs[torch.arange(len(chosen)) * (number + 1) % len(heirs)])
+        replacement = living[~torch.isin(living, chosen)]
+        if len(replacement):
+            slam_map.replace(chosen, replacement[torch.arange(len(chosen)) * (number + 1) % len(replacement)])
     elif kind == "append" and len(slam_map.points) < 200:
         other = make_map(2, 3)
         other.observe(1, torch.tensor([0, 4]), torch.tensor([2, 0]))
@@ -149,14 +148,14 @@ def replaced_by_scan(table: Tensor, old: Tensor, new: Tensor, points: int) -> Te
 
 @settings(deadline=None, max_examples=60)
 @given(CHANGES, st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_merging_does_what_a_scan_of_the_table_does(changes: list[Change], heirs: list[int]) -> None:
+def test_merging_does_what_a_scan_of_the_table_does(changes: list[Change], replacement: list[int]) -> None:
     slam_map = make_map(points=12)
     for change in changes:
         change_map(slam_map, change)
     living = slam_map.valid_points()
-    if len(living) < 3 + len(heirs):
+    if len(living) < 3 + len(replacement):
         return
-    old, new = living[3 : 3 + len(heirs)], living[torch.tensor(heirs)]
+    old, new = living[3 : 3 + len(replacement)], living[torch.tensor(replacement)]
     before = slam_map.keyframes["point_ids"].clone()
     slam_map.replace(old, new)
     expected = replaced_by_scan(before, old, new, len(slam_map.points))
@@ -170,7 +169,7 @@ def test_a_loaded_map_answers_the_same(tmp_path: Path) -> None:
         slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
     write_atlas(
         tmp_path / "map",
-        [Submap(0, TrackingState.nowhere(torch.zeros(0, dtype=torch.float64)), slam_map)],
+        [Submap(0, TrackingState.empty(torch.zeros(0, dtype=torch.float64)), slam_map)],
         CAMERA,
     )
     loaded, _ = read_map(tmp_path / "map")
@@ -190,10 +189,10 @@ def test_a_point_may_have_more_observers_than_there_is_room_for_at_first() -> No
 
 def test_places_come_back_ordered_as_asked() -> None:
     index = ObservationIndex(torch.tensor([[0, -1, 1], [1, 0, -1]]))
-    which, places = index.of(torch.tensor([1, 0, 5]))
-    assert sorted(zip(which.tolist(), places.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
+    which, slots = index.of(torch.tensor([1, 0, 5]))
+    assert sorted(zip(which.tolist(), slots.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
     index.remove(torch.tensor([1]), torch.tensor([2]))
-    assert index.padded(torch.tensor([1]))[0].tolist()[:2] == [3, -1]
+    assert index.padded_slots(torch.tensor([1]))[0].tolist()[:2] == [3, -1]
 
 
 @given(st.lists(st.integers(0, 5), max_size=20), st.integers(1, 6), st.integers(1, 4))
@@ -201,7 +200,7 @@ def test_the_most_are_those_of_a_full_sort(counts: list[int], limit: int, least:
     values = torch.tensor(counts, dtype=torch.int64)
     order = torch.sort(values, descending=True, stable=True)
     expected = order.indices[:limit][order.values[:limit] >= least]
-    assert torch.equal(most(values, limit, least), expected)
+    assert torch.equal(top_rows(values, limit, least), expected)
 
 
 @pytest.mark.parametrize("values", [[], [3], [3, 1, 3, 3, 1, 2]])

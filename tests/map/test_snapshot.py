@@ -7,8 +7,7 @@ from torch import Tensor
 
 from tests.map.simulated import simulated_world, view_of
 from torchslam.geometry import se3_exp
-from torchslam.map.map import Map
-from torchslam.map.snapshot import MapSnapshot
+from torchslam.map.map import Map, MapSnapshot
 
 
 def columns(slam_map: Map) -> list[Tensor]:
@@ -48,7 +47,7 @@ def test_a_map_is_what_it_was() -> None:
     for _ in range(2):  # a bookmark can be returned to as often as one likes
         disturb(slam_map, keyframes=70, points=40)  # more than there is room for
         assert slam_map.num_keyframes == bookmark.num_keyframes + 70
-        bookmark.return_to(slam_map)
+        bookmark.restore(slam_map)
         assert all(torch.equal(now, then) for now, then in zip(columns(slam_map), before, strict=True))
         assert torch.equal(slam_map.observers(asked), observers)
         assert list(slam_map.images) == [slam_map.key(0)]

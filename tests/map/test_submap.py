@@ -11,14 +11,14 @@ from torch import Tensor
 
 from tests.map.simulated import reprojection_errors, simulated_world
 from torchslam.geometry import se3_inverse, sim3_exp, sim3_inverse, sim3_scale, transform
-from torchslam.map.submap import Submap
+from torchslam.map.atlas import Submap
 
 SCALE = 1.7
 SIMILARITY = torch.tensor([0.4, -0.3, 0.2, 0.5, -0.2, 0.3, math.log(SCALE)], dtype=torch.float64)
 
 
 @pytest.fixture
-def world() -> Submap:
+def submap() -> Submap:
     return simulated_world()
 
 
@@ -37,176 +37,180 @@ def moved_poses(T_cw: Tensor, S_ba: Tensor) -> Tensor:
     return moved
 
 
-def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them(world: Submap) -> None:
-    before = copy.deepcopy(world)
-    world.move(similarity())
-    torch.testing.assert_close(world.map.positions_w, transform(similarity(), before.map.positions_w))
-    torch.testing.assert_close(world.map.T_cw, moved_poses(before.map.T_cw, similarity()))
+def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them(submap: Submap) -> None:
+    before = copy.deepcopy(submap)
+    submap.transform(similarity())
+    torch.testing.assert_close(submap.map.positions_w, transform(similarity(), before.map.positions_w))
+    torch.testing.assert_close(submap.map.T_cw, moved_poses(before.map.T_cw, similarity()))
     torch.testing.assert_close(
-        world.history.T_cw(world.map), moved_poses(before.history.T_cw(before.map), similarity())
+        submap.posed_frames.T_cw(submap.map), moved_poses(before.posed_frames.T_cw(before.map), similarity())
     )
-    torch.testing.assert_close(world.T_cw, moved_poses(before.T_cw[None], similarity())[0])
+    torch.testing.assert_close(submap.T_cw, moved_poses(before.T_cw[None], similarity())[0])
 
 
-def test_a_moved_world_is_as_certain_as_before(world: Submap) -> None:
+def test_a_moved_world_is_as_certain_as_before(submap: Submap) -> None:
     """Covariances of points turn and grow; those of poses live in the cameras: their unit alone grows."""
-    before = copy.deepcopy(world)
-    world.move(similarity())
+    before = copy.deepcopy(submap)
+    submap.transform(similarity())
     linear = similarity()[:3, :3]
     torch.testing.assert_close(
-        world.map.points["covariances_w"], linear @ before.map.points["covariances_w"] @ linear.T
+        submap.map.points["covariances_w"], linear @ before.map.points["covariances_w"] @ linear.T
     )
     units = torch.diag(torch.tensor([SCALE] * 3 + [1.0] * 3, dtype=torch.float64))
     torch.testing.assert_close(
-        world.map.keyframes["covariances"], units @ before.map.keyframes["covariances"] @ units
+        submap.map.keyframes["covariances"], units @ before.map.keyframes["covariances"] @ units
     )
-    centres = before.map.centre_covariances_w()
-    torch.testing.assert_close(world.map.centre_covariances_w(), linear @ centres @ linear.T)
+    centres = before.map.center_covariances_w()
+    torch.testing.assert_close(submap.map.center_covariances_w(), linear @ centres @ linear.T)
 
 
-def test_directions_and_reach_are_those_that_a_refresh_would_find(world: Submap) -> None:
-    before = copy.deepcopy(world)
-    world.move(similarity())
+def test_directions_and_reach_are_those_that_a_refresh_would_find(submap: Submap) -> None:
+    before = copy.deepcopy(submap)
+    submap.transform(similarity())
     torch.testing.assert_close(
-        world.map.points["view_directions_w"], before.map.points["view_directions_w"] @ rotation().T
+        submap.map.points["view_directions_w"], before.map.points["view_directions_w"] @ rotation().T
     )
     torch.testing.assert_close(
-        world.map.points["scale_distance"], SCALE * before.map.points["scale_distance"]
+        submap.map.points["scale_distance"], SCALE * before.map.points["scale_distance"]
     )
-    refreshed = copy.deepcopy(world)
-    refreshed.map.refresh(torch.arange(world.map.num_keyframes))
+    refreshed = copy.deepcopy(submap)
+    refreshed.map.refresh(torch.arange(submap.map.num_keyframes))
     for name in ("view_directions_w", "scale_distance"):
-        torch.testing.assert_close(world.map.points[name], refreshed.map.points[name])
+        torch.testing.assert_close(submap.map.points[name], refreshed.map.points[name])
 
 
-def test_a_move_changes_no_reprojection(world: Submap) -> None:
-    before = reprojection_errors(world)
+def test_a_move_changes_no_reprojection(submap: Submap) -> None:
+    before = reprojection_errors(submap)
     assert float(before.norm(dim=-1).max()) > 0.5
-    world.move(similarity())
-    torch.testing.assert_close(reprojection_errors(world), before)
+    submap.transform(similarity())
+    torch.testing.assert_close(reprojection_errors(submap), before)
 
 
-def test_the_track_goes_on_after_a_move(world: Submap) -> None:
-    before = copy.deepcopy(world)
-    world.move(similarity())
-    assert before.track.velocity is not None
-    assert world.track.velocity is not None
-    predicted = world.track.velocity @ world.T_cw
+def test_the_track_goes_on_after_a_move(submap: Submap) -> None:
+    before = copy.deepcopy(submap)
+    submap.transform(similarity())
+    assert before.tracking.velocity is not None
+    assert submap.tracking.velocity is not None
+    predicted = submap.tracking.velocity @ submap.T_cw
     torch.testing.assert_close(
-        predicted, moved_poses((before.track.velocity @ before.T_cw)[None], similarity())[0]
+        predicted, moved_poses((before.tracking.velocity @ before.T_cw)[None], similarity())[0]
     )
 
 
-def test_there_and_back(world: Submap) -> None:
-    before = copy.deepcopy(world)
-    world.move(similarity())
-    world.move(sim3_inverse(similarity()))
-    for table, old in ((world.map.points, before.map.points), (world.map.keyframes, before.map.keyframes)):
+def test_there_and_back(submap: Submap) -> None:
+    before = copy.deepcopy(submap)
+    submap.transform(similarity())
+    submap.transform(sim3_inverse(similarity()))
+    for table, old in ((submap.map.points, before.map.points), (submap.map.keyframes, before.map.keyframes)):
         for name, column in old.columns().items():
             torch.testing.assert_close(table[name], column)
-    torch.testing.assert_close(world.history.frames["T_cr"], before.history.frames["T_cr"])
+    torch.testing.assert_close(submap.posed_frames.frames["T_cr"], before.posed_frames.frames["T_cr"])
 
 
-def corrections(world: Submap) -> Tensor:
+def corrections(submap: Submap) -> Tensor:
     """S_cw (K, 4, 4): every keyframe drifted by another similarity, in its own frame."""
     generator = torch.Generator().manual_seed(7)
-    xi = 0.2 * torch.randn(world.map.num_keyframes, 7, generator=generator, dtype=torch.float64)
-    return sim3_exp(xi) @ world.map.T_cw
+    xi = 0.2 * torch.randn(submap.map.num_keyframes, 7, generator=generator, dtype=torch.float64)
+    return sim3_exp(xi) @ submap.map.T_cw
 
 
-def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(world: Submap) -> None:
-    before, seen = reprojection_errors(world), world.map.observations()
-    world.correct(corrections(world))
-    own = world.map.points["first_keyframe"][seen.point_index] == seen.keyframe_index
+def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(submap: Submap) -> None:
+    before, seen = reprojection_errors(submap), submap.map.observations()
+    submap.apply_sim3_correction(corrections(submap))
+    own = submap.map.points["first_keyframe"][seen.point_index] == seen.keyframe_index
     assert int(own.sum()) > 20
-    torch.testing.assert_close(reprojection_errors(world)[own], before[own])
-    assert float((reprojection_errors(world) - before)[~own].abs().max()) > 1.0
+    torch.testing.assert_close(reprojection_errors(submap)[own], before[own])
+    assert float((reprojection_errors(submap) - before)[~own].abs().max()) > 1.0
 
 
-def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(world: Submap) -> None:
-    S_cw = corrections(world)
-    world.correct(S_cw)
-    torch.testing.assert_close(se3_inverse(world.map.T_cw)[:, :3, 3], sim3_inverse(S_cw)[:, :3, 3])
-    gram = world.map.T_cw[:, :3, :3] @ world.map.T_cw[:, :3, :3].mT
+def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(submap: Submap) -> None:
+    S_cw = corrections(submap)
+    submap.apply_sim3_correction(S_cw)
+    torch.testing.assert_close(se3_inverse(submap.map.T_cw)[:, :3, 3], sim3_inverse(S_cw)[:, :3, 3])
+    gram = submap.map.T_cw[:, :3, :3] @ submap.map.T_cw[:, :3, :3].mT
     torch.testing.assert_close(gram, torch.eye(3, dtype=torch.float64).expand_as(gram))
 
 
-def test_corrected_frames_see_what_their_keyframe_made_as_before(world: Submap) -> None:
+def test_corrected_frames_see_what_their_keyframe_made_as_before(submap: Submap) -> None:
     """A frame stays where it was among the points of its reference keyframe, in that keyframe's unit."""
-    before = copy.deepcopy(world)
-    S_cw = corrections(world)
+    before = copy.deepcopy(submap)
+    S_cw = corrections(submap)
     scale = sim3_scale(S_cw)
-    world.correct(S_cw)
-    reference = world.history.frames["reference_keyframe"]
-    T_cw, old = world.history.T_cw(world.map), before.history.T_cw(before.map)
-    for frame in range(len(world.history)):
-        made = world.map.points["first_keyframe"] == reference[frame]
-        points_c = transform(T_cw[frame], world.map.positions_w[made])
+    submap.apply_sim3_correction(S_cw)
+    reference = submap.posed_frames.frames["reference_keyframe"]
+    T_cw, old = submap.posed_frames.T_cw(submap.map), before.posed_frames.T_cw(before.map)
+    for frame in range(len(submap.posed_frames)):
+        made = submap.map.points["first_keyframe"] == reference[frame]
+        points_c = transform(T_cw[frame], submap.map.positions_w[made])
         expected = transform(old[frame], before.map.positions_w[made]) / scale[reference[frame]]
         torch.testing.assert_close(points_c, expected)
-    around = scale[world.track.reference]
-    torch.testing.assert_close(world.track.T_cr[:3, 3], before.track.T_cr[:3, 3] / around)
-    assert world.track.velocity is not None
-    assert before.track.velocity is not None
-    torch.testing.assert_close(world.track.velocity[:3, 3], before.track.velocity[:3, 3] / around)
+    around = scale[submap.tracking.reference]
+    torch.testing.assert_close(submap.tracking.T_cr[:3, 3], before.tracking.T_cr[:3, 3] / around)
+    assert submap.tracking.velocity is not None
+    assert before.tracking.velocity is not None
+    torch.testing.assert_close(submap.tracking.velocity[:3, 3], before.tracking.velocity[:3, 3] / around)
 
 
-def test_corrected_uncertainty_keeps_its_size_in_pixels(world: Submap) -> None:
+def test_corrected_uncertainty_keeps_its_size_in_pixels(submap: Submap) -> None:
     """Seen from the keyframe that made it, a point is as uncertain in shares of its depth as it was."""
-    before = copy.deepcopy(world)
-    S_cw = corrections(world)
-    world.correct(S_cw)
-    born = world.map.points["first_keyframe"]
+    before = copy.deepcopy(submap)
+    S_cw = corrections(submap)
+    submap.apply_sim3_correction(S_cw)
+    born = submap.map.points["first_keyframe"]
     scale = sim3_scale(S_cw)[born][:, None, None]
 
     def in_camera(of: Submap) -> Tensor:
         R_cw = of.map.T_cw[born][:, :3, :3]
         return R_cw @ of.map.points["covariances_w"] @ R_cw.mT
 
-    torch.testing.assert_close(in_camera(world) * scale**2, in_camera(before))
+    torch.testing.assert_close(in_camera(submap) * scale**2, in_camera(before))
     normals = [
         (of.map.T_cw[born][:, :3, :3] @ of.map.points["view_directions_w"][..., None])[..., 0]
-        for of in (world, before)
+        for of in (submap, before)
     ]
     torch.testing.assert_close(*normals)
     torch.testing.assert_close(
-        world.map.points["scale_distance"] * sim3_scale(S_cw)[born], before.map.points["scale_distance"]
+        submap.map.points["scale_distance"] * sim3_scale(S_cw)[born], before.map.points["scale_distance"]
     )
 
 
-def test_an_absorbed_world_lies_beside_what_was_there(world: Submap) -> None:
+def test_an_absorbed_world_lies_beside_what_was_there(submap: Submap) -> None:
     other = simulated_world(seed=3, number=1, session=1)
-    mine, theirs = copy.deepcopy(world), copy.deepcopy(other)
-    world.absorb(other, similarity())
-    theirs.move(similarity())
+    mine, theirs = copy.deepcopy(submap), copy.deepcopy(other)
+    submap.merge(other, similarity())
+    theirs.transform(similarity())
     keyframes, points = mine.map.num_keyframes, len(mine.map.points)
     torch.testing.assert_close(
-        world.map.positions_w, torch.cat([mine.map.positions_w, theirs.map.positions_w])
+        submap.map.positions_w, torch.cat([mine.map.positions_w, theirs.map.positions_w])
     )
-    torch.testing.assert_close(world.map.T_cw, torch.cat([mine.map.T_cw, theirs.map.T_cw]))
+    torch.testing.assert_close(submap.map.T_cw, torch.cat([mine.map.T_cw, theirs.map.T_cw]))
     torch.testing.assert_close(
-        reprojection_errors(world), torch.cat([reprojection_errors(mine), reprojection_errors(theirs)])
+        reprojection_errors(submap), torch.cat([reprojection_errors(mine), reprojection_errors(theirs)])
     )
     torch.testing.assert_close(
-        world.history.T_cw(world.map),
-        torch.cat([mine.history.T_cw(mine.map), theirs.history.T_cw(theirs.map)]),
+        submap.posed_frames.T_cw(submap.map),
+        torch.cat([mine.posed_frames.T_cw(mine.map), theirs.posed_frames.T_cw(theirs.map)]),
     )
     assert torch.equal(
-        world.map.points["first_keyframe"][points:], theirs.map.points["first_keyframe"] + keyframes
+        submap.map.points["first_keyframe"][points:], theirs.map.points["first_keyframe"] + keyframes
     )
-    torch.testing.assert_close(world.T_cw, theirs.T_cw)
-    assert world.track.reference == theirs.track.reference + keyframes
-    for name, moved_by in (("seen_last", points), ("local_points", points), ("local_keyframes", keyframes)):
-        assert torch.equal(getattr(world.track, name), getattr(theirs.track, name) + moved_by)
-    assert len(world.trajectory(session=1)) == len(theirs.history)
-    assert (other.map.num_keyframes, len(other.map.points), len(other.history)) == (0, 0, 0)
+    torch.testing.assert_close(submap.T_cw, theirs.T_cw)
+    assert submap.tracking.reference == theirs.tracking.reference + keyframes
+    for name, moved_by in (
+        ("last_inlier_points", points),
+        ("local_points", points),
+        ("local_keyframes", keyframes),
+    ):
+        assert torch.equal(getattr(submap.tracking, name), getattr(theirs.tracking, name) + moved_by)
+    assert len(submap.trajectory(session=1)) == len(theirs.posed_frames)
+    assert (other.map.num_keyframes, len(other.map.points), len(other.posed_frames)) == (0, 0, 0)
 
 
-def test_merged_points_keep_their_heirs_in_an_absorbed_world(world: Submap) -> None:
+def test_merged_points_keep_their_heirs_in_an_absorbed_world(submap: Submap) -> None:
     other = simulated_world(seed=3)
     other.map.replace(torch.tensor([5]), torch.tensor([2]))
-    count = len(world.map.points)
-    world.absorb(other, torch.eye(4, dtype=torch.float64))
-    assert world.map.resolve(torch.tensor([count + 5, 5])).tolist() == [count + 2, 5]
-    graph_rows = world.history.observations["frame_row"]
-    assert int(graph_rows.max()) == len(world.history) - 1
+    count = len(submap.map.points)
+    submap.merge(other, torch.eye(4, dtype=torch.float64))
+    assert submap.map.follow_merges(torch.tensor([count + 5, 5])).tolist() == [count + 2, 5]
+    graph_rows = submap.posed_frames.observations["frame_row"]
+    assert int(graph_rows.max()) == len(submap.posed_frames) - 1

@@ -5,8 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.map.schema import Column
-from torchslam.map.table import Table
+from torchslam.map.table import Column, Table
 
 NUMBER = {"number": Column((), "float", "a number")}
 PLACES = {"number": Column((), "int", "a number"), "place": Column((3,), "float", "where it is")}
@@ -27,11 +26,11 @@ def test_rows_come_back_in_the_order_they_went_in(sizes: list[int]) -> None:
 
 def test_capacity_doubles_so_most_appends_do_not_move_the_storage() -> None:
     table = Table(NUMBER)
-    places = set()
+    pointers = set()
     for _ in range(1000):
         table.append(number=torch.ones(1))
-        places.add(table["number"].data_ptr())
-    assert len(places) <= 6
+        pointers.add(table["number"].data_ptr())
+    assert len(pointers) <= 6
 
 
 def test_a_column_is_a_view_of_the_storage() -> None:

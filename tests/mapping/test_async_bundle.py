@@ -15,8 +15,7 @@ from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
-from torchslam.mapping.async_bundle import Answer, AsyncBundleAdjustment, solve_here
-from torchslam.mapping.local_bundle import adjust
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingResult, adjust_local, solve_here
 from torchslam.optim import BundleProblem
 from torchslam.parallel.bundle_worker import BundleWorker
 
@@ -52,24 +51,24 @@ def check_same(mine: Map, other: Map) -> None:
 def adjusted(seed: int = 0) -> Map:
     """What it should come to."""
     slam_map = shaken(seed)
-    adjust(slam_map, 4, CAMERA, SETTINGS, covariances=True)
+    adjust_local(slam_map, 4, CAMERA, SETTINGS, covariances=True)
     return slam_map
 
 
 def test_nothing_happens_before_it_is_taken_over() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
-    assert not adjusting
+    assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
-    adjusting.ask(slam_map, 4, due=12)
-    assert adjusting
+    adjusting.request(slam_map, 4, due=12)
+    assert adjusting.is_pending
     assert adjusting.due == 12
     assert [adjusting.is_due(frame) for frame in (11, 12, 13)] == [False, True, True]
     check_same(slam_map, shaken())
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
-    assert not adjusting
-    adjusting.take_over(slam_map)  # there is nothing more
+    assert not adjusting.is_pending
+    adjusting.apply(slam_map)  # there is nothing more
     check_same(slam_map, adjusted())
 
 
@@ -77,71 +76,71 @@ def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     begun: list[BundleProblem] = []
 
-    def solver(problem: BundleProblem, iterations: int, covariances: bool) -> Answer:
+    def solver(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
         begun.append(problem)
         return solve_here(problem, iterations, covariances)
 
     adjusting.solver = solver
-    adjusting.begin()  # nothing was asked for
-    adjusting.ask(slam_map, 4, due=12)
+    adjusting.start()  # nothing was asked for
+    adjusting.request(slam_map, 4, due=12)
     assert not begun
-    adjusting.begin()
-    adjusting.begin()
+    adjusting.start()
+    adjusting.start()
     assert len(begun) == 1
     check_same(slam_map, shaken())
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
-    adjusting.begin()
+    adjusting.start()
     assert len(begun) == 1
-    adjusting.ask(slam_map, 3, due=20)
-    adjusting.take_over(slam_map)  # who was not begun begins now
+    adjusting.request(slam_map, 3, due=20)
+    adjusting.apply(slam_map)  # who was not begun begins now
     assert len(begun) == 2
-    adjusting.ask(slam_map, 4, due=30)
-    adjusting.begin()
+    adjusting.request(slam_map, 4, due=30)
+    adjusting.start()
     adjusting.drop()
     before = [column.clone() for column in columns(slam_map)]
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     assert all(torch.equal(a, b) for a, b in zip(columns(slam_map), before, strict=True))
 
 
 def test_it_can_be_hurried_or_dropped() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     adjusting.set_deadline(3)
-    assert not adjusting
-    adjusting.ask(slam_map, 4, due=12)
+    assert not adjusting.is_pending
+    adjusting.request(slam_map, 4, due=12)
     adjusting.set_deadline(9)
     assert adjusting.due == 9
     adjusting.drop()
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     check_same(slam_map, shaken())
 
 
 def test_it_may_be_due_before_the_next_frame() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
-    assert not adjusting.due_before_next_frame
-    adjusting.ask(slam_map, 4, due=12)
-    assert not adjusting.due_before_next_frame
+    assert not adjusting.is_due_before_next_frame
+    adjusting.request(slam_map, 4, due=12)
+    assert not adjusting.is_due_before_next_frame
     adjusting.drop()
-    adjusting.ask(slam_map, 4, due=None)
-    assert adjusting
-    assert adjusting.due_before_next_frame
+    adjusting.request(slam_map, 4, due=None)
+    assert adjusting.is_pending
+    assert adjusting.is_due_before_next_frame
     assert adjusting.due is None
     assert adjusting.is_due(0)  # after whatever frame, at the latest
     check_same(slam_map, shaken())
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
-    assert not adjusting.due_before_next_frame
+    assert not adjusting.is_due_before_next_frame
 
 
 def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     slam_map.keyframes["point_ids"][:] = -1
-    adjusting.ask(slam_map, 4, due=12)
+    adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
     before = slam_map.T_cw.clone()
-    adjusting.take_over(slam_map)
+    adjusting.apply(slam_map)
     assert torch.equal(slam_map.T_cw, before)
-    assert not adjusting
+    assert not adjusting.is_pending
 
 
 @pytest.fixture(scope="module", params=["copied", "begun anew"])
@@ -158,20 +157,20 @@ def beside(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
 
 
 def test_another_process_finds_the_same(beside: BundleWorker, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_around", None)  # here nothing is solved
+    monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_local", None)  # here nothing is solved
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True)
     adjusting.solver = beside
     for seed in (0, 1):
         expected = adjusted(seed)
         slam_map = shaken(seed)
-        adjusting.ask(slam_map, 4, due=12)
-        adjusting.take_over(slam_map)
+        adjusting.request(slam_map, 4, due=12)
+        adjusting.apply(slam_map)
         check_same(slam_map, expected)
-    adjusting.ask(shaken(2), 4, due=12)
+    adjusting.request(shaken(2), 4, due=12)
     adjusting.drop()  # its answer comes all the same, and is not mistaken for the next one
     slam_map = shaken(3)
-    adjusting.ask(slam_map, 4, due=12)
-    adjusting.take_over(slam_map)
+    adjusting.request(slam_map, 4, due=12)
+    adjusting.apply(slam_map)
     check_same(slam_map, adjusted(3))
 
 
@@ -182,9 +181,9 @@ def test_without_covariances(beside: BundleWorker) -> None:
         shaken(),
     )
     adjusting.solver = beside
-    adjusting.ask(slam_map, 4, due=12)
-    adjusting.take_over(slam_map)
-    adjust(expected, 4, CAMERA, SETTINGS)
+    adjusting.request(slam_map, 4, due=12)
+    adjusting.apply(slam_map)
+    adjust_local(expected, 4, CAMERA, SETTINGS)
     check_same(slam_map, expected)
 
 
@@ -197,9 +196,9 @@ def test_what_goes_wrong_there_is_raised_here(beside: BundleWorker) -> None:
         return beside(problem, iterations, covariances)
 
     adjusting.solver = wrong
-    adjusting.ask(slam_map, 4, due=12)
+    adjusting.request(slam_map, 4, due=12)
     with pytest.raises(ValueError, match="frame_index") as raised:
-        adjusting.take_over(slam_map)
+        adjusting.apply(slam_map)
     assert "in the process that adjusts" in raised.value.__notes__[0]
 
 
@@ -208,16 +207,16 @@ def test_a_process_that_is_killed_is_done_without() -> None:
     with BundleWorker(CAMERA) as solver:
         assert solver._worker._ours.poll(PATIENCE)
         adjusting.solver = solver
-        adjusting.ask(slam_map, 4, due=12)
+        adjusting.request(slam_map, 4, due=12)
         os.kill(solver._worker._process.pid or 0, signal.SIGKILL)
         solver._worker._process.join()
         solver._worker._ours.close()  # what it may have answered before
         with pytest.warns(UserWarning, match="has ended"):
-            adjusting.take_over(slam_map)
+            adjusting.apply(slam_map)
         check_same(slam_map, adjusted())
         slam_map = shaken(1)
-        adjusting.ask(slam_map, 4, due=12)
-        adjusting.take_over(slam_map)
+        adjusting.request(slam_map, 4, due=12)
+        adjusting.apply(slam_map)
         check_same(slam_map, adjusted(1))
 
 
@@ -227,6 +226,6 @@ def test_a_process_that_has_not_started_is_not_waited_for(monkeypatch: pytest.Mo
         monkeypatch.setattr(solver._worker, "receive", None)
         adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
         adjusting.solver = solver
-        adjusting.ask(slam_map, 4, due=12)
-        adjusting.take_over(slam_map)
+        adjusting.request(slam_map, 4, due=12)
+        adjusting.apply(slam_map)
         check_same(slam_map, adjusted())

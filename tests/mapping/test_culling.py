@@ -10,10 +10,9 @@ from tests.map.simulated import CAMERA, path, tracked_at, view_of
 from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.map import compaction
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.map.tracking_state import TrackingState
-from torchslam.mapping.culling import NEWEST, cull_keyframes, is_covered, redundant
+from torchslam.mapping.culling import NUM_NEWEST_KEPT, cull_keyframes, is_covered, redundant_keyframes
 from torchslam.mapping.mapper import Mapper
 from torchslam.types import FrameFeatures
 from torchslam.utils.timing import Stopwatch
@@ -34,8 +33,8 @@ def view_at(index: int, T_cw: Tensor, scale: float = 1.0) -> FrameFeatures:
 
 def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
     """Keyframes at T_cw (K, 4, 4) that all see all points, the last one followed."""
-    world = Submap.empty(0, CAMERA.params.double())
-    slam_map, everyone = world.map, torch.arange(POINTS)
+    submap = Submap.empty(0, CAMERA.params.double())
+    slam_map, everyone = submap.map, torch.arange(POINTS)
     for index, pose in enumerate(T_cw):
         view = view_at(index, pose, scales[index] if scales else 1.0)
         keyframe = slam_map.add_keyframe(view, pose)
@@ -43,19 +42,19 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
             slam_map.add_points(cloud(), view.descriptors, 0)
         slam_map.observe(keyframe, everyone, everyone)
         seen = tracked_at(pose, everyone, everyone)
-        world.history.add(view, seen, pose @ se3_inverse(pose), keyframe)
+        submap.posed_frames.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)
-    world.track = TrackingState(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
-    return world
+    submap.tracking = TrackingState(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
+    return submap
 
 
 def standing(count: int) -> Tensor:
     return torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
 
 
-def which(world: Submap, *candidates: int) -> list[int]:
-    return torch.nonzero(redundant(world, torch.tensor(candidates), SETTINGS))[:, 0].tolist()
+def which(submap: Submap, *candidates: int) -> list[int]:
+    return torch.nonzero(redundant_keyframes(submap, torch.tensor(candidates), SETTINGS))[:, 0].tolist()
 
 
 def test_a_keyframe_that_three_others_repeat_can_go_and_no_more_than_that() -> None:
@@ -78,9 +77,9 @@ def forget(slam_map: Map, keyframe: int, count: int) -> None:
 
 @pytest.mark.parametrize(("missing", "covered"), [(2, True), (3, False)])
 def test_nine_of_ten_points_are_enough(missing: int, covered: bool) -> None:
-    world = world_of(standing(4))
-    forget(world.map, 3, missing)
-    assert is_covered(world.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
+    submap = world_of(standing(4))
+    forget(submap.map, 3, missing)
+    assert is_covered(submap.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
 
 
 @pytest.mark.parametrize(("degrees", "near"), [(11.0, True), (13.0, False)])
@@ -99,58 +98,58 @@ def test_a_keyframe_that_stands_elsewhere_stays(share: float, near: bool) -> Non
 
 
 def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> None:
-    world = world_of(standing(30))
-    before = world.history.T_cw(world.map)
-    renumbering = cull_keyframes(world, SETTINGS)
+    submap = world_of(standing(30))
+    before = submap.posed_frames.T_cw(submap.map)
+    renumbering = cull_keyframes(submap, SETTINGS)
     assert renumbering is not None
     stays = torch.nonzero(renumbering.keyframes >= 0)[:, 0]
     assert stays[0] == 0
-    assert stays[-NEWEST:].tolist() == list(range(30 - NEWEST, 30))
-    assert world.map.num_keyframes == len(stays) == NEWEST + 1
-    torch.testing.assert_close(world.history.T_cw(world.map), before)
-    assert cull_keyframes(world, SETTINGS) is None  # nobody new to ask about
+    assert stays[-NUM_NEWEST_KEPT:].tolist() == list(range(30 - NUM_NEWEST_KEPT, 30))
+    assert submap.map.num_keyframes == len(stays) == NUM_NEWEST_KEPT + 1
+    torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), before)
+    assert cull_keyframes(submap, SETTINGS) is None  # nobody new to ask about
 
 
 def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compaction, "LEAST_DEAD", 5)
+    monkeypatch.setattr(compaction, "MIN_INVALID_ROWS", 5)
     monkeypatch.setattr(compaction, "_PRICE", 1000)
-    world = world_of(standing(30))
-    descriptors = world.map.points["descriptors"][:1].repeat(40, 1)
-    world.map.invalidate(world.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
-    before, left = world.map.keyframes["frame_index"].clone(), world.map.positions_w[:21].clone()
-    went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
+    submap = world_of(standing(30))
+    descriptors = submap.map.points["descriptors"][:1].repeat(40, 1)
+    submap.map.invalidate(submap.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
+    before, left = submap.map.keyframes["frame_index"].clone(), submap.map.positions_w[:21].clone()
+    went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None
     assert went.points.tolist() == [*range(21)] + [-1] * 39
-    assert torch.equal(world.map.positions_w, left)
+    assert torch.equal(submap.map.positions_w, left)
     stays = went.keyframes >= 0
-    assert torch.equal(world.map.keyframes["frame_index"][went.keyframes[stays]], before[stays])
-    assert torch.equal(went.heirs[stays], went.keyframes[stays])
-    assert int(went.heirs.min()) >= 0
-    assert world.map.num_keyframes < 30
-    assert Mapper(CAMERA, Config(), Stopwatch()).tidy(world) is None
+    assert torch.equal(submap.map.keyframes["frame_index"][went.keyframes[stays]], before[stays])
+    assert torch.equal(went.replacement[stays], went.keyframes[stays])
+    assert int(went.replacement.min()) >= 0
+    assert submap.map.num_keyframes < 30
+    assert Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap) is None
 
 
 def test_keyframes_go_where_the_rows_of_points_stay() -> None:
-    world = world_of(standing(30))
-    went = Mapper(CAMERA, Config(), Stopwatch()).tidy(world)
+    submap = world_of(standing(30))
+    went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None
     assert went.points.tolist() == list(range(POINTS))
-    assert world.map.num_keyframes == NEWEST + 1
+    assert submap.map.num_keyframes == NUM_NEWEST_KEPT + 1
 
 
 def test_a_few_new_keyframes_are_not_worth_the_trouble() -> None:
     assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
-    world = world_of(standing(20))
-    world.asked = 13
-    assert cull_keyframes(world, SETTINGS) is None
+    submap = world_of(standing(20))
+    submap.num_cull_checked = 13
+    assert cull_keyframes(submap, SETTINGS) is None
 
 
 def test_the_reference_of_the_track_stays() -> None:
-    world = world_of(standing(20))
-    world.track.reference = 5
-    renumbering = cull_keyframes(world, SETTINGS)
+    submap = world_of(standing(20))
+    submap.tracking.reference = 5
+    renumbering = cull_keyframes(submap, SETTINGS)
     assert renumbering is not None
-    assert world.track.reference == renumbering.keyframes[5] >= 0
+    assert submap.tracking.reference == renumbering.keyframes[5] >= 0
 
 
 def test_a_camera_on_its_way_keeps_its_keyframes() -> None:
@@ -160,4 +159,4 @@ def test_a_camera_on_its_way_keeps_its_keyframes() -> None:
 
 def test_a_mapper_that_may_not_cull_keeps_all() -> None:
     keeping = load_config(None, ["mapping.cull=false"])
-    assert Mapper(CAMERA, keeping, Stopwatch()).tidy(world_of(standing(30))) is None
+    assert Mapper(CAMERA, keeping, Stopwatch()).cull_and_compact(world_of(standing(30))) is None

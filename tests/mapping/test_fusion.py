@@ -11,15 +11,15 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, transform
+from torchslam.map.atlas import Submap
 from torchslam.map.map import NO_POINT, Map
-from torchslam.map.submap import Submap
-from torchslam.mapping.fusion import find_in, fuse, merge
+from torchslam.mapping.fusion import fuse, match_in_keyframes, merge_points
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)
 
 
-def world(count: int = 3) -> Submap:
+def submap(count: int = 3) -> Submap:
     return world_in(SCENE, sideways(count))
 
 
@@ -45,24 +45,26 @@ def double(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
 
 
 def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
-    here = world()
+    here = submap()
     points, at = free(here.map, 2, 6)
     before = here.map.points["times_observed"].clone()
-    found, there = find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
+    found, there = match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert len(found) == len(there) == 0
     assert torch.equal(here.map.keyframes["point_ids"][2, at], points)
     assert torch.equal(here.map.points["times_observed"][points], before[points] + 1)
 
 
 def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
-    together, apart = world(4), world(4)
+    together, apart = submap(4), submap(4)
     for here in (together, apart):
         points, _ = free(here.map, 3, 6)
         double(here.map, 2, 6)
         free(here.map, 1, 9)
     points = together.map.points_seen_by(torch.arange(4))
-    found = find_in(together.map, torch.tensor([3, 1, 2]), points, CAMERA, Config())
-    one_by_one = [find_in(apart.map, torch.tensor([k]), points, CAMERA, Config()) for k in (3, 1, 2)]
+    found = match_in_keyframes(together.map, torch.tensor([3, 1, 2]), points, CAMERA, Config())
+    one_by_one = [
+        match_in_keyframes(apart.map, torch.tensor([k]), points, CAMERA, Config()) for k in (3, 1, 2)
+    ]
     for pairs, wanted in zip(found, zip(*one_by_one, strict=True), strict=True):
         assert torch.equal(pairs, torch.cat(wanted))
     assert torch.equal(together.map.keyframes["point_ids"], apart.map.keyframes["point_ids"])
@@ -70,18 +72,18 @@ def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
 
 
 def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
-    here = world()
+    here = submap()
     seen = here.map.points_seen_by(torch.tensor([1]))
     before = here.map.keyframes["point_ids"].clone()
-    assert len(find_in(here.map, torch.tensor([1]), seen, CAMERA, Config())[0]) == 0
+    assert len(match_in_keyframes(here.map, torch.tensor([1]), seen, CAMERA, Config())[0]) == 0
     assert torch.equal(here.map.keyframes["point_ids"], before)
 
 
 def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
-    here = world()
+    here = submap()
     points, doubles = double(here.map, 2, 6)
     table = here.map.keyframes["point_ids"].clone()
-    found, there = find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
+    found, there = match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert dict(zip(found.tolist(), there.tolist(), strict=True)) == dict(
         zip(points.tolist(), doubles.tolist(), strict=True)
     )
@@ -90,39 +92,39 @@ def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
 
 @pytest.mark.parametrize(("offset", "agrees"), [(2.4, True), (2.5, False)])
 def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, agrees: bool) -> None:
-    here = world()
+    here = submap()
     points, at = free(here.map, 2, 6)
     T_cw = here.map.T_cw[2]
     points_c = transform(T_cw, here.map.positions_w[points])
     scales = here.map.keyframes["scales"][2, at]
     points_c[:, 0] += offset * scales * points_c[:, 2] / 200.0
     here.map.points["positions_w"][points] = transform(se3_inverse(T_cw), points_c)
-    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
+    match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is agrees
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
     if not agrees:
         wide = load_config(None, ["measurement.max_chi_square=7.0"])
-        find_in(here.map, torch.tensor([2]), points, CAMERA, wide)
+        match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, wide)
         assert (here.map.keyframes["point_ids"][2, at] == points).all()
 
 
 def test_another_look_is_another_point() -> None:
-    here = world()
+    here = submap()
     points, at = free(here.map, 2, 6)
     here.map.points["descriptors"][points] ^= 255
-    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
+    match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert (here.map.keyframes["point_ids"][2, at] == NO_POINT).all()
 
 
 @pytest.mark.parametrize(("factor", "found"), [(1.4, True), (1.6, False), (0.72, True), (0.6, False)])
 def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) -> None:
-    here = world()
+    here = submap()
     points, at = free(here.map, 2, 40)
     middle = (here.map.keyframes["scales"][2, at] - 1.7).abs() < 0.15  # far from the ends of the scales
     points, at = points[middle], at[middle]
     assert len(at) > 3
     here.map.points["scale_distance"][points] *= factor
-    find_in(here.map, torch.tensor([2]), points, CAMERA, Config())
+    match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
     assert bool((here.map.keyframes["point_ids"][2, at] == points).all()) is found
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not found
 
@@ -130,18 +132,18 @@ def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) ->
 @pytest.mark.parametrize("asks", [0, 2])
 def test_doubles_are_found_from_either_side(asks: int) -> None:
     """Keyframe 2 has points of its own that the other two see as others: whoever asks, they become one."""
-    here = world()
+    here = submap()
     points, doubles = double(here.map, 2, 10)
     others = torch.tensor([keyframe for keyframe in range(3) if keyframe != asks])
     fuse(here.map, asks, others, CAMERA, Config())
-    assert torch.equal(here.map.resolve(doubles), points)
+    assert torch.equal(here.map.follow_merges(doubles), points)
     assert not here.map.points["is_valid"][doubles].any()
     assert (here.map.points["times_observed"][points] == 3).all()
 
 
 def test_what_is_free_in_a_neighbour_or_here_is_filled_in() -> None:
     for keyframe in (0, 1):
-        here = world()
+        here = submap()
         points, at = free(here.map, 1, 10)
         fuse(here.map, keyframe, torch.tensor([1 - keyframe]), CAMERA, Config())
         assert torch.equal(here.map.keyframes["point_ids"][1, at], points)
@@ -162,8 +164,8 @@ def observed(*times: int) -> Map:
 
 def merged(times: tuple[int, ...], *pairs: tuple[int, int]) -> list[int]:
     slam_map = observed(*times)
-    merge(slam_map, *torch.tensor(pairs).T)
-    return slam_map.resolve(torch.arange(len(times))).tolist()
+    merge_points(slam_map, *torch.tensor(pairs).T)
+    return slam_map.follow_merges(torch.arange(len(times))).tolist()
 
 
 def test_the_point_that_is_seen_most_stays() -> None:
@@ -182,7 +184,7 @@ def test_chains_end_in_one_point() -> None:
 
 def test_nothing_to_merge_changes_nothing() -> None:
     slam_map = observed(2, 3)
-    merge(slam_map, torch.arange(0), torch.arange(0))
-    merge(slam_map, torch.tensor([1]), torch.tensor([1]))
+    merge_points(slam_map, torch.arange(0), torch.arange(0))
+    merge_points(slam_map, torch.tensor([1]), torch.tensor([1]))
     assert slam_map.points["is_valid"].all()
     assert math.isclose(float(slam_map.points["times_observed"].sum()), 5)

@@ -12,9 +12,9 @@ from torch import Tensor
 from tests.map.simulated import tracked_at
 from tests.scene import Scene, pose, sideways, world_in
 from torchslam.config import KeyframesConfig, load_config
-from torchslam.geometry.transforms import apart
+from torchslam.geometry.transforms import pose_distance
 from torchslam.map.atlas import Submap
-from torchslam.mapping.keyframe_policy import why_keyframe
+from torchslam.mapping.mapper import keyframe_reason
 
 SCENE = Scene.of(100)
 SETTINGS = KeyframesConfig()
@@ -29,7 +29,7 @@ def why(
     submap.tracking.reference_size = round(len(seen) / share)
     estimate = tracked_at(T_cw, seen, torch.arange(len(seen)), depth=depth(submap, T_cw))
     view = replace(SCENE.view(index, T_cw), backlog=backlog)
-    return why_keyframe(view, estimate, submap, settings)
+    return keyframe_reason(view, estimate, submap, settings)
 
 
 def depth(submap: Submap, T_cw: Tensor) -> float:
@@ -85,7 +85,7 @@ def test_a_reference_without_points_is_no_reason() -> None:
     seen = submap.map.points_seen_by(torch.tensor([0]))[:1]
     submap.tracking.reference_size = 0
     estimate = tracked_at(pose(), seen, torch.arange(1))
-    assert why_keyframe(SCENE.view(50, pose()), estimate, submap, SETTINGS) == ""
+    assert keyframe_reason(SCENE.view(50, pose()), estimate, submap, SETTINGS) == ""
 
 
 def test_keyframes_keep_their_interval_forwards_and_backwards() -> None:
@@ -101,7 +101,7 @@ def test_keyframes_keep_their_interval_forwards_and_backwards() -> None:
 def test_how_far_cameras_are_apart() -> None:
     here = pose(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
     there = torch.stack([pose(0.6, 0, 0.8) @ here, pose(0, 0, 0, 0, 0.3) @ here])
-    translation, rotation = apart(here, there, torch.tensor(4.0).double())
+    translation, rotation = pose_distance(here, there, torch.tensor(4.0).double())
     assert translation.tolist() == pytest.approx([0.25, 0.0])
     assert rotation.tolist() == pytest.approx([0.0, math.degrees(0.3)], abs=1e-6)
 

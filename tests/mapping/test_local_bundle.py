@@ -10,7 +10,14 @@ from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
 from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
-from torchslam.mapping.local_bundle import HUBER, adjust, adjust_all, adjust_keyframes, drop_outliers, select
+from torchslam.mapping.local_bundle import (
+    HUBER,
+    adjust_all,
+    adjust_keyframes,
+    adjust_local,
+    remove_outliers,
+    select,
+)
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)
@@ -42,7 +49,7 @@ def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> Non
     truth = slam_map.T_cw.clone()
     shake(slam_map, [4, 5])
     before = slam_map.T_cw.clone()
-    adjust(slam_map, 5, CAMERA, bundle(local_window=2, local_iterations=20))
+    adjust_local(slam_map, 5, CAMERA, bundle(local_window=2, local_iterations=20))
     assert which_moved(slam_map, before) == [4, 5]  # the one that shares most with it
     torch.testing.assert_close(slam_map.T_cw, truth, atol=1e-5, rtol=0)
 
@@ -51,7 +58,7 @@ def test_the_first_keyframe_never_moves() -> None:
     slam_map = row(sideways(3))
     shake(slam_map, [1, 2])
     before = slam_map.T_cw.clone()
-    adjust(slam_map, 1, CAMERA, bundle(local_window=8))
+    adjust_local(slam_map, 1, CAMERA, bundle(local_window=8))
     assert which_moved(slam_map, before) == [1, 2]
     adjust_all(slam_map, CAMERA, bundle())
     assert torch.equal(slam_map.T_cw[0], before[0])
@@ -63,7 +70,9 @@ def test_no_more_keyframes_hold_than_are_allowed() -> None:
         slam_map = row(sideways(4))
         truth = slam_map.T_cw.clone()
         slam_map.keyframes["T_cw"][2:, 0, 3] *= 1.02
-        adjust(slam_map, 3, CAMERA, bundle(local_window=2, max_fixed_keyframes=limit, local_iterations=30))
+        adjust_local(
+            slam_map, 3, CAMERA, bundle(local_window=2, max_fixed_keyframes=limit, local_iterations=30)
+        )
         off = float((slam_map.T_cw[2:] - truth[2:]).abs().max())
         assert (off < 1e-6) is holds
 
@@ -103,7 +112,7 @@ def test_observations_are_dropped_in_units_of_their_scale(offset: float, stays: 
     points = table[2, at].clone()
     slam_map.keyframes["keypoints"][2, at, 1] += offset * slam_map.keyframes["scales"][2, at]
     before = slam_map.points["times_observed"][points].clone()
-    drop_outliers(slam_map, slam_map.observations(), CAMERA)
+    remove_outliers(slam_map, slam_map.observations(), CAMERA)
     assert bool((table[2, at] == points).all()) is stays
     assert bool((table[2, at] == NO_POINT).all()) is not stays
     alive = slam_map.points["is_valid"][points]
@@ -118,7 +127,7 @@ def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
     points = table[1, at].clone()
     slam_map.keyframes["keypoints"][1, at] += 30.0
     count = slam_map.num_points
-    drop_outliers(slam_map, slam_map.observations(), CAMERA)
+    remove_outliers(slam_map, slam_map.observations(), CAMERA)
     both = slam_map.points["times_observed"][points] == 0
     assert both.all()
     assert not slam_map.points["is_valid"][points].any()
@@ -130,14 +139,14 @@ def test_a_bundle_leaves_no_observation_that_disagrees() -> None:
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[3] >= 0)[:5, 0]
     slam_map.keyframes["keypoints"][3, at] += 25.0
-    adjust(slam_map, 3, CAMERA, bundle(local_window=2))
+    adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
     assert (table[3, at] == NO_POINT).all()
 
 
 def test_adjusted_points_are_as_their_observers_have_them() -> None:
     slam_map = row(sideways(4))
     slam_map.points["scale_distance"][:] = 0
-    adjust(slam_map, 3, CAMERA, bundle(local_window=2))
+    adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
     seen = slam_map.points_seen_by(torch.tensor([3]))
     size = SCENE.sizes[torch.argsort(ROWS)[seen]] * 200.0
     torch.testing.assert_close(slam_map.points["scale_distance"][seen], size)
@@ -157,13 +166,24 @@ def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
 def test_certainty_is_noted_where_it_is_asked_for() -> None:
     for asked in (False, True):
         slam_map = world_in(SCENE, sideways(4), noise=0.5).map
-        adjust(slam_map, 3, CAMERA, bundle(local_window=2), covariances=asked)
+        adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=asked)
         known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
         assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if asked else [])
         seen = slam_map.points_seen_by(torch.tensor([2, 3]))
         seen = seen[slam_map.points["times_observed"][seen] >= 2]
         trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
         assert bool((trace > 0).all()) is asked
+
+
+def test_covariances_do_not_change_the_adjustment() -> None:
+    plain, certain = (world_in(SCENE, sideways(4), noise=0.5).map for _ in range(2))
+    adjust_local(plain, 3, CAMERA, bundle(local_window=2))
+    adjust_local(certain, 3, CAMERA, bundle(local_window=2), covariances=True)
+    for name in ("T_cw", "point_ids"):
+        assert torch.equal(plain.keyframes[name], certain.keyframes[name])
+    for name in ("positions_w", "is_valid"):
+        assert torch.equal(plain.points[name], certain.points[name])
+    assert (certain.keyframes["covariances"][2:] != 0).any()
 
 
 def test_nothing_to_adjust_changes_nothing() -> None:

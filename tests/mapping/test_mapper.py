@@ -12,9 +12,9 @@ from tests.scene import CAMERA, Scene, centre, pose, rows_of, sideways, world_in
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import transform, triangulation_covariance
+from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.mapping.mapper import YOUNG, Mapper, world_scale
+from torchslam.mapping.mapper import YOUNG, Mapper, initial_scale
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import TwoViewMap
 from torchslam.utils.timing import Stopwatch
@@ -42,20 +42,20 @@ def start(true: bool = True) -> tuple[TwoViewMap, Tensor]:
 
 def test_the_unit_of_the_world() -> None:
     begin, _ = start()
-    assert world_scale(begin, "unit") == pytest.approx(1 / float(begin.points_w[:, 2].median()))
-    assert world_scale(begin, "groundtruth") == pytest.approx(3.0)
+    assert initial_scale(begin, "unit") == pytest.approx(1 / float(begin.points_w[:, 2].median()))
+    assert initial_scale(begin, "groundtruth") == pytest.approx(3.0)
     longer = replace(begin, T_cw=pose(-2.0) @ pose(0, 0, 0, 0, 0.3))
-    assert world_scale(longer, "groundtruth") == pytest.approx(1.5)
+    assert initial_scale(longer, "groundtruth") == pytest.approx(1.5)
     for name in ("reference", "view"):
         unknown = replace(begin, **{name: replace(getattr(begin, name), T_cw_groundtruth=None)})
         with pytest.raises(ConfigError, match="ground truth"):
-            world_scale(unknown, "groundtruth")
+            initial_scale(unknown, "groundtruth")
 
 
 @pytest.mark.parametrize("scale", ["unit", "groundtruth"])
 def test_a_start_becomes_two_keyframes_that_see_its_points(scale: str) -> None:
     begin, both = start()
-    slam_map, factor = Map(), world_scale(begin, scale)
+    slam_map, factor = Map(), initial_scale(begin, scale)
     assert mapper(f"scale={scale}").start(slam_map, begin) == (0, 1)
     assert slam_map.keyframes["frame_index"].tolist() == [3, 8]
     torch.testing.assert_close(slam_map.T_cw[0], pose())
@@ -91,44 +91,46 @@ def half_world(count: int = 2) -> Submap:
     return world_in(SCENE, sideways(count, step=0.4), seen=torch.arange(300) % 2 == 0)
 
 
-def inserted(by: Mapper, world: Submap, T_cw: Tensor) -> int:
+def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
     view = SCENE.view(50, T_cw)
-    tracked = Tracker(CAMERA, Config()).track(world, view)
-    assert tracked is not None
-    return by.insert(world.map, view, tracked)
+    estimate = Tracker(CAMERA, Config()).track(submap, view)
+    assert estimate is not None
+    return by.insert(submap.map, view, estimate)
 
 
 def test_a_keyframe_brings_the_points_it_tracked_and_new_ones() -> None:
-    world = half_world()
-    before = len(world.map.points)
-    keyframe = inserted(mapper("bundle_adjustment.local=false"), world, sideways(1, start=0.8)[0])
+    submap = half_world()
+    before = len(submap.map.points)
+    keyframe = inserted(mapper("bundle_adjustment.local=false"), submap, sideways(1, start=0.8)[0])
     assert keyframe == 2
-    assert world.map.num_keyframes == 3
-    new = torch.arange(before, len(world.map.points))
-    living = new[world.map.points["is_valid"][new]]
+    assert submap.map.num_keyframes == 3
+    new = torch.arange(before, len(submap.map.points))
+    living = new[submap.map.points["is_valid"][new]]
     assert len(living) > 50
-    table, order = world.map.keyframes["point_ids"][2], SCENE.shows(50)
+    table, order = submap.map.keyframes["point_ids"][2], SCENE.shows(50)
     at = torch.nonzero(table >= 0)[:, 0]
-    torch.testing.assert_close(world.map.positions_w[table[at]], SCENE.points_w[order[at]], atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        submap.map.positions_w[table[at]], SCENE.points_w[order[at]], atol=1e-6, rtol=0
+    )
     old = at[table[at] < before]
     assert len(old) > 50
     assert torch.equal(table[old], ROWS[order[old]])
-    assert (world.map.points["scale_distance"][living] > 0).all()
-    seen = transform(world.map.T_cw[2], world.map.positions_w[living])
+    assert (submap.map.points["scale_distance"][living] > 0).all()
+    seen = transform(submap.map.T_cw[2], submap.map.positions_w[living])
     assert (seen[:, 2] > 0).all()
 
 
 def test_new_points_come_from_the_neighbours_that_are_asked() -> None:
     made = []
     for count in (1, 5):
-        world = half_world(3)
-        before = len(world.map.points)
+        submap = half_world(3)
+        before = len(submap.map.points)
         inserted(
             mapper("bundle_adjustment.local=false", f"mapping.num_partners={count}"),
-            world,
+            submap,
             sideways(1, start=1.2)[0],
         )
-        made.append(len(world.map.points) - before)
+        made.append(len(submap.map.points) - before)
     assert 0 < made[0] < made[1]
     last = half_world(3)
     before = len(last.map.points)
@@ -143,39 +145,39 @@ def test_new_points_come_from_the_neighbours_that_are_asked() -> None:
 def test_fusing_culling_and_adjusting_are_done_where_they_are_asked_for() -> None:
     doubles: dict[str, int] = {}
     for fuse in ("true", "false"):
-        world = world_in(SCENE, sideways(2, step=0.4))
-        table = world.map.keyframes["point_ids"]
+        submap = world_in(SCENE, sideways(2, step=0.4))
+        table = submap.map.keyframes["point_ids"]
         at = torch.nonzero(table[0] >= 0)[:10, 0]
         originals = table[0, at].clone()
-        world.map.forget(torch.zeros_like(at), at)
-        twins = world.map.add_points(
-            world.map.positions_w[originals],
-            world.map.points["descriptors"][originals],
+        submap.map.forget(torch.zeros_like(at), at)
+        twins = submap.map.add_points(
+            submap.map.positions_w[originals],
+            submap.map.points["descriptors"][originals],
             0,
             from_initialization=True,
         )
-        world.map.observe(0, at, twins)
-        world.map.refresh(torch.arange(2))
-        Tracker(CAMERA, Config()).follow(world, 1)
+        submap.map.observe(0, at, twins)
+        submap.map.refresh(torch.arange(2))
+        Tracker(CAMERA, Config()).reset_to_keyframe(submap, 1)
         inserted(
             mapper("bundle_adjustment.local=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
-            world,
+            submap,
             sideways(1, start=0.2)[0],
         )
-        doubles[fuse] = int(world.map.points["is_valid"][twins].sum())
+        doubles[fuse] = int(submap.map.points["is_valid"][twins].sum())
     assert doubles["false"] == 10
     assert doubles["true"] < 5
 
 
 def test_a_bundle_follows_a_keyframe() -> None:
     for enabled, gate in (("true", "chi_square"), ("true", "mahalanobis"), ("false", "mahalanobis")):
-        world = world_in(SCENE, sideways(3, step=0.4), noise=0.5)
-        before = world.map.T_cw.clone()
+        submap = world_in(SCENE, sideways(3, step=0.4), noise=0.5)
+        before = submap.map.T_cw.clone()
         by = mapper(f"bundle_adjustment.local={enabled}", f"measurement.gate={gate}")
-        inserted(by, world, sideways(1, start=1.0)[0])
-        has_moved = bool((world.map.T_cw[:3] != before).any())
+        inserted(by, submap, sideways(1, start=1.0)[0])
+        has_moved = bool((submap.map.T_cw[:3] != before).any())
         assert has_moved is (enabled == "true")
-        is_known = bool((world.map.keyframes["covariances"] != 0).any())
+        is_known = bool((submap.map.keyframes["covariances"] != 0).any())
         assert is_known is (enabled == "true" and gate == "mahalanobis")
         assert ("bundle" in by.clock.take()) is (enabled == "true")
 
@@ -184,8 +186,8 @@ def young_map(
     age: int, *, found: int = 10, visible: int = 10, observed: int = 3, from_initialization: bool = False
 ) -> bool:
     """Whether a point of that kind survives; the keyframe asking is number 8."""
-    world = world_in(SCENE, sideways(9, step=0.01))
-    slam_map = world.map
+    submap = world_in(SCENE, sideways(9, step=0.01))
+    slam_map = submap.map
     point = int(torch.nonzero(slam_map.points["times_observed"] == 9)[0])
     points = slam_map.points
     points["first_keyframe"][:] = 0

@@ -15,9 +15,8 @@ from torchslam.errors import ConfigError
 from torchslam.geometry import KeypointNoise, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.fusion import fuse
-from torchslam.mapping.keyframe_policy import why_keyframe
-from torchslam.mapping.local_bundle import adjust, adjust_all
-from torchslam.mapping.mapper import Mapper, world_scale
+from torchslam.mapping.local_bundle import adjust_all, adjust_local
+from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
 from torchslam.mapping.new_points import has_consistent_scale
 from torchslam.system.front_end import Simulated
 from torchslam.system.slam import SLAM
@@ -98,9 +97,9 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
 
 
 def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
-    tracked = slam.tracker.track(slam.world, view_of(slam, 20))
-    assert tracked is not None
-    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
+    estimate = slam.tracker.track(slam.submap, view_of(slam, 20))
+    assert estimate is not None
+    assert torch.allclose(estimate.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -108,21 +107,21 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
 )
 def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
     tracker = Tracker(slam.camera, load_config(None, ["features.kind=simulated", override]))
-    tracker.follow(slam.world, slam.map.num_keyframes - 1)
-    tracked = tracker.track(slam.world, view_of(slam, 20))
-    assert tracked is not None
-    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 20), atol=1e-5)
+    tracker.reset_to_keyframe(slam.submap, slam.map.num_keyframes - 1)
+    estimate = tracker.track(slam.submap, view_of(slam, 20))
+    assert estimate is not None
+    assert torch.allclose(estimate.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
 
 def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
     anywhere = match_points(slam.map, slam.map.valid_points(), view, CONFIG.matching)
-    tracked = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
-    assert tracked is not None
-    assert torch.allclose(tracked.T_cw, walk_from_start(slam, 2), atol=1e-5)
-    slam.tracker.start_at(slam.world, view, tracked)
-    assert slam.world.track.reference <= 2
-    assert torch.allclose(slam.world.T_cw, tracked.T_cw)
+    estimate = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
+    assert estimate is not None
+    assert torch.allclose(estimate.T_cw, walk_from_start(slam, 2), atol=1e-5)
+    slam.tracker.start_at(slam.submap, view, estimate)
+    assert slam.submap.tracking.reference <= 2
+    assert torch.allclose(slam.submap.T_cw, estimate.T_cw)
 
 
 def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Generator) -> None:
@@ -163,13 +162,13 @@ def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
     keyframe = slam.map.num_keyframes - 1
     keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])
     slam.map.keyframes["keypoints"][keyframe, keypoint] += 40.0
-    adjust(slam.map, keyframe, slam.camera, CONFIG.bundle_adjustment)
+    adjust_local(slam.map, keyframe, slam.camera, CONFIG.bundle_adjustment)
     assert slam.map.keyframes["point_ids"][keyframe, keypoint] == NO_POINT
 
 
 def test_the_first_keyframe_stays(slam: SLAM) -> None:
     before = slam.map.T_cw[0].clone()
-    adjust(slam.map, 1, slam.camera, CONFIG.bundle_adjustment)
+    adjust_local(slam.map, 1, slam.camera, CONFIG.bundle_adjustment)
     adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
     assert torch.equal(slam.map.T_cw[0], before)
 
@@ -184,7 +183,7 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
     slam.map.observe(keyframe, seen, doubles)
     slam.map.refresh(torch.tensor([keyframe]))
     fuse(slam.map, keyframe, slam.map.covisible(keyframe, 5, min_shared=5), slam.camera, CONFIG)
-    assert torch.equal(slam.map.resolve(doubles), slam.map.resolve(originals))
+    assert torch.equal(slam.map.follow_merges(doubles), slam.map.follow_merges(originals))
 
 
 def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
@@ -240,7 +239,7 @@ def test_two_views_make_a_start_with_the_true_motion() -> None:
     truth = true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0])
     truth[:3, 3] /= truth[:3, 3].norm()
     assert torch.allclose(start.T_cw, truth, atol=1e-6)
-    assert world_scale(start, "groundtruth") == pytest.approx(
+    assert initial_scale(start, "groundtruth") == pytest.approx(
         float((true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0]))[:3, 3].norm())
     )
 
@@ -265,7 +264,7 @@ def test_scale_from_ground_truth_needs_ground_truth() -> None:
     assert start is not None
     view = FrameFeatures(**{**start.view.__dict__, "T_cw_groundtruth": None})
     with pytest.raises(ConfigError, match="ground truth"):
-        world_scale(
+        initial_scale(
             TwoViewMap(
                 start.reference, view, start.T_cw, start.points_w, start.keypoints_1, start.keypoints_2
             ),
@@ -274,16 +273,16 @@ def test_scale_from_ground_truth_needs_ground_truth() -> None:
 
 
 def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
-    tracked = slam.tracker.track(slam.world, view_of(slam, 20))
-    assert tracked is not None
-    reference = slam.map.T_cw[slam.world.track.reference]
+    estimate = slam.tracker.track(slam.submap, view_of(slam, 20))
+    assert estimate is not None
+    reference = slam.map.T_cw[slam.submap.tracking.reference]
     view = FrameFeatures(**{**view_of(slam, 20).__dict__, "index": 100})
 
     def why(T_cr: list[float], overlap: float = 1.0) -> str:
         pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference
-        slam.world.track.reference_size = int(tracked.inliers / overlap)
-        moved = replace(tracked, T_cw=pose)
-        return why_keyframe(view, moved, slam.world, Config().keyframes)
+        slam.submap.tracking.reference_size = int(estimate.inliers / overlap)
+        moved = replace(estimate, T_cw=pose)
+        return keyframe_reason(view, moved, slam.submap, Config().keyframes)
 
     assert why([0.0] * 6) == ""
     assert why([2.0, 0, 0, 0, 0, 0]).startswith("moved")

@@ -14,7 +14,7 @@ from torchslam.config import MatchingConfig, load_config
 from torchslam.geometry import KeypointNoise, se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.map.map import Map
 from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
-from torchslam.tracking.epipolar import FreeKeypoints, around, match_along_epipolar_lines
+from torchslam.tracking.epipolar import FreeKeypoints, angle_around_axis, match_along_epipolar_lines
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
 
@@ -269,11 +269,11 @@ def test_angles_around_an_axis() -> None:
         torch.randn(*shape, 3, generator=generator, dtype=torch.float64) for shape in ((4,), (4, 9))
     )
     axes[0] = torch.tensor([0.0, 0.0, 2.0])
-    angles, sines = around(axes, rays)
+    angles, sines = angle_around_axis(axes, rays)
     unit, across = (torch.nn.functional.normalize(x, dim=-1) for x in (axes[:, None], rays))
     torch.testing.assert_close(sines, torch.linalg.cross(unit.expand_as(rays), across).norm(dim=-1))
     turn = so3_exp(0.3 * unit[:, 0])
-    turned, _ = around(axes, rays @ turn.mT)
+    turned, _ = angle_around_axis(axes, rays @ turn.mT)
     torch.testing.assert_close(torch.remainder(turned - angles, 2 * math.pi), torch.full_like(angles, 0.3))
 
 

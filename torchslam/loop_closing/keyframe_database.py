@@ -94,7 +94,7 @@ class KeyframeDatabase:
             return self.keys, torch.zeros(len(self), device=self._keys.device)
         return self._ranked(*words_and_codes(_strongest(descriptors, mask), self._words))
 
-    def like(self, key: int) -> tuple[Tensor, Tensor]:
+    def query_by_key(self, key: int) -> tuple[Tensor, Tensor]:
         """As `query` for the image of a keyframe that is there. Raises KeyError where it is not."""
         slot = self._slots[key]
         used = torch.nonzero(self._used[:, slot])[:, 0]

@@ -1,78 +1,196 @@
-"""The memory of places over all worlds: what was seen before, and what follows when it is seen again."""
+"""Loop closing: detect known places, correct the drift of a loop, and merge submaps that share a place.
+
+A closed loop bends the map by a pose graph of Sim(3) over the essential graph of its keyframes, which spreads the drift
+of position, rotation and scale along the loop. Then duplicate landmarks are fused and the whole map is adjusted.
+Sources: Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010; Mur-Artal, Montiel and
+Tardos, "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, section VII.
+"""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera
-from torchslam.loop_closing.closing import close_loop, join, sew_on
+from torchslam.geometry import Camera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
-from torchslam.map.atlas import Atlas
+from torchslam.loop_closing.relative_sim3 import neighborhood
+from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
+from torchslam.mapping.fusion import match_in_keyframes, merge_points
+from torchslam.mapping.local_bundle import adjust_all
+from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures
 
+STRONG = 100  # shared points from which two keyframes have an edge beside the spanning tree
+_MAX_STRONG_EDGES = 20  # of a keyframe
+_ITERATIONS = 20
+_VISIT_KEYFRAMES = 20  # on either side of the loop: what is searched for the other side's points
+
 
 class LoopCloser:
-    """Knows the keyframes of all worlds by what they look like."""
+    """Detects and closes loops over all submaps of an atlas."""
 
-    def __init__(self, camera: Camera, config: Config, worlds: Atlas) -> None:
+    def __init__(self, camera: Camera, config: Config, atlas: Atlas) -> None:
         self.camera = camera
         self.config = config
-        self.worlds = worlds
-        self.places = KeyframeDatabase()
-        self.recognizer = LoopDetector(camera, config, worlds, self.places)
-        self.recalls: list[LoopClosureRecord] = []  # what was recognised so far, for the record
-        self.looks_known: tuple[int, bool] | None = None  # a keyframe, by key, and what `look_ahead` saw
-        for world in worlds:
-            for keyframe in range(world.map.num_keyframes):
-                self.add(world.map, keyframe)
+        self.atlas = atlas
+        self.keyframe_database = KeyframeDatabase()
+        self.loop_detector = LoopDetector(camera, config, atlas, self.keyframe_database)
+        self.loop_closures: list[LoopClosureRecord] = []  # what was recognised so far, for the record
+        self.loop_precheck: tuple[int, bool] | None = None  # a keyframe, by key, and what `precheck` saw
+        for submap in atlas:
+            for keyframe in range(submap.map.num_keyframes):
+                self.add(submap.map, keyframe)
+
+    def restore(self, loop_closures: list[LoopClosureRecord], loop_precheck: tuple[int, bool] | None) -> None:
+        """Continue from the state of a checkpoint."""
+        self.loop_closures, self.loop_precheck = loop_closures, loop_precheck
 
     def add(self, slam_map: Map, keyframe: int) -> None:
-        """The place of a keyframe can be recognised from now on."""
+        """Add a keyframe to the keyframe database."""
         view = slam_map.view(keyframe)
-        self.places.add(slam_map.key(keyframe), view.descriptors, view.mask)
+        self.keyframe_database.add(slam_map.key(keyframe), view.descriptors, view.mask)
 
     def remove(self, keys: Tensor) -> None:
-        """Keyframes that are gone, by their keys (n,)."""
-        self.places.remove(keys)
+        """Remove keyframes by their keys (n,)."""
+        self.keyframe_database.remove(keys)
 
-    def likely(self, view: FrameFeatures) -> list[Candidate]:
-        """Keyframes that look like a frame, in any world, the likeliest first."""
-        keys, _ = self.places.query(view.descriptors, view.mask)
+    def query(self, view: FrameFeatures) -> list[Candidate]:
+        """Return relocalization candidates in all submaps, most similar first."""
+        keys, _ = self.keyframe_database.query(view.descriptors, view.mask)
         found = (
-            self.worlds.find(key) for key in keys[: 3 * self.config.relocalization.max_candidates].tolist()
+            self.atlas.find(key) for key in keys[: 3 * self.config.relocalization.max_candidates].tolist()
         )
         return [candidate for candidate in found if candidate is not None]
 
-    def look_ahead(self, world: Submap, keyframe: int) -> None:
-        """Note whether a keyframe shows a place that was seen before, by the map as it is; the map is not changed."""
-        is_known = self.config.loop_closing.enabled and self.recognizer.recognize(world, keyframe) is not None
-        self.looks_known = world.map.key(keyframe), is_known
+    def precheck(self, submap: Submap, keyframe: int) -> None:
+        """Record whether a loop is detected before the local adjustment is applied; the map is not changed."""
+        is_known = (
+            self.config.loop_closing.enabled and self.loop_detector.detect(submap, keyframe) is not None
+        )
+        self.loop_precheck = submap.map.key(keyframe), is_known
 
-    def recognize(self, world: Submap, keyframe: int) -> LoopCandidate | None:
-        """The place that a keyframe shows, if it was seen before and that is certain.
+    def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
+        """Return the verified loop candidate of a keyframe, or None.
 
-        Where none is found, or `look_ahead` saw none, what the map knows already of earlier visits is tied to the
-        keyframe.
+        If there is none, or `precheck` found none, landmarks are fused with covisible keyframes of earlier visits.
         """
         if not self.config.loop_closing.enabled:
             return None
-        looks_new = self.looks_known == (world.map.key(keyframe), False)
-        found = None if looks_new else self.recognizer.recognize(world, keyframe)
+        looks_new = self.loop_precheck == (submap.map.key(keyframe), False)
+        found = None if looks_new else self.loop_detector.detect(submap, keyframe)
         if found is None:
-            sew_on(world, keyframe, self.camera, self.config)
+            fuse_with_earlier_visits(submap, keyframe, self.camera, self.config)
         return found
 
-    def take_up(self, found: LoopCandidate) -> tuple[Submap, int]:
-        """Close the loop, or make one world of two; returns the world and the row in it of the keyframe that asked."""
-        self.recalls.append(found.recall)
+    def close(self, found: LoopCandidate) -> tuple[Submap, int]:
+        """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""
+        self.loop_closures.append(found.closure)
         if found.is_loop:
             close_loop(found, self.camera, self.config)
-            return found.world, found.keyframe
-        world, keyframe = join(found, self.camera, self.config)
-        self.worlds.forget(found.world if world is found.other else found.other)
-        return world, keyframe
+            return found.submap, found.keyframe
+        submap, keyframe = merge_maps(found, self.camera, self.config)
+        self.atlas.remove(found.submap if submap is found.other else found.other)
+        return submap, keyframe
+
+
+def close_loop(found: LoopCandidate, camera: Camera, config: Config) -> None:
+    """Correct the drift of a submap by a pose graph, then fuse landmarks; the first keyframe stays."""
+    submap = found.submap
+    submap.apply_sim3_correction(essential_graph_solution(found))
+    fuse_and_adjust(submap, found.keyframe, found.place, camera, config)
+
+
+def essential_graph_solution(found: LoopCandidate) -> Tensor:
+    """Optimize the pose graph of the essential graph and the loop edge; return Sim(3) (K, 4, 4), world to keyframe."""
+    T_cw = found.submap.map.T_cw
+    edges = essential_edges(found.submap.map)
+    closing = edges.new_tensor([[found.place, found.keyframe]])
+    measured = T_cw[edges[:, 1]] @ se3_inverse(T_cw[edges[:, 0]])
+    # S_21 maps the frame of the keyframe to that of the place.
+    S_kp = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ se3_inverse(T_cw[found.place])
+    graph = PoseGraph(T_cw, torch.cat([edges, closing]), torch.cat([measured, S_kp[None]]), fixed=(0,))
+    return pose_graph_optimize(graph, backward="detached", iterations=_ITERATIONS).S_cw
+
+
+def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Submap, int]:
+    """Merge the newer of two submaps into the older one; return it and the row of the keyframe in it.
+
+    The tracking state stays that of the keyframe's submap.
+    """
+    submap, other, relation = found.submap, found.other, found.relation
+    if other.number < submap.number:
+        offset = other.map.num_keyframes
+        other.merge(submap, relation.S_21)
+        fuse_and_adjust(other, found.keyframe + offset, found.place, camera, config)
+        return other, found.keyframe + offset
+    offset = submap.map.num_keyframes
+    tracking = submap.tracking
+    submap.merge(other, sim3_inverse(relation.S_21))
+    submap.tracking = tracking
+    fuse_and_adjust(submap, found.keyframe, found.place + offset, camera, config)
+    return submap, found.keyframe
+
+
+def fuse_and_adjust(submap: Submap, keyframe: int, place: int, camera: Camera, config: Config) -> None:
+    """Fuse landmarks between the neighborhoods of a keyframe and of a place, and adjust the whole map, twice.
+
+    Before the first adjustment some points are too far from their keypoints to be matched.
+    """
+    here = neighborhood(submap.map, keyframe, _VISIT_KEYFRAMES)
+    there = neighborhood(submap.map, place, _VISIT_KEYFRAMES)
+    fuse_landmarks(submap.map, here, there, camera, config)
+    if config.loop_closing.global_bundle_adjustment and config.bundle_adjustment.local:
+        adjust_all(submap.map, camera, config.bundle_adjustment)
+        fuse_landmarks(submap.map, here, there, camera, config)
+        adjust_all(submap.map, camera, config.bundle_adjustment)
+
+
+def fuse_with_earlier_visits(submap: Submap, keyframe: int, camera: Camera, config: Config) -> None:
+    """Fuse the landmarks of a keyframe with those of covisible keyframes of earlier visits.
+
+    After a loop closure, the most covisible keyframes, which tracking and mapping use, are mostly of the same visit.
+    """
+    earlier = earlier_visit_keyframes(submap.map, keyframe)
+    if len(earlier):
+        fuse_landmarks(submap.map, submap.map.ids(keyframe), earlier, camera, config)
+        tracking = submap.tracking  # must not refer to merged points
+        tracking.local_points = torch.unique(submap.map.follow_merges(tracking.local_points))
+        tracking.last_inlier_points = submap.map.follow_merges(tracking.last_inlier_points)
+
+
+def earlier_visit_keyframes(slam_map: Map, keyframe: int) -> Tensor:
+    """Return covisible keyframes (<= 20,) of earlier visits: before the last gap in covisibility over time."""
+    order = torch.argsort(slam_map.keys)
+    rank = torch.argsort(order)
+    shares = slam_map.observers(slam_map.points_seen_by(slam_map.ids(keyframe)))[order] > 0
+    missing = torch.nonzero(~shares[: int(rank[keyframe])])[:, 0]
+    began = int(missing[-1]) + 1 if len(missing) else 0
+    near = slam_map.covisible(keyframe, slam_map.num_keyframes)
+    return near[rank[near] < began][:_VISIT_KEYFRAMES]
+
+
+def fuse_landmarks(slam_map: Map, here: Tensor, there: Tensor, camera: Camera, config: Config) -> None:
+    """Match the points of keyframes (k,) and others (l,) in each other, and merge duplicates."""
+    for keyframes, others in ((here, there), (there, here)):
+        points = slam_map.points_seen_by(others)
+        merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
+    slam_map.refresh(torch.unique(torch.cat([here, there])))
+
+
+def essential_edges(slam_map: Map) -> Tensor:
+    """Return the essential graph: edges (E, 2) int64 of a spanning tree and of strongly covisible keyframes.
+
+    The parent in the tree is the most covisible earlier keyframe, or else the row before.
+    """
+    edges: set[tuple[int, int]] = set()
+    for keyframe in range(1, slam_map.num_keyframes):
+        near = slam_map.covisible(keyframe, slam_map.num_keyframes, min_shared=1)
+        earlier = near[near < keyframe]
+        edges.add((int(earlier[0]) if len(earlier) else keyframe - 1, keyframe))
+        strong = slam_map.covisible(keyframe, _MAX_STRONG_EDGES, min_shared=STRONG)
+        edges.update((other, keyframe) for other in strong.tolist() if other < keyframe)
+    return torch.tensor(sorted(edges), dtype=torch.int64, device=slam_map.T_cw.device).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""How do two keyframes lie to each other whose maps do not know of each other? A similarity, checked both ways."""
+"""Estimate and verify the Sim(3) between two keyframes, of different submaps or of both ends of a loop."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ class RelativeSim3:
     pairs: int
 
 
-def relate(
+def estimate_relative_sim3(
     map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
 ) -> RelativeSim3 | None:
-    """The similarity between two maps by a keyframe of each; None where they do not show the same for certain.
+    """Estimate the Sim(3) between two maps from a keyframe of each; None if it is not certain.
 
-    The two may be one map: then keyframe 1 is seen from the place where keyframe 2 is.
+    Both may be the same map: then the Sim(3) is the drift between the two keyframes.
     """
     T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config)
     if T_12 is None:
         return None
-    points_2 = map_2.points_seen_by(neighbourhood(map_2, keyframe_2))
-    ids, keypoints = find(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
+    points_2 = map_2.points_seen_by(neighborhood(map_2, keyframe_2))
+    ids, keypoints = match_by_sim3_pose(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
     settings = config.loop_closing
     if len(ids) < settings.min_matches:
         return None
@@ -75,15 +75,15 @@ def relate(
     depth_2 = transform(T_12, map_2.positions_w[ids])[:, 2]
     scale = (depth_2 / depth_1).median()
     S_21 = se3_inverse(T_12) @ rescaling(scale) @ T_11
-    points_1 = map_1.points_seen_by(neighbourhood(map_1, keyframe_1))
+    points_1 = map_1.points_seen_by(neighborhood(map_1, keyframe_1))
     T_21 = seen_from(map_2.T_cw[keyframe_2], S_21)
-    back, _ = agreeing(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
+    back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
     if len(back) < settings.min_matches // 2:
         return None
     return RelativeSim3(S_21, int(agrees.sum()), len(back), len(own))
 
 
-def confirms(
+def verify(
     relation: RelativeSim3,
     map_1: Map,
     other: int,
@@ -92,14 +92,14 @@ def confirms(
     camera: Camera,
     settings: Config,
 ) -> bool:
-    """Whether another keyframe of map 1 sees the points around keyframes near_2 (k,) of map 2 where it should."""
+    """Whether another keyframe of map 1 observes the points of keyframes (k,) of map 2 as the Sim(3) predicts."""
     T_o2 = seen_from(map_1.T_cw[other], sim3_inverse(relation.S_21))
-    ids, _ = agreeing(map_2, map_2.points_seen_by(near_2), T_o2, map_1, other, camera, settings)
+    ids, _ = inlier_matches(map_2, map_2.points_seen_by(near_2), T_o2, map_1, other, camera, settings)
     return len(ids) >= settings.loop_closing.min_matches // 2
 
 
-def neighbourhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
-    """(k,) a keyframe and those that share most points with it."""
+def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
+    """Return a keyframe and the most covisible ones, (k,)."""
     near = slam_map.covisible(keyframe, count)
     return torch.cat([near.new_tensor([keyframe]), near])
 
@@ -120,7 +120,7 @@ def seen_from(T_cw: Tensor, S_wv: Tensor) -> Tensor:
     return rigid(S_cv[:3, :3] / scale, S_cv[:3, 3] / scale)
 
 
-def find(
+def match_by_sim3_pose(
     slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) points (n,) of a map and keypoints of another map's keyframe, which is at T_cw in this one."""
@@ -131,11 +131,11 @@ def find(
     return pairs.first, pairs.second
 
 
-def agreeing(
+def inlier_matches(
     slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
-    """As `find`, those alone that are seen where they should be, more noise allowed for that of the similarity."""
-    ids, keypoints = find(slam_map, point_ids, T_cw, other, keyframe, camera, config)
+    """Return the matches of `match_by_sim3_pose` that pass a gate widened for the noise of the Sim(3)."""
+    ids, keypoints = match_by_sim3_pose(slam_map, point_ids, T_cw, other, keyframe, camera, config)
     view = other.view(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)

@@ -1,65 +1,192 @@
-"""The worlds of a run: most runs have one; what cannot be joined to it stays beside it."""
+"""The atlas: the submaps of a run, each with its map, its posed frames and its tracking state.
+
+A run starts a new submap when the camera is lost for long, and merges submaps when loop closing recognizes a shared
+place. Term: Campos et al., "ORB-SLAM3: an accurate open-source library for visual, visual-inertial and multi-map
+SLAM", 2021.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
-from torchslam.map.submap import Submap
+from torchslam.geometry import sim3_inverse, sim3_scale
+from torchslam.geometry.transforms import (
+    carry_points,
+    covariances_with_unit,
+    with_unit,
+    without_scale,
+)
+from torchslam.map.map import Map
+from torchslam.map.posed_frames import PosedFrames
+from torchslam.types import Trajectory
+
+
+@dataclass
+class TrackingState:
+    """The state of tracking in a submap after the last frame.
+
+    T_cr:               (4, 4) pose of the last frame relative to its reference keyframe, so that it follows the map
+    reference:          row of the reference keyframe; -1 before there is one
+    reference_size:     number of points of the reference keyframe that other keyframes observe as well
+    velocity:           (4, 4) last motion, T_c_previous; None if unknown
+    last_inlier_points: (n,) points that the last frame observed
+    local_keyframes:    (k,) keyframes of the local map: the reference keyframe and the most covisible ones
+    local_points:       (m,) points of the local map: those that the local keyframes observe
+    error:              moving average of the median squared error of the matches in units of their variance
+    explained_ratio:    moving average of the ratio of image cells with keypoints in which some agree with the map
+    """
+
+    T_cr: Tensor
+    reference: int
+    reference_size: int
+    velocity: Tensor | None
+    last_inlier_points: Tensor
+    local_keyframes: Tensor
+    local_points: Tensor
+    error: float = 0.0
+    explained_ratio: float = 1.0
+
+    @classmethod
+    def empty(cls, like: Tensor) -> TrackingState:
+        """Create the state before the first keyframe, with the device and floating-point type of `like`."""
+        none = torch.empty(0, dtype=torch.int64, device=like.device)
+        eye = torch.eye(4, dtype=like.dtype, device=like.device)
+        return cls(eye, -1, 0, None, none, none, none)
+
+
+@dataclass
+class Submap:
+    """A map with a coordinate frame of its own, the frames posed in it, and the tracking state.
+
+    number:           from 0, in the order in which the submaps of a run were created
+    num_cull_checked: number of leading keyframes that keyframe culling has already checked
+    """
+
+    number: int
+    tracking: TrackingState
+    map: Map = field(default_factory=Map)
+    posed_frames: PosedFrames = field(default_factory=PosedFrames)
+    num_cull_checked: int = 0
+
+    @classmethod
+    def empty(cls, number: int, like: Tensor) -> Submap:
+        """Create an empty submap with the device and floating-point type of `like`."""
+        return cls(number, TrackingState.empty(like))
+
+    @property
+    def T_cw(self) -> Tensor:
+        """(4, 4) current pose of the last frame."""
+        return self.tracking.T_cr @ self.map.T_cw[self.tracking.reference]
+
+    def trajectory(self, session: int | None = None) -> Trajectory:
+        """Return the current poses of all posed frames, or of those of one session."""
+        return self.posed_frames.trajectory(self.map, session)
+
+    def fork(self) -> Submap:
+        """Return a submap that shares map and posed frames but has a tracking state of its own."""
+        return replace(self, tracking=replace(self.tracking))
+
+    def apply_sim3_correction(self, S_cw: Tensor) -> None:
+        """Move every keyframe to the pose of a Sim(3) S_cw (K, 4, 4), world to camera.
+
+        The scale of S_cw changes the map unit around the keyframe. Points follow the keyframe that created them, posed
+        frames and the tracking state their reference keyframe.
+        """
+        points, first_keyframe, scale = self.map.points, self.map.points["first_keyframe"], sim3_scale(S_cw)
+        points["positions_w"][:], points["covariances_w"][:], points["view_directions_w"][:] = carry_points(
+            points["positions_w"],
+            points["covariances_w"],
+            points["view_directions_w"],
+            self.map.T_cw[first_keyframe],
+            S_cw[first_keyframe],
+        )
+        points["scale_distance"][:] /= scale[first_keyframe]
+        covariances = self.map.keyframes["covariances"]
+        covariances[:] = covariances_with_unit(covariances, scale)
+        self.map.keyframes["T_cw"][:] = without_scale(S_cw)
+        self.posed_frames.rescale(1 / scale)
+        if self.tracking.reference >= 0:
+            around = scale[self.tracking.reference]
+            self.tracking.T_cr = with_unit(self.tracking.T_cr, around)
+            if self.tracking.velocity is not None:
+                self.tracking.velocity = with_unit(self.tracking.velocity, around)
+
+    def transform(self, S_ba: Tensor) -> None:
+        """Change the coordinate frame and unit: points p become S_ba p, with a Sim(3) S_ba (4, 4)."""
+        self.apply_sim3_correction(self.map.T_cw @ sim3_inverse(S_ba))
+
+    def merge(self, other: Submap, S_ab: Tensor) -> None:
+        """Move everything of another submap into this one by a Sim(3) S_ab (4, 4); the other is empty afterwards.
+
+        The other's rows of keyframes, points and frames are appended. The tracking state becomes that of the other.
+        """
+        other.transform(S_ab)
+        keyframes, points = self.map.append(other.map)
+        self.posed_frames.append(other.posed_frames, keyframes, points)
+        tracking = other.tracking
+        self.tracking = replace(
+            tracking,
+            reference=tracking.reference + keyframes,
+            last_inlier_points=tracking.last_inlier_points + points,
+            local_keyframes=tracking.local_keyframes + keyframes,
+            local_points=tracking.local_points + points,
+        )
+        other.map, other.posed_frames = Map(), PosedFrames()
 
 
 class Atlas:
-    """All worlds that a run keeps, in the order in which they began; numbers are not used again."""
+    """The submaps of a run in the order of their creation; numbers are not reused."""
 
-    def __init__(self, like: Tensor) -> None:
-        """like: device and floating-point type of the worlds' tensors."""
+    def __init__(self, like: Tensor, submaps: Iterable[Submap] = (), num_created: int = 0) -> None:
+        """Create an atlas.
+
+        Args:
+            like: Tensor whose device and floating-point type new submaps get.
+            submaps: Submaps to start with.
+            num_created: Number of submaps ever created.
+        """
         self._like = like
-        self._worlds: list[Submap] = []
-        self._next = 0
-
-    @classmethod
-    def of(cls, worlds: Iterable[Submap], begun: int, like: Tensor) -> Atlas:
-        """Worlds that there were already; `begun`: how many ever began, so that no number is used again."""
-        made = cls(like)
-        made._worlds, made._next = list(worlds), begun
-        return made
-
-    @property
-    def begun(self) -> int:
-        """How many worlds ever began."""
-        return self._next
+        self._submaps = list(submaps)
+        self.num_created = num_created
 
     def __len__(self) -> int:
-        return len(self._worlds)
+        return len(self._submaps)
 
     def __iter__(self) -> Iterator[Submap]:
-        return iter(self._worlds)
+        return iter(self._submaps)
 
-    def begin(self) -> Submap:
-        """A new, empty world."""
-        world = Submap.empty(self._next, self._like)
-        self._next += 1
-        self._worlds.append(world)
-        return world
+    def create(self) -> Submap:
+        """Add a new, empty submap."""
+        submap = Submap.empty(self.num_created, self._like)
+        self.num_created += 1
+        self._submaps.append(submap)
+        return submap
 
-    def forget(self, world: Submap) -> None:
-        """Drop a world that was taken back, or that is part of another one now."""
-        self._worlds = [other for other in self._worlds if other is not world]
+    def remove(self, submap: Submap) -> None:
+        """Remove a submap that was discarded or merged into another one."""
+        self._submaps = [other for other in self._submaps if other is not submap]
 
     def main(self, session: int | None = None) -> Submap | None:
-        """As `main_of`."""
-        return main_of(self._worlds, session)
+        """Return the submap of `main_submap`."""
+        return main_submap(self._submaps, session)
 
     def find(self, key: int) -> tuple[Submap, int] | None:
-        """The world and the row of the keyframe of that name; None where no world has it."""
-        for world in self._worlds:
-            row = world.map.row(key)
+        """Return the submap and the row of the keyframe with this key, or None."""
+        for submap in self._submaps:
+            row = submap.map.row(key)
             if row >= 0:
-                return world, row
+                return submap, row
         return None
 
 
-def main_of(worlds: Iterable[Submap], session: int | None = None) -> Submap | None:
-    """The world in which most frames of a session are posed, then most of all; of equals the first; None without."""
-    return max(worlds, key=lambda world: (world.history.count(session), len(world.history)), default=None)
+def main_submap(submaps: Iterable[Submap], session: int | None = None) -> Submap | None:
+    """Return the submap with most posed frames of a session, then of all sessions; None if there is none."""
+    return max(
+        submaps,
+        key=lambda submap: (submap.posed_frames.count(session), len(submap.posed_frames)),
+        default=None,
+    )

@@ -1,8 +1,8 @@
-"""Everything that a run keeps, as one safetensors file: its worlds, table by table, and the camera.
+"""The map file: an atlas of submaps and the camera as one safetensors file.
 
-A tensor `worlds.0.points.positions_w` is a column of a table of world 0; `torchslam.map.schema` says what it holds.
-Where the camera was last is not in it: who goes on in a saved map finds itself in it. A file that is read is checked
-column by column and row by row, so that nothing later stumbles over it.
+A tensor `submaps.0.points.positions_w` is a column of a table of submap 0; `torchslam.map.table` describes the columns.
+The tracking state is not saved: a run that continues in a saved map relocalizes. Reading checks every column against
+the schema and every row reference against the tables.
 """
 
 from __future__ import annotations
@@ -18,12 +18,9 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.map.atlas import Atlas
+from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
-from torchslam.map.schema import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema
-from torchslam.map.submap import Submap
-from torchslam.map.table import Table
-from torchslam.map.validation import check_camera, check_keys, check_world
+from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema, Table
 from torchslam.utils.atomic_write import write_whole
 from torchslam.utils.bounded_read import check_regular, parse_json
 
@@ -35,65 +32,94 @@ TABLES: dict[str, Schema] = {
     "observations": OBSERVATIONS,
 }
 CAMERA = "camera.params"
-MOST = 1 << 31  # worlds and sessions
+MAX_NUMBER = 1 << 31  # of submaps and of sessions
 MAX_BYTES = 1 << 34  # of a map of 100,000 keyframes
+
+
+Columns = dict[str, dict[str, Tensor]]
+"""Columns by table and name; none if a table is empty."""
+
+_FINITE = (
+    "T_cw",
+    "T_cr",
+    "positions_w",
+    "timestamp",
+    "keypoints",
+    "scales",
+    "pixels",
+    "scale_distance",
+    "information",
+)
 
 
 @dataclass(frozen=True)
 class Saved:
-    """What a file holds.
+    """The content of a map file.
 
-    sessions: how many runs over the map are in it; the next one has this number
+    sessions: number of sessions (runs over the map) in it; the next session gets this number
     """
 
-    worlds: Atlas
+    atlas: Atlas
     camera: Camera
     sessions: int
 
 
-def write_atlas(path: str | Path, worlds: Iterable[Submap], camera: Camera, sessions: int = 1) -> None:
-    """Write all of the worlds, dead points included, and their camera, whole or not at all; same worlds, same bytes.
+def write_atlas(path: str | Path, submaps: Iterable[Submap], camera: Camera, sessions: int = 1) -> None:
+    """Write submaps and their camera atomically; equal submaps give equal bytes.
 
-    sessions: frames of sessions from this number on were only localised, and are left out
+    Args:
+        path: The file to write.
+        submaps: All submaps, removed points included.
+        camera: The camera of all submaps.
+        sessions: Number of sessions to keep; frames of later sessions, which were only localized, are left out.
     """
-    write_tensors(path, *pack(worlds, camera, sessions))
+    write_tensors(path, *pack(submaps, camera, sessions))
 
 
 def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> Saved:
-    """What `write_atlas` wrote.
+    """Read and check a file that `write_atlas` wrote.
 
-    Raises ResultsError for a missing or damaged file, one of another program or format, and one whose tables do not
-    fit their schema or each other; the message names the file and what is wrong.
+    Raises:
+        ResultsError: The file is missing or damaged, belongs to another program or format, or has tables that do not
+            fit their schema or each other.
     """
     tensors, about = read_tensors(path)
     return unpack(path, tensors, about, device)
 
 
 def read_map(path: str | Path) -> tuple[Map, Camera]:
-    """The map of the world in which most frames are posed, empty where there is none, and the camera.
+    """Read the main submap's map, empty if there is no submap, and the camera.
 
-    Raises ResultsError as `read_atlas` does.
+    Raises:
+        ResultsError: As `read_atlas`.
     """
     saved = read_atlas(path)
-    main = saved.worlds.main()
+    main = saved.atlas.main()
     return Map() if main is None else main.map, saved.camera
 
 
 def pack(
-    worlds: Iterable[Submap], camera: Camera, sessions: int, begun: int | None = None
+    submaps: Iterable[Submap], camera: Camera, sessions: int, num_created: int | None = None
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and description of worlds; `begun`: how many ever began, by default up to the last that is left."""
+    """Convert submaps to tensors and a JSON description.
+
+    Args:
+        submaps: All submaps.
+        camera: The camera of all submaps.
+        sessions: Number of sessions to keep.
+        num_created: Number of submaps ever created; by default the highest number in use plus one.
+    """
     tensors, numbers = {CAMERA: camera.params}, []
-    for world in worlds:
-        numbers.append(world.number)
-        for name, table in _tables(world).items():
-            columns = _kept(name, table.columns(), world, sessions)
-            tensors |= {f"worlds.{world.number}.{name}.{column}": rows for column, rows in columns.items()}
+    for submap in submaps:
+        numbers.append(submap.number)
+        for name, table in _tables(submap).items():
+            columns = _kept(name, table.columns(), submap, sessions)
+            tensors |= {f"submaps.{submap.number}.{name}.{column}": rows for column, rows in columns.items()}
     about = {
         "format": FORMAT,
         "camera": {"model": camera.model, "size": list(camera.size)},
-        "worlds": numbers,
-        "begun": max(numbers, default=-1) + 1 if begun is None else begun,
+        "submaps": numbers,
+        "num_created": max(numbers, default=-1) + 1 if num_created is None else num_created,
         "sessions": sessions,
     }
     return tensors, about
@@ -102,33 +128,37 @@ def pack(
 def unpack(
     path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any], device: torch.device | str = "cpu"
 ) -> Saved:
-    """Worlds of tensors and a description that `pack` made. Raises ResultsError where they are something else."""
+    """Check and convert the tensors and the description that `pack` made.
+
+    Raises:
+        ResultsError: They are not a valid map; `path` is the file that the message names.
+    """
     try:
-        numbers, begun, sessions = _numbers(about)
-        camera = check_camera(about["camera"], tensors.get(CAMERA))
-        expected = {f"worlds.{number}." for number in numbers}
-        foreign = [
+        numbers, num_created, sessions = _numbers(about)
+        camera = _check_camera(about["camera"], tensors.get(CAMERA))
+        expected = {f"submaps.{number}." for number in numbers}
+        unknown = [
             name
             for name in tensors
             if name != CAMERA and not any(name.startswith(start) for start in expected)
         ]
-        if foreign:
-            raise ValueError(f"foreign tensors: {', '.join(sorted(foreign)[:3])}")
-        worlds = []
+        if unknown:
+            raise ValueError(f"unknown tensors: {', '.join(sorted(unknown)[:3])}")
+        submaps = []
         for number in numbers:
-            start = f"worlds.{number}."
+            start = f"submaps.{number}."
             own = {name[len(start) :]: rows for name, rows in tensors.items() if name.startswith(start)}
-            worlds.append(_world(number, own, camera, sessions, device))
-        check_keys([world.map for world in worlds])
+            submaps.append(_submap(number, own, camera, sessions, device))
+        _check_keys([submap.map for submap in submaps])
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
-    return Saved(Atlas.of(worlds, begun, like), camera.with_params(like), sessions)
+    return Saved(Atlas(like, submaps, num_created), camera.with_params(like), sessions)
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
-    """One file of tensors and their description, whole or not at all; same content, same bytes."""
+    """Write tensors and their description as one file, atomically; equal content gives equal bytes."""
     from safetensors.torch import save
 
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -137,7 +167,11 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], about: dict[str,
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `write_tensors` wrote, of this format. Raises ResultsError that names the file."""
+    """Read a file that `write_tensors` wrote.
+
+    Raises:
+        ResultsError: It is not readable, or not a map of this format.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -165,19 +199,23 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, about
 
 
-def _tables(world: Submap) -> dict[str, Table]:
-    """All tables of a world by their names in a file."""
-    slam_map, history = world.map, world.history
+def _tables(submap: Submap) -> dict[str, Table]:
+    """Return the tables of a submap by their names in the file."""
+    slam_map, posed_frames = submap.map, submap.posed_frames
     return dict(
-        zip(TABLES, (slam_map.points, slam_map.keyframes, history.frames, history.observations), strict=True)
+        zip(
+            TABLES,
+            (slam_map.points, slam_map.keyframes, posed_frames.frames, posed_frames.observations),
+            strict=True,
+        )
     )
 
 
-def _kept(name: str, columns: dict[str, Tensor], world: Submap, sessions: int) -> dict[str, Tensor]:
-    """The columns without the frames of sessions that are not kept; those come last."""
+def _kept(name: str, columns: dict[str, Tensor], submap: Submap, sessions: int) -> dict[str, Tensor]:
+    """Drop the frames of sessions that are not kept from the columns of a table."""
     if name not in ("frames", "observations") or not columns:
         return columns
-    kept = world.history.frames["session"] < sessions
+    kept = submap.posed_frames.frames["session"] < sessions
     if bool(kept.all()):
         return columns
     if not bool(kept.any()):
@@ -187,31 +225,149 @@ def _kept(name: str, columns: dict[str, Tensor], world: Submap, sessions: int) -
 
 
 def _numbers(about: dict[str, Any]) -> tuple[list[int], int, int]:
-    """The numbers of the worlds, how many ever began, and how many sessions there were."""
-    numbers, begun, sessions = about["worlds"], about["begun"], about["sessions"]
-    whole = [*numbers, begun, sessions]
-    if not all(type(number) is int and 0 <= number < MOST for number in whole):
+    """Return the checked numbers of the submaps, the number ever created and the number of sessions."""
+    numbers, num_created, sessions = about["submaps"], about["num_created"], about["sessions"]
+    whole = [*numbers, num_created, sessions]
+    if not all(type(number) is int and 0 <= number < MAX_NUMBER for number in whole):
         raise ValueError(
-            f"worlds {numbers}, begun {begun}, sessions {sessions}: must be numbers from 0 to {MOST}"
+            f"submaps {numbers}, num_created {num_created}, sessions {sessions}: must be numbers from 0 to {MAX_NUMBER}"
         )
-    if len(set(numbers)) != len(numbers) or max(numbers, default=-1) >= begun:
-        raise ValueError(f"worlds {numbers} of {begun} that began: numbers must differ and lie below")
-    return numbers, begun, sessions
+    if len(set(numbers)) != len(numbers) or max(numbers, default=-1) >= num_created:
+        raise ValueError(f"submaps {numbers}: numbers must differ and lie below num_created = {num_created}")
+    return numbers, num_created, sessions
 
 
-def _world(
+def _submap(
     number: int, tensors: dict[str, Tensor], camera: Camera, sessions: int, device: torch.device | str
 ) -> Submap:
-    """One world of its columns `points.positions_w`, ..., which are checked."""
-    world = Submap.empty(number, camera.params.to(device))
+    """Check the columns `points.positions_w`, ... and build a submap of them."""
+    submap = Submap.empty(number, camera.params.to(device))
     columns: dict[str, dict[str, Tensor]] = {name: {} for name in TABLES}
     for name, rows in tensors.items():
         owner, _, column = name.partition(".")
         if owner not in columns:
-            raise ValueError(f"world {number} has a foreign tensor {name}")
+            raise ValueError(f"submap {number} has an unknown tensor {name}")
         columns[owner][column] = rows
-    check_world(number, columns, TABLES, camera.params.dtype, sessions)
-    for name, table in _tables(world).items():
+    _check_submap(number, columns, TABLES, camera.params.dtype, sessions)
+    for name, table in _tables(submap).items():
         if columns[name]:
             table.append(**{column: rows.to(device) for column, rows in columns[name].items()})
-    return world
+    return submap
+
+
+def _check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
+    """Build the camera from its description and parameters."""
+    if params is None:
+        raise ValueError("the camera's parameters are missing")
+    width, height = about["size"]
+    if not all(isinstance(side, int) and side > 0 for side in (width, height)):
+        raise ValueError(f"an image of {width} x {height} pixels")
+    if params.ndim != 1 or not params.is_floating_point() or not bool(torch.isfinite(params).all()):
+        raise ValueError("the camera's parameters are not a row of finite numbers")
+    return Camera(about["model"], params, (width, height))
+
+
+def _check_submap(
+    number: int, columns: Columns, tables: dict[str, Schema], dtype: torch.dtype, sessions: int
+) -> None:
+    """Check columns against the schema, their sizes and types against each other, and their row references."""
+    sizes: dict[str, int] = {}
+    descriptors: set[torch.dtype] = set()
+    for name, schema in tables.items():
+        try:
+            _check_table(columns[name], schema, dtype, sizes, descriptors)
+        except ValueError as error:
+            raise ValueError(f"submap {number}, {name}: {error}") from None
+    try:
+        _check_rows(columns, sessions)
+    except ValueError as error:
+        raise ValueError(f"submap {number}: {error}") from None
+
+
+def _check_keys(maps: list[Map]) -> None:
+    """Check that no two keyframes of all maps have the same key."""
+    keys = [slam_map.keys for slam_map in maps if slam_map.num_keyframes]
+    if keys and len(torch.unique(torch.cat(keys))) != sum(map(len, keys)):
+        raise ValueError("two keyframes have the same session and frame index")
+
+
+def _check_table(
+    columns: dict[str, Tensor],
+    schema: Schema,
+    dtype: torch.dtype,
+    sizes: dict[str, int],
+    descriptors: set[torch.dtype],
+) -> None:
+    """Check one table against its schema; `sizes` and `descriptors` collect what all tables must agree on."""
+    if not columns:
+        return
+    missing, unknown = sorted(schema.keys() - columns.keys()), sorted(columns.keys() - schema.keys())
+    if missing or unknown:
+        raise ValueError(
+            "; ".join(
+                f"{what} {', '.join(names)}"
+                for what, names in (("missing", missing), ("unknown", unknown))
+                if names
+            )
+        )
+    lengths = {len(rows) for rows in columns.values() if rows.ndim}
+    for name, rows in columns.items():
+        column = schema[name]
+        wrong = column.mismatch(rows)
+        if wrong:
+            raise ValueError(f"{name}: {wrong}")
+        if len(lengths) > 1:
+            raise ValueError(f"the columns have {min(lengths)} to {max(lengths)} rows")
+        for wanted, size in zip(column.shape, rows.shape[1:], strict=True):
+            if isinstance(wanted, str) and sizes.setdefault(wanted, size) != size:
+                raise ValueError(f"{name}: {wanted} is {size}, elsewhere {sizes[wanted]}")
+        if column.kind == "float" and rows.dtype != (torch.float64 if name == "timestamp" else dtype):
+            raise ValueError(f"{name}: {rows.dtype} but the camera is {dtype}")
+        if column.kind == "descriptor":
+            descriptors.add(rows.dtype)
+        if name in _FINITE and not bool(torch.isfinite(rows).all()):
+            raise ValueError(f"{name}: not finite")
+    if len(descriptors) > 1:
+        raise ValueError("descriptors of several types")
+
+
+def _check_rows(columns: Columns, sessions: int) -> None:
+    """Check that every reference to a row is in range."""
+    points, keyframes, frames, seen = (
+        columns[name] for name in ("points", "keyframes", "frames", "observations")
+    )
+    num_points, num_keyframes, num_frames = (
+        len(next(iter(table.values()), ())) for table in (points, keyframes, frames)
+    )
+    ranges = (
+        (points, "first_keyframe", 0, num_keyframes),
+        (points, "replaced_by", -1, num_points),
+        (keyframes, "point_ids", -1, num_points),
+        (keyframes, "session", 0, sessions),
+        (keyframes, "frame_index", 0, None),
+        (frames, "session", 0, sessions),
+        (frames, "frame_index", 0, None),
+        (frames, "reference_keyframe", 0, num_keyframes),
+        (seen, "frame_row", 0, num_frames),
+        (seen, "point_ids", 0, num_points),
+        (seen, "keypoint_index", 0, None),
+    )
+    for table, name, low, end in ranges:
+        rows = table.get(name)
+        if rows is None or rows.numel() == 0:
+            continue
+        least, top_rows = int(rows.min()), int(rows.max())
+        if least < low or (end is not None and top_rows >= end):
+            limit = "" if end is None else f" to {end - 1}"
+            raise ValueError(f"{name} from {least} to {top_rows}, there are {low}{limit}")
+    if points:
+        _check_replacements(points["replaced_by"])
+
+
+def _check_replacements(replaced_by: Tensor) -> None:
+    """Check that `replaced_by` has no cycle."""
+    replacement = torch.cat([replaced_by, replaced_by.new_tensor([-1])])  # NO_POINT reads the last entry
+    for _ in range(len(replaced_by).bit_length()):  # each round doubles the steps
+        replacement = replacement[replacement]
+    if bool((replacement >= 0).any()):
+        raise ValueError("replaced_by has a cycle")

@@ -1,8 +1,7 @@
-"""From a point to its observations: the table of keyframes read the other way round.
+"""Inverted index from points to observations.
 
-What a keyframe sees is a row of the map's table; who sees a point would be a scan of all of it. This index holds for
-every point the places of that table where it stands, so that a question about some points costs what these points
-cost, however large the map is. It is derived from the table: never saved, made anew where it is missing.
+The table of keyframes lists the points of each keyframe; this index lists for each point the slots of that table which
+observe it, so that a query costs O(observations of the queried points). It is derived from the table and never saved.
 """
 
 from __future__ import annotations
@@ -10,45 +9,45 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-NOWHERE = -1
+NO_SLOT = -1
 _LEAST_ROWS, _LEAST_WIDTH = 64, 4
 
 
 class ObservationIndex:
-    """For every point the places (keyframe row * N + keypoint) that see it, in rows that are filled from the left.
+    """For every point the slots (keyframe row * N + keypoint) that observe it, in rows filled from the left.
 
-    A point takes a row when it is seen first and gives it back when nobody sees it: memory goes with the points that
-    are seen, not with all that ever were. As that of the table, it is made outside of inference mode.
+    Only observed points have a row, so memory grows with them and not with all points ever made. Memory is allocated
+    outside of inference mode, like that of the table.
     """
 
     @torch.inference_mode(False)
     def __init__(self, table: Tensor) -> None:
-        """The index of a table (K, N) of point rows, negative where a keypoint sees nothing."""
+        """Index a table (K, N) of point rows, negative where a keypoint observes nothing."""
         # Half the memory of int64: enough for two million keyframes of a thousand keypoints.
         like = torch.empty(0, dtype=torch.int32, device=table.device)
-        self._places = like.new_full((_LEAST_ROWS, _LEAST_WIDTH), NOWHERE)
+        self._slots = like.new_full((_LEAST_ROWS, _LEAST_WIDTH), NO_SLOT)
         self._row_of = like.new_zeros(_LEAST_ROWS)  # by point; row 0 is that of all points that nobody sees
         self._free = torch.arange(_LEAST_ROWS, device=table.device).flip(
             0
         )  # rows without a point: a stack, and
         self._num_free = _LEAST_ROWS - 1  # how high it is
         flat = table.flatten()
-        places = torch.nonzero(flat >= 0)[:, 0]
-        self.add(flat[places], places)
+        slots = torch.nonzero(flat >= 0)[:, 0]
+        self.add(flat[slots], slots)
 
     def of(self, point_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """(o,), (o,) for every observation of points (n,) its index in 0 ... n - 1 and its place."""
-        places = self.padded(point_ids)
-        which, column = torch.nonzero(places >= 0, as_tuple=True)
-        return which, places[which, column].long()
+        """Return for every observation of points (n,) the index of its point, 0 ... n - 1, and its slot: (o,), (o,)."""
+        slots = self.padded_slots(point_ids)
+        which, column = torch.nonzero(slots >= 0, as_tuple=True)
+        return which, slots[which, column].long()
 
-    def padded(self, point_ids: Tensor) -> Tensor:
-        """(n, w) the places that see points (n,), in rows filled from the left, then NOWHERE."""
-        return self._places[self._rows(point_ids)]
+    def padded_slots(self, point_ids: Tensor) -> Tensor:
+        """Return the slots (n, w) that observe points (n,), padded with NO_SLOT."""
+        return self._slots[self._rows(point_ids)]
 
     @torch.inference_mode(False)
-    def add(self, point_ids: Tensor, places: Tensor) -> None:
-        """Note that points (n,) are seen at places (n,); a point may stand there several times."""
+    def add(self, point_ids: Tensor, slots: Tensor) -> None:
+        """Add observations of points (n,) at slots (n,); points may repeat."""
         if len(point_ids) == 0:
             return
         order = torch.sort(point_ids, stable=True)
@@ -56,45 +55,45 @@ class ObservationIndex:
         self._take_rows(ids)
         first = counts.cumsum(0) - counts
         ranks = torch.arange(len(point_ids), device=ids.device) - first.repeat_interleave(counts)
-        filled = (self.padded(ids) >= 0).sum(1)
+        filled = (self.padded_slots(ids) >= 0).sum(1)
         columns = filled.repeat_interleave(counts) + ranks
         self._widen(int(columns.max()) + 1)
-        self._places[self._rows(order.values), columns] = places[order.indices].to(self._places.dtype)
+        self._slots[self._rows(order.values), columns] = slots[order.indices].to(self._slots.dtype)
 
-    def remove(self, point_ids: Tensor, places: Tensor) -> None:
-        """Note that points (n,) are no longer seen at places (n,)."""
+    def remove(self, point_ids: Tensor, slots: Tensor) -> None:
+        """Remove observations of points (n,) at slots (n,)."""
         if len(point_ids) == 0:
             return
         rows = self._rows(torch.unique(point_ids))
-        held = self._places[rows]
-        gone = torch.isin(held, places.to(held.dtype))
-        self._places[rows] = torch.sort(held.masked_fill(gone, NOWHERE), dim=1, descending=True).values
+        held = self._slots[rows]
+        gone = torch.isin(held, slots.to(held.dtype))
+        self._slots[rows] = torch.sort(held.masked_fill(gone, NO_SLOT), dim=1, descending=True).values
 
     def clear(self, point_ids: Tensor) -> None:
-        """Note that nobody sees points (n,) any longer."""
+        """Remove all observations of points (n,)."""
         rows = torch.unique(self._rows(point_ids))
         rows = rows[rows > 0]
-        self._places[rows] = NOWHERE
+        self._slots[rows] = NO_SLOT
         self._row_of[point_ids] = 0
         self._free[self._num_free : self._num_free + len(rows)] = rows
         self._num_free += len(rows)
 
     def _rows(self, point_ids: Tensor) -> Tensor:
-        """(n,) where the places of points (n,) are."""
+        """Return the rows (n,) of points (n,)."""
         if len(point_ids) and int(point_ids.max()) >= len(self._row_of):
             self._reach(int(point_ids.max()))
         return self._row_of[point_ids].long()
 
     @torch.inference_mode(False)
     def _reach(self, point: int) -> None:
-        """Know at least all points up to this one."""
+        """Grow to hold at least all points up to this one."""
         more = self._row_of.new_zeros(max(len(self._row_of), point + 1))
         self._row_of = torch.cat([self._row_of, more])
 
     def _take_rows(self, point_ids: Tensor) -> None:
-        """Have a row of its own for every one of distinct points (n,)."""
+        """Assign a row to each of distinct points (n,) that has none."""
         new = point_ids[self._rows(point_ids) == 0]
-        rows, width = self._places.shape
+        rows, width = self._slots.shape
         if len(new) > self._num_free:
             more = max(rows, len(new))
             self._resize(rows + more, width)
@@ -106,24 +105,24 @@ class ObservationIndex:
         self._num_free = left
 
     def _widen(self, width: int) -> None:
-        """Have room for this many observations of a point."""
-        if width > self._places.shape[1]:
-            self._resize(len(self._places), max(width, 2 * self._places.shape[1]))
+        """Grow to hold this many observations of a point."""
+        if width > self._slots.shape[1]:
+            self._resize(len(self._slots), max(width, 2 * self._slots.shape[1]))
 
     def _resize(self, rows: int, width: int) -> None:
-        old = self._places
-        self._places = old.new_full((rows, width), NOWHERE)
-        self._places[: old.shape[0], : old.shape[1]] = old
+        old = self._slots
+        self._slots = old.new_full((rows, width), NO_SLOT)
+        self._slots[: old.shape[0], : old.shape[1]] = old
 
 
-def most(counts: Tensor, limit: int, least: int) -> Tensor:
-    """(<= limit,) indices of the largest counts (K,) that are at least `least`, the largest first."""
+def top_rows(counts: Tensor, limit: int, least: int) -> Tensor:
+    """Return indices (<= limit,) of the largest counts (K,) that are at least `least`, in descending order."""
     enough = torch.nonzero(counts >= least)[:, 0]
     return enough[torch.sort(counts[enough], descending=True, stable=True).indices[:limit]]
 
 
 def first_of_each(values: Tensor) -> Tensor:
-    """(n,) bool, whether a value (n,) stands for the first time."""
+    """Return (n,) bool: whether a value (n,) occurs for the first time."""
     order = torch.sort(values, stable=True)
     is_first = torch.ones_like(values, dtype=torch.bool)
     is_first[order.indices[1:]] = order.values[1:] != order.values[:-1]

@@ -1,4 +1,4 @@
-"""What a run remembers of every posed frame: where it was, and which points it saw at which pixels."""
+"""Posed frames of a submap: poses relative to keyframes, observations of map points, and the graph of a run."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, fits, se3_inverse, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate, se3_inverse, transform
 from torchslam.map.map import Map, key_of
-from torchslam.map.schema import FRAMES, OBSERVATIONS
-from torchslam.map.table import Table
+from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
-_ASTRAY = 4.0 * CHI_SQUARE_95  # twice as far off as a fit may be: the final adjustment moves frames by less
-_MOST = 0.75  # of what a frame saw, which must agree before the rest is forgotten
-_AT_ONCE = 1 << 16  # observations: a pose for each takes memory
+_OUTLIER_CHI_SQUARE = (
+    4.0 * CHI_SQUARE_95
+)  # twice the distance of the gate: the final adjustment moves frames by less
+_MIN_INLIER_RATIO = 0.75  # of a frame's observations, to remove the others
+_CHUNK = 1 << 16  # observations that are checked at once, to bound memory
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunGraph(ObservationGraph):
-    """The graph of a run, which knows where its rows come from.
+    """The observation graph of a submap, with the origin of its rows.
 
     frame_ids:      (F,) frames of the sequence of their session
     sessions:       (F,) which run over the map saw them
@@ -44,15 +45,15 @@ class RunGraph(ObservationGraph):
 
 
 class PosedFrames:
-    """Poses relative to a keyframe, so that they follow when the map is adjusted; observations as flat rows."""
+    """All posed frames: poses relative to a keyframe, so that they follow the map; observations as flat rows."""
 
     def __init__(self) -> None:
         self.frames = Table(FRAMES)
         self.observations = Table(OBSERVATIONS)
 
-    def add(self, view: FrameFeatures, tracked: PoseEstimate, T_cr: Tensor, reference: int) -> None:
-        """Remember a posed frame: its pose T_cr (4, 4) relative to keyframe `reference`, and what it saw."""
-        device, view = T_cr.device, view.weighed(tracked.keypoints, tracked.weights)
+    def add(self, view: FrameFeatures, estimate: PoseEstimate, T_cr: Tensor, reference: int) -> None:
+        """Add a frame with pose T_cr (4, 4) relative to keyframe `reference` and its inlier observations."""
+        device, view = T_cr.device, view.weighed(estimate.keypoints, estimate.weights)
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
             session=torch.tensor([view.session], device=device),
@@ -61,34 +62,34 @@ class PosedFrames:
             reference_keyframe=torch.tensor([reference], device=device),
         )
         self.observations.append(
-            frame_row=row.expand(tracked.inliers),
-            point_ids=tracked.point_ids,
-            keypoint_index=tracked.keypoints,
-            pixels=view.keypoints[tracked.keypoints],
-            scales=view.scales[tracked.keypoints],
-            information=view.information[tracked.keypoints],
+            frame_row=row.expand(estimate.inliers),
+            point_ids=estimate.point_ids,
+            keypoint_index=estimate.keypoints,
+            pixels=view.keypoints[estimate.keypoints],
+            scales=view.scales[estimate.keypoints],
+            information=view.information[estimate.keypoints],
         )
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def count(self, session: int | None = None) -> int:
-        """How many frames were posed, in one session or in all."""
+        """Return the number of posed frames of one session or of all."""
         if session is None or len(self) == 0:
             return len(self)
         return int((self.frames["session"] == session).sum())
 
     @property
     def keys(self) -> Tensor:
-        """(F,) names of the frames, as of keyframes: session and frame in one."""
+        """(F,) keys of the frames: session and frame index, as for keyframes."""
         return key_of(self.frames["session"], self.frames["frame_index"])
 
     def T_cw(self, slam_map: Map) -> Tensor:
-        """(F, 4, 4) poses of the frames in the order they were added, by the map as it is now."""
+        """Return the current poses (F, 4, 4) of the frames in the order they were added."""
         return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference_keyframe"]]
 
     def trajectory(self, slam_map: Map, session: int | None = None) -> Trajectory:
-        """Camera to world, ordered by time; the frames of one session, or of all."""
+        """Return the poses, camera to world, ordered by time, of one session or of all."""
         if len(self) == 0:
             return Trajectory.empty()
         T_cw, timestamps = self.T_cw(slam_map), self.frames["timestamp"]
@@ -99,12 +100,12 @@ class PosedFrames:
         return Trajectory(timestamps[order].clone(), se3_inverse(T_cw[order]))
 
     def rescale(self, factors: Tensor) -> None:
-        """The unit of length around each keyframe changes by factors (K,): what refers to it follows."""
+        """Scale the poses relative to each keyframe by factors (K,)."""
         if len(self):
             self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference_keyframe"]][:, None]
 
     def append(self, other: PosedFrames, keyframes: int, points: int) -> None:
-        """Add the frames of another history whose keyframe and point rows moved by these numbers."""
+        """Append the frames of another submap, whose keyframe and point rows are shifted by these offsets."""
         if len(other) == 0:
             return
         frames, seen = other.frames.columns(), other.observations.columns()
@@ -114,17 +115,17 @@ class PosedFrames:
         self.frames.append(**frames)
         self.observations.append(**seen)
 
-    def refer(self, heirs: Tensor, slam_map: Map) -> None:
-        """Let frames that refer to keyframe i refer to heirs (K,)[i] from now on, without moving them."""
+    def reassign_reference(self, replacement: Tensor, slam_map: Map) -> None:
+        """Change the reference of frames from keyframe i to replacement[i] (K,), without moving them."""
         old = self.frames["reference_keyframe"]
-        moves = torch.nonzero(heirs[old] != old)[:, 0]
-        new = heirs[old[moves]]
+        moves = torch.nonzero(replacement[old] != old)[:, 0]
+        new = replacement[old[moves]]
         T_rr = slam_map.T_cw[old[moves]] @ se3_inverse(slam_map.T_cw[new])
         self.frames["T_cr"][moves] = self.frames["T_cr"][moves] @ T_rr
         old[moves] = new
 
-    def take_over(self, slam_map: Map, keyframes: Tensor) -> None:
-        """Keep what the map knows of keyframes (k,): their frames see from now on what the keyframes see.
+    def absorb_keyframes(self, slam_map: Map, keyframes: Tensor) -> None:
+        """Replace pose and observations of the frames of keyframes (k,) by those of the keyframes.
 
         A keyframe without a frame gets one.
         """
@@ -147,7 +148,7 @@ class PosedFrames:
         )
 
     def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
-        """Put fresh observations in the place of stale rows (n,), ascending: nothing is copied as long as they fit."""
+        """Overwrite stale rows (n,), ascending, with fresh observations, and copy the table only if they do not fit."""
         count = min(len(stale), len(fresh["frame_row"]))
         for name, values in fresh.items():
             self.observations[name][stale[:count]] = values[:count]
@@ -157,7 +158,7 @@ class PosedFrames:
         self.observations.append(**{name: values[count:] for name, values in fresh.items()})
 
     def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
-        """(1,) the row of the frame that a keyframe was made of, added where it is missing."""
+        """Return the row (1,) of the frame that a keyframe was made of; add it if it is missing."""
         own = {
             name: slam_map.keyframes[name][keyframe][None] for name in ("frame_index", "session", "timestamp")
         }
@@ -169,52 +170,51 @@ class PosedFrames:
         return self.frames.append(T_cr=eye, reference_keyframe=slam_map.ids(keyframe), **own)
 
     def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
-        """Points got the rows (L,), negative where they are gone: merged ones count as their heirs, dead ones not."""
+        """Renumber points to rows (L,), negative if removed; merged points count as their replacements."""
         if len(self.observations) == 0:
             return
-        renamed = rows[slam_map.resolve(self.observations["point_ids"])]
+        renamed = rows[slam_map.follow_merges(self.observations["point_ids"])]
         self.observations["point_ids"][:] = renamed
         if bool((renamed < 0).any()):
             self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
 
-    def forget_strays(self, slam_map: Map, camera: Camera) -> None:
-        """Forget what frames saw far from where the map has it by now: its point was merged with another, or moved.
+    def remove_outliers(self, slam_map: Map, camera: Camera) -> None:
+        """Remove observations far from the current reprojection, since their point was merged or has moved.
 
-        One such observation would pull a frame off its place that few points hold. Where many of a frame's do not
-        agree, they stay: it may be the frame that is off its place.
+        A frame with many of them keeps its observations, since its pose may be wrong.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
         every = torch.arange(len(seen_by), device=T_cw.device)
-        agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_AT_ONCE)])
+        agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_CHUNK)])
         count = torch.bincount(seen_by, minlength=len(self))
-        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MOST * count
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MIN_INLIER_RATIO * count
         kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])
 
     def _agree(self, rows: Tensor, T_cw: Tensor, slam_map: Map, camera: Camera) -> Tensor:
-        """(n,) whether observations, by row (n,), are not far from where frames at T_cw (F, 4, 4) have their points."""
+        """Return (n,) bool: whether observations (n,) are near their reprojection by frames at T_cw (F, 4, 4)."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
-        points_w = slam_map.positions_w[slam_map.resolve(seen["point_ids"])]
+        points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
         points_c = transform(T_cw[seen["frame_row"]], points_w[:, None])[:, 0]
         noise = KeypointNoise(seen["scales"], seen["information"])
-        return fits(noise.squared_reprojection(points_c, seen["pixels"], camera), _ASTRAY)
+        return passes_gate(noise.squared_reprojection(points_c, seen["pixels"], camera), _OUTLIER_CHI_SQUARE)
 
-    def graph(self, slam_map: Map, camera: Camera, world: int = 0) -> RunGraph:
-        """Everything the run saw, as one least-squares problem: keyframes first, then the frames between them.
+    def graph(self, slam_map: Map, camera: Camera, submap: int = 0) -> RunGraph:
+        """Build the observation graph: keyframes first, then the frames between them.
 
-        Keyframes bring all their observations, the other frames those of points that keyframes see.
+        Keyframes contribute all their observations, other frames those of points that keyframes observe.
         """
         seen = slam_map.observations()
         point_ids = torch.unique(seen.point_index)
         between = torch.nonzero(~torch.isin(self.keys, slam_map.keys))[:, 0]
         slot = torch.full((len(self),), -1, device=point_ids.device)
         slot[between] = slam_map.num_keyframes + torch.arange(len(between), device=point_ids.device)
-        heirs = slam_map.resolve(self.observations["point_ids"])
+        replacement = slam_map.follow_merges(self.observations["point_ids"])
         # A flag per point: `isin` would sort all that was ever seen.
         is_seen = torch.zeros(len(slam_map.points), dtype=torch.bool, device=point_ids.device)
         is_seen[point_ids] = True
-        rows = torch.nonzero((slot[self.observations["frame_row"]] >= 0) & is_seen[heirs])[:, 0]
+        rows = torch.nonzero((slot[self.observations["frame_row"]] >= 0) & is_seen[replacement])[:, 0]
         keyframes = slam_map.keyframes
 
         def with_own(values: Tensor, name: str) -> Tensor:
@@ -226,7 +226,7 @@ class PosedFrames:
             T_cw=torch.cat([slam_map.T_cw, self.T_cw(slam_map)[between]]),
             points_w=slam_map.positions_w[point_ids],
             frame_index=torch.cat([seen.keyframe_index, slot[self.observations["frame_row"][rows]]]),
-            point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, heirs[rows]])),
+            point_index=torch.searchsorted(point_ids, torch.cat([seen.point_index, replacement[rows]])),
             pixels=with_own(seen.pixels, "pixels"),
             weights=KeypointNoise(
                 with_own(seen.scales, "scales"), with_own(seen.information, "information")
@@ -235,20 +235,20 @@ class PosedFrames:
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),
-            world=torch.full((slam_map.num_keyframes + len(between),), world, device=point_ids.device),
+            submap=torch.full((slam_map.num_keyframes + len(between),), submap, device=point_ids.device),
             sessions=torch.cat([keyframes["session"], self.frames["session"][between]]),
             point_ids=point_ids,
             keypoint_index=with_own(seen.keypoint_index, "keypoint_index"),
         )
 
-    def take(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
-        """Move the map and the frames to the solution of their own graph; the map keeps how certain it is."""
+    def apply_solution(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
+        """Move map and frames to the solution of their own graph, and store the covariances in the map."""
         (bundle,) = solution.keyframes
         count = slam_map.num_keyframes
         slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
         slam_map.points["positions_w"][graph.point_ids] = solution.points_w
         keyframes = torch.arange(count, device=graph.point_ids.device)
-        slam_map.take_covariances(keyframes, graph.point_ids, bundle.covariance())
+        slam_map.set_covariances(keyframes, graph.point_ids, bundle.covariance())
         keys = key_of(graph.sessions, graph.frame_ids)
         order = torch.argsort(keys)
         solved = order[torch.searchsorted(keys[order], self.keys)]

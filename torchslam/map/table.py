@@ -1,20 +1,114 @@
-"""Columns of tensors that grow together: the storage of a world."""
+"""Tables of a submap: columns of tensors that grow together, and their schemas, which are also those of the map file.
+
+A letter in a shape is a size that the first row of a table fixes: N keypoints per frame, D numbers per descriptor, I
+numbers of keypoint information (0, 1 or 3). Kinds: "float" is the floating-point type of the geometry, "int" int64,
+"bool" bool, "byte" uint8, "descriptor" bytes or floats.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchslam.map.schema import Schema
+
+@dataclass(frozen=True)
+class Column:
+    """The shape of one row, the kind of its numbers, and a description."""
+
+    shape: tuple[int | str, ...]
+    kind: str
+    about: str
+
+    def mismatch(self, values: Tensor) -> str:
+        """Describe how values violate the column; empty if they fit."""
+        row = tuple(values.shape[1:])
+        fits = len(row) == len(self.shape) and all(
+            isinstance(wanted, str) or wanted == size for wanted, size in zip(self.shape, row, strict=True)
+        )
+        if values.ndim == 0 or not fits:
+            return f"rows must have the shape {self.shape}, not {row}"
+        if not _KINDS[self.kind](values.dtype):
+            return f"must be of kind {self.kind}, not {values.dtype}"
+        return ""
+
+
+_KINDS = {
+    "float": lambda dtype: dtype in (torch.float32, torch.float64),
+    "int": lambda dtype: dtype == torch.int64,
+    "bool": lambda dtype: dtype == torch.bool,
+    "byte": lambda dtype: dtype == torch.uint8,
+    "descriptor": lambda dtype: dtype == torch.uint8 or dtype.is_floating_point,
+}
+
+Schema = dict[str, Column]
+
+POINTS: Schema = {
+    "positions_w": Column((3,), "float", "position in the submap's frame"),
+    "covariances_w": Column((3, 3), "float", "covariance of the position; zero where unknown"),
+    "descriptors": Column(("D",), "descriptor", "descriptor of the newest observation"),
+    "colors": Column((3,), "byte", "red, green, blue in the images; black where unknown"),
+    "view_directions_w": Column(
+        (3,), "float", "unit direction from the newest observing keyframe to the point"
+    ),
+    "scale_distance": Column(
+        (), "float", "keypoint scale times distance in the newest observation: px times map units"
+    ),
+    "angles": Column((), "float", "keypoint orientation of the newest observation, radians"),
+    "last_seen_frame": Column((), "int", "index of the last frame that tracked the point"),
+    "first_keyframe": Column((), "int", "row of the keyframe that created the point"),
+    "from_initialization": Column((), "bool", "created by the two-view initialization"),
+    "times_observed": Column((), "int", "number of keyframes that observe the point"),
+    "times_visible": Column((), "int", "number of frames in which the point should have been visible"),
+    "times_found": Column((), "int", "number of frames in which the point was matched"),
+    "is_valid": Column((), "bool", "false for removed points, whose rows stay until the submap is compacted"),
+    "replaced_by": Column((), "int", "row of the point that this one was merged into, or -1"),
+}
+
+KEYFRAMES: Schema = {
+    "T_cw": Column((4, 4), "float", "pose, world to camera"),
+    "covariances": Column((6, 6), "float", "covariance of the pose's left perturbation; zero where unknown"),
+    "session": Column((), "int", "session that observed the keyframe, from 0"),
+    "frame_index": Column((), "int", "index in the sequence of its session"),
+    "timestamp": Column((), "float", "seconds"),
+    "keypoints": Column(("N", 2), "float", "pixels"),
+    "scales": Column(("N",), "float", "pixels"),
+    "angles": Column(("N",), "float", "radians"),
+    "descriptors": Column(("N", "D"), "descriptor", "descriptors of the keypoints"),
+    "mask": Column(("N",), "bool", "true for valid keypoints"),
+    "information": Column(
+        ("N", "I"),
+        "float",
+        "information of the keypoints, px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy",
+    ),
+    "point_ids": Column(("N",), "int", "row of the point that each keypoint observes, or -1"),
+}
+
+FRAMES: Schema = {
+    "frame_index": Column((), "int", "index in the sequence of its session"),
+    "session": Column((), "int", "session that observed the frame, from 0"),
+    "timestamp": Column((), "float", "seconds"),
+    "T_cr": Column((4, 4), "float", "pose relative to the reference keyframe, in map units"),
+    "reference_keyframe": Column((), "int", "row of the reference keyframe"),
+}
+
+OBSERVATIONS: Schema = {
+    "frame_row": Column((), "int", "row of the frame"),
+    "point_ids": Column((), "int", "row of the point"),
+    "keypoint_index": Column((), "int", "row among the frame's keypoints"),
+    "pixels": Column((2,), "float", "pixels"),
+    "scales": Column((), "float", "pixels"),
+    "information": Column(("I",), "float", "px^-2, as for the keypoints"),
+}
 
 
 class Table:
-    """Named columns with one row per item; capacity doubles when it is used up, so appending costs O(1) a row.
+    """Named columns with one row per item; capacity doubles when it is used up, so appending a row costs O(1).
 
     The schema fixes names, shapes and kinds; the first `append` fixes dtypes, device and the sizes that the schema
-    leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. What is appended
-    is detached: a world holds values, not graphs. Its memory is made outside of inference mode, so that autograd may
-    read it and anybody may write it.
+    leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. Appended tensors
+    are detached. Memory is allocated outside of inference mode, so that autograd can read it.
     """
 
     def __init__(self, schema: Schema) -> None:
@@ -32,14 +126,15 @@ class Table:
         return self._columns[name][: self._size]
 
     def columns(self) -> dict[str, Tensor]:
-        """All columns by name, the rows in use."""
+        """Return all columns by name, rows in use only."""
         return {name: self[name] for name in self._columns}
 
     @torch.inference_mode(False)
     def append(self, **rows: Tensor) -> Tensor:
-        """Add rows, one tensor (n, ...) per column; returns their ids (n,) int64.
+        """Append rows, one tensor (n, ...) per column, and return their ids (n,) int64.
 
-        Raises ValueError for columns that the schema does not have, or that do not fit it or each other.
+        Raises:
+            ValueError: Columns do not fit the schema or each other.
         """
         self._check(rows)
         start, end = self._size, self._size + len(next(iter(rows.values())))
@@ -51,10 +146,7 @@ class Table:
 
     @torch.inference_mode(False)
     def keep(self, rows: Tensor) -> None:
-        """Keep some rows (n,), by index, in this order; the others are gone.
-
-        Their memory is given back where most of it would stay empty; otherwise the next rows go there.
-        """
+        """Keep the rows (n,) in this order and drop the others; memory is freed if most of it would be unused."""
         for name, column in self._columns.items():
             kept = self[name][rows]
             if 2 * len(rows) < len(column):
@@ -63,8 +155,8 @@ class Table:
                 column[: len(rows)] = kept
         self._size = len(rows)
 
-    def cut(self, size: int) -> None:
-        """Forget the rows from `size` on; the next ones go there."""
+    def truncate(self, size: int) -> None:
+        """Drop the rows from `size` on."""
         self._size = min(size, self._size)
 
     def _check(self, rows: dict[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Points that are one: found again in keyframes that see the same place, and merged."""
+"""Landmark fusion: data association of map points with covisible keyframes, and merging of duplicates."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from torchslam.tracking.matcher import max_distance
 RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
 
 
-def fuse(slam_map: Map, keyframe: int, neighbours: Tensor, camera: Camera, config: Config) -> None:
-    """Find the points of this keyframe in its neighbours and theirs in it; merge what turns out to be one point."""
+def fuse(slam_map: Map, keyframe: int, neighbors: Tensor, camera: Camera, config: Config) -> None:
+    """Match the points of a keyframe in its covisible keyframes and theirs in it, and merge duplicates."""
     here = slam_map.ids(keyframe)
     own = slam_map.points_seen_by(here)
-    merge(slam_map, *find_in(slam_map, neighbours, own, camera, config))
-    merge(slam_map, *find_in(slam_map, here, slam_map.points_seen_by(neighbours), camera, config))
+    merge_points(slam_map, *match_in_keyframes(slam_map, neighbors, own, camera, config))
+    merge_points(
+        slam_map, *match_in_keyframes(slam_map, here, slam_map.points_seen_by(neighbors), camera, config)
+    )
 
 
-def find_in(
+def match_in_keyframes(
     slam_map: Map, keyframes: Tensor, point_ids: Tensor, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
-    """Match points (n,) to the keypoints of those keyframes (k,) that do not see them yet.
+    """Match points (n,) by projection into keyframes (k,) that do not observe them yet.
 
-    Free keypoints see them from now on. Returns pairs (m,), (m,) of points that are one: found at a keypoint that
-    sees another point already.
+    Matches with free keypoints become observations. Returns the other matches as pairs (m,), (m,) of duplicate points:
+    the matched point and the one that the keypoint already observes.
     """
     if len(keyframes) == 0 or len(point_ids) == 0:
         return point_ids[:0], point_ids[:0]
@@ -64,24 +66,24 @@ def find_in(
     return ids[~is_free], taken[~is_free]
 
 
-def merge(slam_map: Map, found: Tensor, there: Tensor) -> None:
-    """Merge pairs of points (m,), (m,): of those that are one, the one with most observations stays."""
+def merge_points(slam_map: Map, found: Tensor, there: Tensor) -> None:
+    """Merge pairs of points (m,), (m,); of each group of duplicates the point with most observations stays."""
     pairs = torch.stack([found, there], dim=1)
     counts = slam_map.points["times_observed"][pairs]
     observed = dict(zip(pairs.flatten().tolist(), counts.flatten().tolist(), strict=True))
-    heir: dict[int, int] = {}
+    replacement: dict[int, int] = {}
 
-    def last_heir(point: int) -> int:
-        while point in heir:
-            point = heir[point]
+    def follow_merges(point: int) -> int:
+        while point in replacement:
+            point = replacement[point]
         return point
 
     often = zip(found.tolist(), there.tolist(), strict=True)  # a pair may be found in several keyframes
     for pair in dict.fromkeys(often):
-        one, other = (last_heir(point) for point in pair)
+        one, other = (follow_merges(point) for point in pair)
         if one != other:
             old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
-            heir[old] = kept
-    if heir:
-        last = [last_heir(point) for point in heir.values()]
-        slam_map.replace(found.new_tensor(list(heir)), found.new_tensor(last))
+            replacement[old] = kept
+    if replacement:
+        last = [follow_merges(point) for point in replacement.values()]
+        slam_map.replace(found.new_tensor(list(replacement)), found.new_tensor(last))

@@ -1,28 +1,38 @@
-"""What happens when a frame becomes a keyframe: observe, cull, triangulate, fuse, adjust."""
+"""Local mapping: when a frame becomes a keyframe, and what a keyframe does to the map.
+
+A new keyframe observes, culls recent points, triangulates new ones, fuses duplicates and requests a local bundle
+adjustment. `MapInitializer` builds the first map of a submap from two views.
+"""
 
 from __future__ import annotations
 
 import torch
 
-from torchslam.config import Config
+from torchslam.config import Config, KeyframesConfig
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_covariance
+from torchslam.geometry.transforms import pose_distance
+from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap, compact
 from torchslam.map.map import Map
-from torchslam.map.submap import Submap
-from torchslam.mapping.async_bundle import AsyncBundleAdjustment
 from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
+from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.new_points import triangulate_against
 from torchslam.tracking.matcher import Matcher
-from torchslam.types import FrameFeatures, PoseEstimate, TwoViewMap
+from torchslam.tracking.tracker import Tracker
+from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
-YOUNG = 3  # keyframes after its own for which a point is on trial
+YOUNG = 3  # keyframes after its own for which a point may be culled
+ENOUGH_OVERLAP = 0.4
+"""Overlap above which keyframes wait for as many frames as a live camera is ahead, since late frames are dropped.
+
+Half of the default `min_overlap`, so that tracking stays safe."""
 
 
 class Mapper:
-    """Grows the map, keyframe by keyframe."""
+    """Inserts keyframes into a map."""
 
     def __init__(
         self,
@@ -32,25 +42,25 @@ class Mapper:
         matcher: Matcher | None = None,
         undistortion: Undistortion | None = None,
     ) -> None:
-        """undistortion: of this camera, where somebody has one already"""
+        """Create a mapper; `undistortion` is that of the camera if there is one already."""
         self.camera = camera
         self.config = config
         self.clock = clock
-        self.adjusting = AsyncBundleAdjustment(
+        self.adjustment = AsyncBundleAdjustment(
             camera, config.bundle_adjustment, config.measurement.gate == "mahalanobis"
         )
         self.matcher = matcher
         self.undistortion = undistortion or Undistortion(camera)
 
     def start(self, slam_map: Map, start: TwoViewMap) -> tuple[int, int]:
-        """Make the first map of two views, at the configured scale; returns the two keyframes."""
-        factor = world_scale(start, self.config.scale)
+        """Create the first map of two views at the configured scale; return the rows of the two keyframes."""
+        factor = initial_scale(start, self.config.scale)
         T_cw = start.T_cw.clone()
         T_cw[:3, 3] *= factor
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         points_w, camera = start.points_w * factor, self.camera
-        spread_1 = start.reference.noise[start.keypoints_1].spread
-        spread_2 = start.view.noise[start.keypoints_2].spread
+        spread_1 = start.reference.noise[start.keypoints_1].sigma_or_covariance
+        spread_2 = start.view.noise[start.keypoints_2].sigma_or_covariance
         covariances_w = triangulation_covariance(T_1w, T_cw, points_w, spread_1, spread_2, camera, camera)
         first = slam_map.add_keyframe(start.reference, T_1w)
         second = slam_map.add_keyframe(start.view, T_cw)
@@ -62,22 +72,30 @@ class Mapper:
         return first, second
 
     def insert(
-        self, slam_map: Map, view: FrameFeatures, tracked: PoseEstimate, delay: int | None = None
+        self, slam_map: Map, view: FrameFeatures, estimate: PoseEstimate, apply_at: ApplyAt = ApplyAt.NOW
     ) -> int:
-        """Make a tracked frame a keyframe; returns its index.
+        """Insert a tracked frame as a keyframe: observe, cull points, triangulate, fuse, request local adjustment.
 
-        delay: frames that are tracked before the adjustment around it is taken over, which has to be before the map
-               changes; None: it is at once
+        Args:
+            slam_map: The map.
+            view: The frame.
+            estimate: Its pose and inlier matches.
+            apply_at: When the local bundle adjustment is applied; until then the map must not change.
+
+        Returns:
+            The row of the keyframe.
         """
         settings = self.config.mapping
         with self.clock("mapping"):
-            keyframe = slam_map.add_keyframe(view.weighed(tracked.keypoints, tracked.weights), tracked.T_cw)
-            slam_map.observe(keyframe, tracked.keypoints, tracked.point_ids)
+            keyframe = slam_map.add_keyframe(
+                view.weighed(estimate.keypoints, estimate.weights), estimate.T_cw
+            )
+            slam_map.observe(keyframe, estimate.keypoints, estimate.point_ids)
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
-            neighbours = slam_map.covisible(keyframe, 2 * settings.num_partners)
+            neighbors = slam_map.covisible(keyframe, 2 * settings.num_partners)
             last = range(keyframe - 1, max(keyframe - 1 - settings.num_partners, -1), -1)
-            partners = neighbours if settings.triangulation_partners == "covisible" else slam_map.ids(*last)
+            partners = neighbors if settings.triangulation_partners == "covisible" else slam_map.ids(*last)
             partners = partners[: settings.num_partners]
             normalize = self.undistortion.normalize
             triangulate_against(
@@ -85,51 +103,58 @@ class Mapper:
             )
             slam_map.refresh(slam_map.ids(keyframe))
             if settings.fuse:
-                fuse(slam_map, keyframe, neighbours, self.camera, self.config)
+                fuse(slam_map, keyframe, neighbors, self.camera, self.config)
         if self.config.bundle_adjustment.local:
+            is_delayed = apply_at is ApplyAt.AFTER_DELAY
             with self.clock("bundle"):
-                self.adjusting.ask(slam_map, keyframe, view.index + delay if delay else None)
-                if not delay:
-                    self.adjusting.begin()
-            if delay is None:
-                self.take_over(slam_map)
+                due = view.index + self.config.bundle_adjustment.delay_frames if is_delayed else None
+                self.adjustment.request(slam_map, keyframe, due)
+                if not is_delayed:
+                    self.adjustment.start()
+            if apply_at is ApplyAt.NOW:
+                self.apply_adjustment(slam_map)
         return keyframe
 
-    def take_over(self, slam_map: Map) -> None:
-        """Put the map to where the adjustment that was asked for has it."""
+    def apply_adjustment(self, slam_map: Map) -> None:
+        """Wait for the pending local bundle adjustment and apply it to the map."""
         with self.clock("bundle"):
-            self.adjusting.take_over(slam_map)
+            self.adjustment.apply(slam_map)
 
-    def tidy(self, world: Submap) -> RowRemap | None:
-        """Take out what the world can do without: redundant keyframes, rows of dead points; returns where rows went.
+    def cull_and_compact(self, submap: Submap) -> RowRemap | None:
+        """Remove redundant keyframes and the rows of invalid points; return where rows went, or None if all stay.
 
-        To be called when a keyframe was inserted and nobody holds rows of the map: after the frame went into the
-        history. None if all rows stay.
+        Renumbers rows, see `Map.version`.
         """
         with self.clock("mapping"):
-            culled = cull_keyframes(world, self.config.keyframes) if self.config.mapping.cull else None
-            compacted = compact(world)
+            culled = cull_keyframes(submap, self.config.keyframes) if self.config.mapping.cull else None
+            compacted = compact(submap)
         if culled is None or compacted is None:
             return culled or compacted
         return culled.then(compacted)
 
     def cull_recent_points(self, slam_map: Map, keyframe: int) -> None:
-        """Kill young points that are rarely found where they should be visible, or that nobody else has seen."""
+        """Remove recent points that are rarely found where visible, or that too few keyframes observe."""
         points = slam_map.points
-        young = torch.nonzero(points["first_keyframe"] >= keyframe - YOUNG)[:, 0]
-        young = young[points["is_valid"][young]]
-        age = keyframe - points["first_keyframe"][young]
+        recent = torch.nonzero(points["first_keyframe"] >= keyframe - YOUNG)[:, 0]
+        recent = recent[points["is_valid"][recent]]
+        age = keyframe - points["first_keyframe"][recent]
         least = self.config.mapping.min_found_ratio
-        is_rarely_found = points["times_found"][young] < least * points["times_visible"][young]
-        is_lonely = (age >= 2) & (points["times_observed"][young] < 3) & ~points["from_initialization"][young]
-        slam_map.invalidate(young[is_rarely_found | is_lonely])
+        is_rarely_found = points["times_found"][recent] < least * points["times_visible"][recent]
+        is_unconfirmed = (
+            (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
+        )
+        slam_map.invalidate(recent[is_rarely_found | is_unconfirmed])
 
 
-def world_scale(start: TwoViewMap, kind: str) -> float:
-    """The factor from the unit baseline of a start to the lengths of the world.
+def initial_scale(start: TwoViewMap, kind: str) -> float:
+    """Return the factor from the unit baseline of a two-view map to the map unit.
 
-    unit: the median depth in the first camera is one. groundtruth: the baseline has its true length.
-    Raises ConfigError when the true poses are asked for and are not known.
+    Args:
+        start: The two-view map.
+        kind: "unit": the median depth in the first camera is one; "groundtruth": the baseline has its true length.
+
+    Raises:
+        ConfigError: The true poses are needed and not known.
     """
     if kind == "unit":
         return 1.0 / float(start.points_w[:, 2].median())
@@ -140,3 +165,60 @@ def world_scale(start: TwoViewMap, kind: str) -> float:
         )
     true_baseline = torch.linalg.vector_norm(se3_inverse(truth_2)[:3, 3] - se3_inverse(truth_1)[:3, 3])
     return float(true_baseline / torch.linalg.vector_norm(start.T_cw[:3, 3]))
+
+
+class MapInitializer:
+    """Initializes an empty submap from two views and checks it with the frames between them."""
+
+    def __init__(self, tracker: Tracker, mapper: Mapper, min_explained: float) -> None:
+        self.tracker = tracker
+        self.mapper = mapper
+        self.min_explained = min_explained  # ratio of frames
+
+    def build(self, submap: Submap, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
+        """Build the first map of two views and pose the frames between them; return why it is rejected, or None.
+
+        Tracking continues from the second view.
+        """
+        first, second = self.mapper.start(submap.map, start)
+        self.tracker.reset_to_keyframe(submap, first)
+        explained = [self._explains(submap, view) for view in views]
+        self.tracker.reset_to_keyframe(submap, second)
+        if sum(explained) < self.min_explained * len(explained):
+            return Rejection.of(Reason.FRAMES_UNEXPLAINED, count=sum(explained), frames=len(explained))
+        return None
+
+    def _explains(self, submap: Submap, view: FrameFeatures) -> bool:
+        """Pose a frame from before the map was initialized; return whether most of its matches are inliers."""
+        estimate = self.tracker.track(submap, view)
+        if estimate is None:
+            return False
+        self.tracker.count_found(submap.map, estimate)
+        submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
+        return estimate.inliers > 0.5 * estimate.matches
+
+
+def keyframe_reason(
+    view: FrameFeatures, estimate: PoseEstimate, submap: Submap, settings: KeyframesConfig
+) -> str:
+    """Describe why a tracked frame should become a keyframe; empty if it should not.
+
+    Either it is far from all local keyframes, in translation relative to the scene depth or in rotation, or it observes
+    too few points of its reference keyframe.
+    """
+    slam_map, tracking = submap.map, submap.tracking
+    newest = slam_map.num_keyframes - 1
+    age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
+    overlap = estimate.inliers / max(tracking.reference_size, 1)
+    if age < max(1, settings.min_interval) or (age < view.backlog and overlap > ENOUGH_OVERLAP):
+        return ""
+    around = torch.cat([tracking.local_keyframes, tracking.local_keyframes.new_tensor([newest])])
+    translation, rotation = pose_distance(estimate.T_cw, slam_map.T_cw[around], estimate.depth)
+    has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
+    if bool((has_moved | has_turned).all()):
+        if bool(has_moved.all()):
+            return f"moved by {float(translation.min()):.2f} of the depth of the scene"
+        return f"turned by {float(rotation[~has_moved].min()):.1f} degrees"
+    if overlap < settings.min_overlap:
+        return f"sees {overlap:.0%} of the points of its reference keyframe"
+    return ""

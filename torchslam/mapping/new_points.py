@@ -158,7 +158,7 @@ def match_each(
     parts, weights = [], []
     for row, (view, T_21) in enumerate(zip(views[1:], prior.T_21, strict=True)):
         pairs = run_matcher(matcher, views[0], view, replace(prior, T_21=T_21))
-        at_1, at_2 = places(here.rows[0])[pairs.first], places(there.rows[row])[pairs.second]
+        at_1, at_2 = slots_among(here.rows[0])[pairs.first], slots_among(there.rows[row])[pairs.second]
         order = torch.argsort(at_1 * len(view.mask) + at_2)
         parts.append(torch.stack([torch.full_like(at_1, row), at_1, at_2])[:, order])
         weights += [] if pairs.weights is None else [pairs.weights[order]]
@@ -166,7 +166,7 @@ def match_each(
     return which, at_1, at_2, torch.cat(weights) if len(weights) == len(parts) else None
 
 
-def places(rows: Tensor) -> Tensor:
+def slots_among(rows: Tensor) -> Tensor:
     """(N,) where each of N keypoints stands among rows (n,), which may leave some out."""
     found = torch.zeros(int(rows.max()) + 1 if len(rows) else 1, dtype=torch.int64, device=rows.device)
     return found.index_put((rows.flip(0),), torch.arange(len(rows), device=rows.device).flip(0))
