@@ -15,7 +15,7 @@ from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.optim._core import tangent
 from torchslam.optim._core.batching import Tensors, index_tree, where_tree
-from torchslam.optim._core.implicit import Backward, Ndims, check_backward, implicit_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
 from torchslam.optim._core.linear import DefiniteFactor, factorize
 from torchslam.optim._core.residuals import Linearization, flat_along
@@ -189,13 +189,7 @@ def minimize(
     minimization = _Minimization(residual, product, len(unknowns), kernel, iterations, tolerance)
     tensors = (*unknowns, counted, weights, scale, *inputs)
     minimization.ndims = minimization.dimensions(tensors)
-    if backward == "unroll":
-        found = minimization.minimize(tensors)
-    else:
-        attached = backward == "implicit"
-        found = implicit_minimum(
-            minimization, tensors if attached else [tensor.detach() for tensor in tensors]
-        )
+    found = find_minimum(minimization, tensors, backward)
     solution, (success, cost, steps, converged, initial_cost) = (
         found[: len(unknowns)],
         found[len(unknowns) :],
@@ -346,7 +340,7 @@ def _pull(lin: Linearization, use_curvature: Tensor) -> Tensor:
 
 
 class _Minimization:
-    """`minimize` for `implicit_minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
+    """`minimize` for `find_minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
 
     num_vectors = 1
 

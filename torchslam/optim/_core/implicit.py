@@ -79,11 +79,16 @@ class Minimization(Protocol):
         ...
 
 
-def implicit_minimum(problem: Minimization, inputs: Sequence[Tensor]) -> Tensors:
-    """What `problem.minimize` finds: theta with its implicit derivatives to the inputs, the rest detached.
+def find_minimum(problem: Minimization, inputs: Sequence[Tensor], backward: Backward) -> Tensors:
+    """What `problem.minimize` finds, with the gradients of `backward`; "truncated" here means detached.
 
-    Raises RuntimeError for forward mode within forward mode, in which torch would drop a part without a word.
+    With "implicit", theta has its implicit derivatives to the inputs, and the rest is detached. Raises RuntimeError for
+    forward mode within forward mode, where PyTorch would silently drop a part.
     """
+    if backward == "unroll":
+        return problem.minimize(tuple(inputs))
+    if backward != "implicit":
+        inputs = [tensor.detach() for tensor in inputs]
     stack = (get_interpreter_stack() or ()) if _are_functorch_transforms_active() else ()
     if sum(transform.key() == TransformType.Jvp for transform in stack) > 1:
         raise RuntimeError(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_backward, implicit_minimum
+from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
@@ -143,13 +143,7 @@ def bundle_adjust(
     minimization = BundleMinimization(
         problem.camera, kernel, free_camera, iterations, tolerance, progress, check, given.weights.ndim > 2
     )
-    if backward == "unroll":
-        found = minimization.minimize(given)
-    else:
-        attached = backward == "implicit"
-        found = BundleMinimum(
-            *implicit_minimum(minimization, given if attached else [x.detach() for x in given])
-        )
+    found = BundleMinimum(*find_minimum(minimization, given, backward))
     detached = [x.detach() for x in given]
     solution = minimization.at_minimum(found, given) if backward == "implicit" else found.estimate
     if backward == "truncated":

@@ -1,4 +1,4 @@
-"""Bundle adjustments as `implicit_minimum` takes them: batches in the order of the problem, for either solver."""
+"""Bundle adjustments as `find_minimum` takes them: batches in the order of the problem, for either solver."""
 
 from __future__ import annotations
 

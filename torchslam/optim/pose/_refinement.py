@@ -19,7 +19,7 @@ from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.batching import Tensors
-from torchslam.optim._core.implicit import Backward, Ndims, check_backward, implicit_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
 from torchslam.optim._core.linear import factorize
 from torchslam.optim._core.priors import PosePrior, prior_expansion, prior_hessian
@@ -253,7 +253,7 @@ class PoseProblem:
 
 
 class PoseMinimization:
-    """`refine_pose` for `implicit_minimum`: found are the poses, and `success`, `cost` and how it went."""
+    """`refine_pose` for `find_minimum`: found are the poses, and `success`, `cost` and how it went."""
 
     num_unknowns = 1
     num_vectors = 1
@@ -382,13 +382,7 @@ def refine_pose(
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
     minimization = PoseMinimization(inputs, iterations, tolerance)
     tensors = (T_cw, *inputs.tensors())
-    if backward == "unroll":
-        found = minimization.minimize(tensors)
-    else:
-        attached = backward == "implicit"
-        found = implicit_minimum(
-            minimization, tensors if attached else [tensor.detach() for tensor in tensors]
-        )
+    found = find_minimum(minimization, tensors, backward)
     refined, success, cost, steps, converged, initial_cost = found
     if backward == "truncated":
         problem = PoseProblem(inputs)

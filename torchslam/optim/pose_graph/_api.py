@@ -11,7 +11,7 @@ from torch import Tensor
 from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_backward, implicit_minimum
+from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 
@@ -99,11 +99,7 @@ def pose_graph_optimize(
     counted, fixed, inputs = _sanitized(graph, scale)
     minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
     tensors = (*inputs, counted, fixed, graph.edges)
-    if backward == "unroll":
-        found = minimization.minimize(tensors)
-    else:
-        attached = backward == "implicit"
-        found = implicit_minimum(minimization, tensors if attached else [x.detach() for x in tensors])
+    found = find_minimum(minimization, tensors, backward)
     solution, success, moving, cost, steps, converged, initial_cost = found
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
     if backward == "implicit":
