@@ -11,8 +11,8 @@ from typing import Any
 
 from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
 from torchslam.batch.result_store import RUNS, hash_files, hash_json, program_hash, run_or_reuse
+from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
-from torchslam.batch.table import read_times
 from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
 from torchslam.io.results import read_metrics
@@ -68,9 +68,7 @@ def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
 
 
-def metrics_of_runs(
-    rows: Sequence[Row], options: argparse.Namespace, plots: bool = False
-) -> list[Columns]:
+def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: bool = False) -> list[Columns]:
     """Run the rows with the options of `add_engine`; return the metrics of each, times included.
 
     Raises SystemExit if one ended with an error.

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchslam.batch import Row, Task
-from torchslam.batch.table import TIMES_CSV
+from torchslam.batch.results_table import TIMES_CSV
 from torchslam.batch.task import TIMES
 from torchslam.cli.main import main
 

@@ -17,7 +17,7 @@ import pytest
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
 from tests.cli.test_cli import write_tum_folder
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
-from torchslam.batch import table as tables
+from torchslam.batch import results_table as tables
 from torchslam.batch.result_store import ERRORS, RECORD, RUNS, hash_files
 from torchslam.cli.main import main
 from torchslam.errors import ConfigError

@@ -21,7 +21,7 @@ from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
 from torchslam.batch import Row, Task, read_list
 from torchslam.batch.result_store import RUNS
-from torchslam.batch.table import gather, read_times
+from torchslam.batch.results_table import gather, read_times
 from torchslam.batch.task import configuration
 from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from torchslam.batch.engines import ENGINES, RETRIES, Engine, Shard, parse_shard
 from torchslam.batch.result_store import DONE, ERROR, NO_MAP, OPEN, Columns, store_failure
+from torchslam.batch.results_table import write_table
 from torchslam.batch.rows import Row, assign_names, read_list
-from torchslam.batch.table import write_table
 from torchslam.batch.task import Task, configuration, run_row
 
 __all__ = [

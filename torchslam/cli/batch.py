@@ -33,7 +33,7 @@ from types import FrameType
 from typing import Any
 
 from torchslam.batch import DONE, ENGINES, ERROR, Columns, Engine, Task, parse_shard, read_list, run_batch
-from torchslam.batch.table import CSV, counts
+from torchslam.batch.results_table import CSV, counts
 from torchslam.cli import arguments
 from torchslam.cli.progress import SIGNALS, STATUS
 

@@ -50,7 +50,7 @@ def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
 
     columns = run_or_reuse(tmp_path, "mine", dict, bug)
     assert columns["status"] == "error"
-    assert columns["error"].startswith("ZeroDivisionError: float division by zero (test_one_row.py:")
+    assert columns["error"].startswith("ZeroDivisionError: float division by zero (test_task.py:")
     assert "Traceback" in json.loads((tmp_path / ERRORS / "mine.json").read_text())["traceback"]
 
     def stop(folder: Path) -> dict[str, object]:
