@@ -24,12 +24,12 @@ from torchslam.geometry import (
     transform,
 )
 from torchslam.geometry.transforms import (
-    apart,
     carry_points,
     corner_camera,
     corner_pixels,
     covariances_with_unit,
     opengl,
+    pose_distance,
     quaternion_wxyz,
     reorthonormalized,
     rotation_angle,
@@ -56,7 +56,7 @@ def test_how_far_cameras_are_apart() -> None:
     away = torch.eye(4, dtype=torch.float64)
     away[:3, :3] = so3_exp(torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64))
     away[:3, 3] = torch.tensor([0.0, 0.3, 0.4])
-    translation, rotation = apart(away @ T_kw[0], T_kw, 2.0)
+    translation, rotation = pose_distance(away @ T_kw[0], T_kw, 2.0)
     assert translation.tolist() == pytest.approx([0.25])
     assert rotation.tolist() == pytest.approx([math.degrees(0.2)])
 

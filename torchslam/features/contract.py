@@ -1,4 +1,4 @@
-"""What a front end must return, and an error that says what is wrong where it does not."""
+"""The contract of front ends: checks of the features that they return, and masks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
 }
 """The shape of one keypoint's row."""
 BYTES = 32
-"""Of a descriptor of bits: matching and the memory of places count 256 of them."""
+"""Bytes of a binary descriptor: matching and the keyframe database count 256 bits."""
 
 LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"

@@ -165,7 +165,7 @@ class ORB(nn.Module):
             levels = build_levels(images, pyramid)
         with torch.no_grad():
             pixels = pack_levels(levels, pyramid).flatten()
-            # Peaks lie in cells, and a score is asked for next to them as well.
+            # Peaks lie in cells, and the scores next to them are needed as well.
             scores = fast_scores(pixels, pyramid.stride, _bands(grid, pyramid, len(images), margin=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if wanted is not None:

@@ -19,7 +19,7 @@ MIN_SIDE = 40  # of a packed pyramid, so that every neighborhood fits whatever t
 
 @dataclass(frozen=True)
 class PackedPyramid:
-    """Where the levels of a pyramid lie in the pyramid. Everything in pixels of the pyramid.
+    """Layout of the levels of a pyramid in one rectangle, in pixels of that rectangle.
 
     sizes:  (height, width) of each level; corners: (top, left) of each level; scales: full-resolution pixels
     (x, y) per pixel of the level.

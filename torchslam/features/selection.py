@@ -1,4 +1,4 @@
-"""Which corners to keep: an even spread over the image at a budget per pyramid level."""
+"""Selection of corners: an even spread over the image at a budget per pyramid level."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def plan_grid(
     threshold: int,
     device: torch.device,
 ) -> Grid:
-    """Budgets per level and square cells whose share of the budget is about `per_cell` keypoints.
+    """Budgets per level and square cells whose part of the budget is about `per_cell` keypoints.
 
     threshold: the FAST score that a corner must exceed.
     """
@@ -100,7 +100,7 @@ def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
 
 
 def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
-    """Whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
+    """Test whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
     best = scores.new_zeros(num_cells).scatter_reduce(0, cells, scores, "amax")
     return scores == best.index_select(0, cells)
 
@@ -108,7 +108,7 @@ def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
 def prefilter_candidates(
     scores: Tensor, offered: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
 ) -> Tensor:
-    """Which corners `select_evenly` may choose beside the best of the cells: far fewer than there are, at no sort.
+    """Corners that `select_evenly` may choose besides the best of the cells: far fewer than all, without a sort.
 
     scores: (N,) uint8, whole parts of the scores to be; offered: (N,) bool, what is to be spread; others as there.
     A level takes its budget and at most all that is left of others': who has as many stronger ones cannot be chosen.
@@ -132,7 +132,7 @@ def select_evenly(
 ) -> tuple[Tensor, Tensor]:
     """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
 
-    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen beside the best of its cell;
+    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen besides the best of its cell;
     cells: (N,) cell within its image; images: (N,) its image. Every level first takes its budget; what levels leave
     unused goes to the best remaining corners of any level.
     Returns the chosen rows (K,) and the place (K,) of each in its image's list, 0 ... count - 1, by falling score.
@@ -162,7 +162,7 @@ def _falling(scores: Tensor) -> Tensor:
 
 
 def _is_first(groups: Tensor, num_groups: int) -> Tensor:
-    """Whether a row is the first of its group: (N,) int64 -> (N,) bool."""
+    """Test whether a row is the first of its group: (N,) int64 -> (N,) bool."""
     rows = torch.arange(groups.shape[0], device=groups.device)
     first = rows.new_full((num_groups,), groups.shape[0]).scatter_reduce(0, groups, rows, "amin")
     return rows == first.index_select(0, groups)

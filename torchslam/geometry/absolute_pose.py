@@ -199,7 +199,8 @@ class _Search:
         if len(rows) == len(self.points):
             return self
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return replace(self, **{name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)})
+        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
+        return replace(self, **chosen)
 
     def best_pose(self, seed: int, confidence: float, max_samples: int) -> Tensor:
         """(B, 3, 4) the pose of each problem with most support."""
@@ -346,7 +347,7 @@ def unit_rays(normalized: Tensor) -> Tensor:
 def is_success(
     inliers: Tensor, mask: Tensor, points: Tensor, size: tuple[int, int], threshold: float
 ) -> Tensor:
-    """Whether inliers (B, N) of rows (B, N) are no accident, and fix the pose: four or more, not on one line. (B,).
+    """Test whether inliers (B, N) of rows (B, N) are significant and fix the pose: four or more, not on one line. (B,).
 
     points: (B, N, 3) about their mean; size: of the image; threshold: of an inlier, pixels
     """
@@ -374,7 +375,7 @@ def find_absolute_pose(
 def attach_absolute_pose(
     T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera, used: Tensor
 ) -> Tensor:
-    """The same poses, with the gradient of the minimizer of the squared error over the rows (B, N) in use."""
+    """Attach to the poses the gradient of the minimizer of the squared error over the rows (B, N) in use."""
 
     def objective(xi: Tensor) -> Tensor:
         projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))

@@ -141,7 +141,7 @@ class Camera:
         return Camera(self.model, params, self.size)
 
     def __getitem__(self, index: Any) -> Camera:
-        """Of many cameras (..., P) some, as indexing a tensor of their leading dimensions does."""
+        """Index the leading dimensions of many cameras, as for a tensor."""
         if self.params.ndim == 1:
             raise IndexError("this is one camera: its parameters have no leading dimension")
         index = index if isinstance(index, tuple) else (index,)

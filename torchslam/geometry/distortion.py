@@ -58,7 +58,7 @@ def first_positive_root(coefficients: Tensor) -> Tensor:
 
 
 def _converged(step: Tensor) -> bool:
-    """Whether the next Newton step, about the square of the largest one, would have no effect."""
+    """Test whether the next Newton step, about the square of the largest one, would have no effect."""
     return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
 
@@ -68,11 +68,11 @@ def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
     determinant = a * d - b * c
     determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
     x, y = residual.unbind(-1)
-    return -_beside(d * x - b * y, a * y - c * x) / determinant[..., None]
+    return -_stack_columns(d * x - b * y, a * y - c * x) / determinant[..., None]
 
 
 def length(xy: Tensor) -> Tensor:
-    """Of vectors (..., 2) -> (...), not to be differentiated at zero.
+    """Length of vectors (..., 2) -> (...), not differentiable at zero.
 
     Many times as fast as `norm` where each coordinate is in one piece of memory.
     """
@@ -80,7 +80,7 @@ def length(xy: Tensor) -> Tensor:
     return (x * x + y * y).sqrt()
 
 
-def _beside(*columns: Tensor) -> Tensor:
+def _stack_columns(*columns: Tensor) -> Tensor:
     """(..., n) of n tensors (...), each in one piece of memory: whoever reads or writes one of them streams."""
     return torch.stack(columns).movedim(0, -1)
 
@@ -120,7 +120,7 @@ def _radial_tangential(xy: Tensor, k: Tensor) -> Tensor:
     p1, p2 = k[..., 2], k[..., 3]
     r2, xy2 = x * x + y * y, 2 * x * y
     radial = _radial_factor(r2, k)
-    return _beside(
+    return _stack_columns(
         x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)
     )
 
@@ -135,7 +135,7 @@ def _radial_tangential_slope(xy: Tensor, k: Tensor) -> Tensor:
     cross = slope * x * y + 2 * (p1 * x + p2 * y)
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return _beside(xx, cross, cross, yy).unflatten(-1, (2, 2))
+    return _stack_columns(xx, cross, cross, yy).unflatten(-1, (2, 2))
 
 
 def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
     r4 = r2 * r2
     r6 = r4 * r2
     columns = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
-    return _beside(*columns).unflatten(-1, (2, 5))
+    return _stack_columns(*columns).unflatten(-1, (2, 5))
 
 
 def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:

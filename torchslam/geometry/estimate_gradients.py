@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 
 
 def needs_gradient(*tensors: Tensor) -> bool:
-    """Whether a graph is being recorded for any of the tensors, or may be by forward mode."""
+    """Test whether a graph is being recorded for any of the tensors, or may be by forward mode."""
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
 

@@ -1,4 +1,4 @@
-"""Which of three models explains two views, an essential matrix, a homography or a pure rotation, and its pose."""
+"""Selection among three models of two views: essential matrix, homography and pure rotation; and the pose."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ class Fits:
     squared: Tensor
 
     def with_mappings(self, views: TwoViews) -> Fits:
-        """The same with the errors of homography and rotation brought up to date."""
+        """Update the errors of homography and rotation."""
         mapped = transfer_squared(views, torch.stack((self.H, self.R_only), dim=1)).transpose(0, 1)
         return replace(self, squared=torch.cat((self.squared[:1], mapped)).nan_to_num(torch.inf))
 
     def finished(self, views: TwoViews, width: float) -> Fits:
-        """The same with homography and rotation at their minimum, over the matches within so many thresholds."""
+        """Minimize homography and rotation over the matches within `width` thresholds."""
         (H,), _ = fit_homography(views, self.H[:, None], FINAL_ITERATIONS, width)
         (R_only,), _ = fit_rotation(views, self.R_only[:, None], FINAL_ITERATIONS, width)
         return replace(self, H=H[:, 0], R_only=R_only[:, 0]).with_mappings(views)
@@ -147,7 +147,7 @@ def choose(views: TwoViews, fits: Fits, chance: Tensor, by_noise: bool = False) 
 
 
 def _leans(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
-    """(2, B) whether the matches lie beside homography and rotation along their epipolar lines, rather than anywhere.
+    """(2, B) whether the matches lie off homography and rotation along their epipolar lines, rather than anywhere.
 
     Little parallax is spread over all matches, none of which is clearly off. Noise, of whatever size and tail, has no
     direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
@@ -187,7 +187,7 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Tensor) -> Tensor:
 
 
 class PlaneMotions(NamedTuple):
-    """What may have moved before the plane of a homography: R (B, 4, 3, 3), direction (B, 4, 3), normal (B, 4, 3) of
+    """Motions in front of the plane of a homography: R (B, 4, 3, 3), direction (B, 4, 3), normal (B, 4, 3) of
     the plane in units of the distance that the camera moved, squared Sampson errors (B, 4, N) in thresholds, and
     whether the plane is in front of the cameras (B, 4).
     """
@@ -265,7 +265,7 @@ def pose_of(
 
 
 def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
-    """Whether the inliers leave a line in both images, by some thresholds. (B,)"""
+    """Test whether the inliers leave a line in both images, by some thresholds. (B,)"""
     weights = inliers[..., None].to(views.x_1.dtype)
     weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
     spread = torch.ones_like(inliers[:, 0])
@@ -303,7 +303,7 @@ def is_no_accident(
 
 
 def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:
-    """Of the poses with the essential matrix of R (B, 3, 3), t (B, 3), that with most inliers in front of both cameras.
+    """The pose with most inliers in front of both cameras among the four of an essential matrix, R (B, 3, 3), t (B, 3).
 
     A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
     """

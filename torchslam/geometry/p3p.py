@@ -77,7 +77,7 @@ _CONIC_TABLE = [
 
 @lru_cache(maxsize=4)
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """What the conics and their adjugates are made of.
+    """Coefficients of the conics and their adjugates.
 
     Indices of the factors of the adjugate (24,); how often each entry is in the full matrix (6, 1); the conics as a
     linear function of distances times one and the cosines (12, 12).
@@ -132,7 +132,7 @@ def _line_pair(D: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _intersections(lines: Tensor, conic: Tensor) -> tuple[Tensor, Tensor]:
-    """Where two lines meet a conic without entry 01, up to scale. (2, 2, S), (6, S) -> (3, 4, S), real (4, S)."""
+    """Intersections of two lines with a conic without entry 01: (2, 2, S), (6, S) -> (3, 4, S), real (4, S)."""
     p, q = lines
     xx, _, xz, yy, zz, yz = conic
     part = torch.addcmul(xz, xx, q)

@@ -45,7 +45,7 @@ def squared_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor
 
 @dataclass(frozen=True)
 class Tangent:
-    """How a mapping P (3, D) depends on T local parameters.
+    """Derivatives and retraction of a mapping P (3, D) with T local parameters.
 
     constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of T derivatives of P and of itself, as an affine
     function of the entries of P
@@ -76,7 +76,7 @@ class Tangent:
 
 @lru_cache(maxsize=16)
 def pose_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
-    """Of poses [R t], by [rho, omega] from the left."""
+    """Tangent of poses [R t], by [rho, omega] from the left."""
     axes = generators(dtype, device)
     translation = torch.nn.functional.pad(torch.eye(3, dtype=dtype, device=device)[..., None], (3, 0))
     return Tangent.of(lambda P: torch.cat((translation, axes @ P)), retract_pose, 4, dtype, device)
@@ -84,14 +84,14 @@ def pose_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
 
 @lru_cache(maxsize=16)
 def rotation_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
-    """Of rotations, by omega from the left."""
+    """Tangent of rotations, by omega from the left."""
     axes = generators(dtype, device)
     return Tangent.of(lambda R: axes @ R, lambda R, step: (cayley_rotation(step) @ R[0],), 3, dtype, device)
 
 
 @lru_cache(maxsize=16)
 def homography_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
-    """Of homographies whose last entry stays one, by the other eight."""
+    """Tangent of homographies whose last entry stays one, by the other eight."""
     entries = torch.eye(8, 9, dtype=dtype, device=device).unflatten(-1, (3, 3))
 
     def retract(H: ModelState, step: Tensor) -> ModelState:
@@ -132,7 +132,7 @@ def _fit_part(
     x: Tensor,
     scale: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The same for a few problems, with a scale of zero for rows outside the mask."""
+    """`fit_projections` of a few problems, with a scale of zero for rows outside the mask."""
     B, K, _, D = P.shape
     T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]
     x, scale = x.mT[:, None], scale.mT[:, None].contiguous()

@@ -1,4 +1,4 @@
-"""What the robust estimators share: RANSAC with local optimization, seeded and batched.
+"""RANSAC with local optimization, seeded and batched, as all robust estimators use it.
 
 Samples, scores, the search over rounds, significance tests, and a small batched Levenberg-Marquardt for the local
 optimization. Differentiable least squares are in `torchslam.optim`.
@@ -145,7 +145,7 @@ def best_models(
 
 
 def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: float) -> Tensor:
-    """How many samples contain, with the given confidence, one without outliers. (B,), (B,) -> (B,) float64.
+    """Number of samples that contain, with the given confidence, one without outliers. (B,), (B,) -> (B,) float64.
 
     Computed on the host, where a number costs less than a call.
     """
@@ -173,7 +173,7 @@ def truncated_score(squared: Tensor, mask: Tensor) -> Tensor:
 
 
 def truncated_rows(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """Which rows count, (B, K, N), and the truncated cost, (B, K), of squared residuals (B, K, N)."""
+    """Rows in use, (B, K, N), and the truncated cost, (B, K), of squared residuals (B, K, N)."""
     cost = torch.where(mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
     return (squared < width * width) & mask[:, None], cost
 
@@ -225,7 +225,7 @@ def search(
 
 
 def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor, solutions: int) -> Tensor:
-    """Whether so many inliers are no accident among wrong matches: fewer than 0.001 false alarms expected.
+    """Test whether inliers are significant: fewer than 0.001 false alarms expected among wrong matches.
 
     inliers, available: (B,) counts; chance: (B,) probability that a wrong row fits a model; solutions: models per
     minimal sample of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
@@ -240,7 +240,7 @@ def _log_false_alarms(inliers: int, available: int, size: int, chance: float, so
     """For one problem: on the host a number costs less than a call."""
     if inliers <= size:
         return math.inf
-    # available over inliers times inliers over size, but for what cancels
+    # available over inliers times inliers over size, without what cancels
     rest, others = max(available - inliers, 0), inliers - size
     choices = math.lgamma(available + 1) - math.lgamma(rest + 1) - math.lgamma(others + 1)
     alarms = choices - math.lgamma(size + 1) + others * math.log(min(max(chance, 1e-12), 1.0))
@@ -248,9 +248,9 @@ def _log_false_alarms(inliers: int, available: int, size: int, chance: float, so
 
 
 def is_unlikely(count: Tensor, available: Tensor, size: int, chance: Tensor) -> Tensor:
-    """Whether so many rows tell for a richer model, and against a simpler one: fewer than 0.1 false alarms expected.
+    """Test whether rows support a richer model against a simpler one: fewer than 0.1 false alarms expected.
 
-    As `is_significant`, but for chances that need not be small: the tail of the binomial distribution over the rows
+    As `is_significant`, for chances that need not be small: the tail of the binomial distribution over the rows
     beyond a sample is bounded by Chernoff's inequality.
     """
     problems = zip(count.tolist(), available.tolist(), chance.tolist(), strict=True)

@@ -146,7 +146,7 @@ def estimate_relative_pose(
 
 
 def _answer(T_21: Tensor, found: FoundPose) -> RelativePose:
-    """What was found, with a pose (B, 4, 4) that may carry a gradient."""
+    """The result, with a pose (B, 4, 4) that may carry a gradient."""
     return RelativePose(
         T_21,
         found.inliers,

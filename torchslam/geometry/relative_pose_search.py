@@ -46,7 +46,7 @@ _LEAST_NOISE = 1 / 64  # thresholds; of exact matches
 
 
 class _Effort(NamedTuple):
-    """How long to look for a motion: as the arguments of `estimate_relative_pose`."""
+    """Effort of the search: as the arguments of `estimate_relative_pose`."""
 
     seed: int
     confidence: float
@@ -83,7 +83,7 @@ def find_relative_pose(
     wanted: Model,
     *effort: Any,
 ) -> FoundPose:
-    """What `estimate_relative_pose` finds; effort: seed, confidence, min_samples and max_samples of it."""
+    """The search of `estimate_relative_pose`; effort: seed, confidence, min_samples and max_samples of it."""
     width, height = camera_2.size
     # The probability that a wrong match is within the threshold of an epipolar line.
     chance = 2 * threshold * math.hypot(width, height) / (width * height)

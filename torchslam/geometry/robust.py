@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
-"""What a residual costs beyond the scale.
+"""Robust kernels, by the cost of a residual beyond the scale.
 
 "none":          its square, as before it: least squares
 "huber":         its length
@@ -29,7 +29,7 @@ Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 class Robustified(NamedTuple):
     """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
 
-    rho:       the cost, twice the share of the residual in the objective
+    rho:       the cost, twice the contribution of the residual to the objective
     weight:    rho', the weight of the residual in iteratively reweighted least squares, in [0, 1]
     curvature: rho'', never positive
     """

@@ -349,7 +349,7 @@ class _Problem:
         return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
 
     def is_success(self, inliers: Tensor) -> Tensor:
-        """Whether the inliers are no accident, and fix the similarity: four or more, not on one line. (B,)."""
+        """Test whether the inliers are significant and fix the similarity: four or more, not on one line. (B,)."""
         weights = inliers[..., None].to(self.forward.points.dtype)
         count = self.mask.sum(-1)
         # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.

@@ -30,8 +30,8 @@ from torchslam.geometry.lie import (
 )
 
 
-def apart(T_cw: Tensor, T_kw: Tensor, depth: Tensor | float) -> tuple[Tensor, Tensor]:
-    """(k,), (k,) how far cameras T_kw (k, 4, 4) are from T_cw (4, 4): shares of a depth, and degrees."""
+def pose_distance(T_cw: Tensor, T_kw: Tensor, depth: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Distances of cameras T_kw (k, 4, 4) from T_cw (4, 4): (k,) in units of a depth, and (k,) degrees."""
     T_ck = T_cw @ se3_inverse(T_kw)
     translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
     return translation, torch.rad2deg(rotation_angle(T_ck[:, :3, :3]))
@@ -45,7 +45,7 @@ def rotation_angle(R: Tensor) -> Tensor:
 
 
 def reorthonormalized(T: Tensor) -> Tensor:
-    """Rigid transforms (..., 4, 4) whose rotations are so to rounding, of such that are so nearly.
+    """Reorthonormalize the rotations of nearly rigid transforms (..., 4, 4), to machine precision.
 
     Where a pose is predicted from those before it, with transposes for inverses, what they lack of a rotation grows by
     1 + sqrt(2) from frame to frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
@@ -57,7 +57,7 @@ def reorthonormalized(T: Tensor) -> Tensor:
 def carry_points(
     points_w: Tensor, covariances_w: Tensor, normals_w: Tensor, T_cw: Tensor, S_cw: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points, their covariances and unit normals in the world in which a similarity S_cw stands for the pose T_cw.
+    """Move points, covariances and unit normals as the pose T_cw of their camera is corrected to a similarity S_cw.
 
     points_w: (..., 3); covariances_w: (..., 3, 3); normals_w: (..., 3); T_cw, S_cw: (..., 4, 4), one for each point,
     world to camera. What is seen in the direction and with the relative depth p_c = T_cw p is seen so by S_cw after.
@@ -103,7 +103,7 @@ def corner_camera(camera: Camera) -> Camera:
 
 
 def opengl(T_wc: Tensor) -> Tensor:
-    """Camera to world (..., 4, 4) for camera axes x right, y up, z backward."""
+    """Convert camera-to-world (..., 4, 4) to camera axes x right, y up, z backward."""
     return T_wc * T_wc.new_tensor((1.0, -1.0, -1.0, 1.0))
 
 
@@ -113,7 +113,7 @@ def quaternion_wxyz(R: Tensor) -> Tensor:
 
 
 def upright_rotation(T_wc: Tensor) -> Tensor:
-    """(3, 3) from the world to one whose z is up and whose x is as near to the world's x as can be.
+    """Rotation (3, 3) from the world to one whose z is up and whose x is as close to the world's x as possible.
 
     T_wc: (N, 4, 4). Gravity is not known: up is the mean up direction of the cameras. Where they have none, as when
     half of them hang upside down, it is that of a world whose y points down.

@@ -74,7 +74,7 @@ class TwoViews:
         return views if weights is None else views.in_units(torch.where(mask, weights, 1.0).rsqrt())
 
     def in_units(self, thresholds: Tensor) -> TwoViews:
-        """The same with thresholds so many times as large. (B, N) or (B, 1)."""
+        """The matches with thresholds scaled by factors. (B, N) or (B, 1)."""
         return replace(self, scale_1=self.scale_1 / thresholds, scale_2=self.scale_2 / thresholds)
 
     def select(self, rows: Tensor) -> TwoViews:
@@ -100,7 +100,7 @@ class TwoViews:
 
     @cached_property
     def epipolar(self) -> tuple[Tensor, Tensor]:
-        """What the Sampson error is linear in: (B, 9, N) for the constraint, (B, 18, N) for its variance.
+        """Terms in which the Sampson error is linear: (B, 9, N) for the constraint, (B, 18, N) for its variance.
 
         The constraint is E times h_2 h_1^T; its variance (E E^T and E^T E without the last row and column) times
         h_1 h_1^T and h_2 h_2^T, over the squared scale of the other image.
@@ -113,7 +113,7 @@ class TwoViews:
 
     @cached_property
     def epipolar_float(self) -> tuple[Tensor, Tensor]:
-        """The same in float32, for scores."""
+        """`epipolar` in float32, for scores."""
         constraint, variance = self.epipolar
         return constraint.float(), variance.float()
 
@@ -129,7 +129,7 @@ class TwoViews:
 
 
 _CANDIDATES = 4  # essential matrices of each round that are optimized
-_MORE_CANDIDATES = 8  # where it is asked what they leave in front of the cameras,
+_MORE_CANDIDATES = 8  # if matches have to be in front of the cameras,
 _CHECKED_CANDIDATES = 24  # of so many
 _ITERATIONS = 4  # of their local optimization
 # Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
@@ -319,7 +319,7 @@ def twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Which matches lie in front of both cameras, and their parallax in thresholds. Poses (B, K) -> (B, K, N) twice."""
+    """Matches in front of both cameras, and their parallax in thresholds. Poses (B, K) -> (B, K, N) twice."""
     ray_1 = views.h_1[:, None] @ R.mT
     ray_2 = views.h_2[:, None].expand_as(ray_1)
     normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
@@ -331,7 +331,7 @@ def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, T
 
 
 def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the four poses of each essential matrix (B, K) the one of least cost, and that cost (B, K).
+    """The pose of least cost among the four of each essential matrix (B, K), and that cost (B, K).
 
     The cost of a match is r^2 / (1 + r^2), by Geman and McClure. Matches behind a camera count as wrong, but where
     their parallax is within the threshold.

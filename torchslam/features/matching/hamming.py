@@ -134,7 +134,7 @@ def int8_product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def _fast_int8(device: torch.device) -> bool:
-    """Whether int8 matrix products beat float32: on x86 processors with AVX-512, through oneDNN."""
+    """Test whether int8 matrix products beat float32: on x86 processors with AVX-512, through oneDNN."""
     return (
         device.type == "cpu"
         and hasattr(torch, "_int_mm")
