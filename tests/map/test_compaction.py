@@ -204,9 +204,9 @@ def test_rows_are_dropped_when_most_of_them_are_dead(submap: Submap, monkeypatch
     submap.map.invalidate(torch.arange(half))
     assert compact(submap) is None  # not more than half
     submap.map.invalidate(torch.tensor([half]))
-    monkeypatch.setattr(compaction, "_PRICE", len(submap.posed_frames.observations) / (half + 1))
+    monkeypatch.setattr(compaction, "_MAX_REWRITTEN", len(submap.posed_frames.observations) / (half + 1))
     assert compact(submap) is None  # the history is too long for so few
-    monkeypatch.setattr(compaction, "_PRICE", 1 + len(submap.posed_frames.observations) / (half + 1))
+    monkeypatch.setattr(compaction, "_MAX_REWRITTEN", 1 + len(submap.posed_frames.observations) / (half + 1))
     renumbering = compact(submap)
     assert renumbering is not None
     assert len(submap.map.points) == count - half - 1

@@ -112,7 +112,7 @@ def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> No
 
 def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compaction, "MIN_INVALID_ROWS", 5)
-    monkeypatch.setattr(compaction, "_PRICE", 1000)
+    monkeypatch.setattr(compaction, "_MAX_REWRITTEN", 1000)
     submap = world_of(standing(30))
     descriptors = submap.map.points["descriptors"][:1].repeat(40, 1)
     submap.map.invalidate(submap.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])

@@ -20,12 +20,12 @@ from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
 from torchslam.mapping.new_points import has_consistent_scale
 from torchslam.system.front_end import Simulated
 from torchslam.system.slam import SLAM
-from torchslam.tracking.correspondences import match_near, match_points, project_points
+from torchslam.tracking.correspondences import match_points, match_projected_points, project_points
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, TwoViewMap
+from torchslam.types import FrameFeatures, Rejection, TwoViewMap
 
 OVERRIDES = [
     "features.kind=simulated",
@@ -86,7 +86,7 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     near = project_points(
         slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
-    pairs = match_near(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
+    pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
     ids, keypoints = pairs.first, pairs.second
     assert len(ids) > 150
     assert len(torch.unique(keypoints)) == len(keypoints)
@@ -119,7 +119,7 @@ def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     estimate = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
     assert estimate is not None
     assert torch.allclose(estimate.T_cw, walk_from_start(slam, 2), atol=1e-5)
-    slam.tracker.start_at(slam.submap, view, estimate)
+    slam.tracker.start_at_estimate(slam.submap, view, estimate)
     assert slam.submap.tracking.reference <= 2
     assert torch.allclose(slam.submap.T_cw, estimate.T_cw)
 
@@ -225,7 +225,7 @@ def test_scale_consistency() -> None:
     assert consistent.tolist() == [True, False, False]
 
 
-def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[TwoViewMap | None, str]:
+def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> TwoViewMap | Rejection:
     extract = Simulated(config, walk.camera, true_T_cw(walk))
     initializer = Initializer(walk.camera, config)
     for i in indices:
@@ -234,8 +234,8 @@ def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> tuple[TwoV
 
 
 def test_two_views_make_a_start_with_the_true_motion() -> None:
-    start, reason = start_of((0, 5), WALK, CONFIG)
-    assert start is not None, reason
+    start = start_of((0, 5), WALK, CONFIG)
+    assert isinstance(start, TwoViewMap), start
     truth = true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0])
     truth[:3, 3] /= truth[:3, 3].norm()
     assert torch.allclose(start.T_cw, truth, atol=1e-6)
@@ -246,22 +246,21 @@ def test_two_views_make_a_start_with_the_true_motion() -> None:
 
 def test_the_parallax_criterion_waits_longer() -> None:
     strict = load_config(None, [*OVERRIDES, "initialization.criterion=parallax"])
-    assert start_of((0, 1), WALK, strict)[0] is None
-    assert "parallax" in start_of((0, 1), WALK, strict)[1]
-    assert start_of((0, 6), WALK, strict)[0] is not None
+    rejection = start_of((0, 1), WALK, strict)
+    assert isinstance(rejection, Rejection)
+    assert "parallax" in str(rejection)
+    assert isinstance(start_of((0, 6), WALK, strict), TwoViewMap)
 
 
 def test_pure_rotation_is_no_start() -> None:
     walk = Walk(turn(10))
     config = load_config(None, [*OVERRIDES, "simulated.noise_px=0.3"])
-    start, reason = start_of((0, 5), walk, config)
-    assert start is None
-    assert reason
+    assert isinstance(start_of((0, 5), walk, config), Rejection)
 
 
 def test_scale_from_ground_truth_needs_ground_truth() -> None:
-    start, _ = start_of((0, 5), WALK, CONFIG)
-    assert start is not None
+    start = start_of((0, 5), WALK, CONFIG)
+    assert isinstance(start, TwoViewMap)
     view = FrameFeatures(**{**start.view.__dict__, "T_cw_groundtruth": None})
     with pytest.raises(ConfigError, match="ground truth"):
         initial_scale(
@@ -291,8 +290,8 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
 
 
 def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
-    start, _ = start_of((0, 5), WALK, CONFIG)
-    assert start is not None
+    start = start_of((0, 5), WALK, CONFIG)
+    assert isinstance(start, TwoViewMap)
     slam = SLAM(WALK.camera, CONFIG)
     slam_map = Map()
     first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)

@@ -22,7 +22,7 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
 from torchslam.optim import refine_pose
-from torchslam.tracking.correspondences import match_near, match_views, project_points
+from torchslam.tracking.correspondences import match_projected_points, match_views, project_points
 from torchslam.tracking.matcher import DescriptorMatcher
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity
@@ -127,7 +127,7 @@ def match_by_sim3_pose(
     view = other.view(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    pairs = match_near(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
+    pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
     return pairs.first, pairs.second
 
 

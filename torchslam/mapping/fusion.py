@@ -9,7 +9,7 @@ from torchslam.config import Config
 from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, passes_gate
 from torchslam.map.map import Map
-from torchslam.tracking.correspondences import look_at
+from torchslam.tracking.correspondences import predict_observations
 from torchslam.tracking.matcher import max_distance
 
 RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
@@ -38,7 +38,7 @@ def match_in_keyframes(
     table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
     features = slam_map.features(keyframes)
     T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
-    pixels, scales, visible = look_at(slam_map, point_ids, T_cw, camera, angle, sizes)
+    pixels, scales, visible = predict_observations(slam_map, point_ids, T_cw, camera, angle, sizes)
     visible &= ~slam_map.sees(keyframes, point_ids)
     somewhere = torch.nonzero(visible.any(0))[:, 0]
     point_ids = point_ids[somewhere]

@@ -19,9 +19,8 @@ from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.new_points import triangulate_against
-from torchslam.tracking.matcher import Matcher
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, TwoViewMap
+from torchslam.types import FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
 YOUNG = 3  # keyframes after its own for which a point may be culled

@@ -1,4 +1,4 @@
-"""New map points from a keyframe and its neighbours: matches along epipolar lines, triangulated and checked."""
+"""New map points: match a keyframe along epipolar lines with covisible keyframes, triangulate and check."""
 
 from __future__ import annotations
 
@@ -22,84 +22,92 @@ from torchslam.geometry import (
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
-from torchslam.tracking.matcher import DescriptorMatcher, Matcher, MatchPrior, max_distance, run_matcher
-from torchslam.types import FrameFeatures
+from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
+from torchslam.types import FrameFeatures, Matcher, MatchPrior
 
 
 def triangulate_against(
     slam_map: Map,
     keyframe: int,
-    neighbours: Tensor,
+    neighbors: Tensor,
     camera: Camera,
     config: Config,
     matcher: Matcher | None = None,
     normalize: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
-    """Add the points that a keyframe and neighbours (k,) see with enough parallax and that the map does not have yet.
+    """Add new points that a keyframe and neighbors (k,) observe with enough parallax.
 
-    Of several neighbours with which a keypoint makes a point the first one counts.
+    If a keypoint makes points with several neighbors, the first one counts.
 
-    matcher:   one of one's own; along epipolar lines, by descriptors, if None
-    normalize: a quicker way for `camera.normalize`
+    Args:
+        slam_map: The map.
+        keyframe: Row of the new keyframe.
+        neighbors: (k,) rows of the keyframes to triangulate against.
+        camera: The camera of all keyframes.
+        config: The configuration.
+        matcher: A custom matcher; by default descriptors along epipolar lines.
+        normalize: A faster equivalent of `camera.normalize`.
     """
-    neighbours = neighbours[has_baseline(slam_map, keyframe, neighbours, config.mapping.min_baseline)]
-    if len(neighbours) == 0:
+    neighbors = neighbors[has_baseline(slam_map, keyframe, neighbors, config.mapping.min_baseline)]
+    if len(neighbors) == 0:
         return
     here, there = (
         FreeKeypoints.of(slam_map, rows, normalize or camera.normalize)
-        for rows in (slam_map.ids(keyframe), neighbours)
+        for rows in (slam_map.ids(keyframe), neighbors)
     )
-    found = _match(slam_map, keyframe, neighbours, here, there, camera, config, matcher)
-    _triangulate(slam_map, keyframe, neighbours, here, there, found, camera, config)
+    found = _match(slam_map, keyframe, neighbors, here, there, camera, config, matcher)
+    _triangulate(slam_map, keyframe, neighbors, here, there, found, camera, config)
 
 
-class Matches(NamedTuple):
-    """Matches (m,) of a keyframe with its neighbours: with which one, rows of free keypoints of both, and weights."""
+class NewPointMatches(NamedTuple):
+    """Matches (m,) of a keyframe: index of the neighbor, rows of free keypoints of both, and weights."""
 
     which: Tensor
     at_1: Tensor
     at_2: Tensor
     weights: Tensor | None
 
-    def select(self, rows: Tensor) -> Matches:
+    def select(self, rows: Tensor) -> NewPointMatches:
         weights = None if self.weights is None else self.weights[rows]
-        return Matches(self.which[rows], self.at_1[rows], self.at_2[rows], weights)
+        return NewPointMatches(self.which[rows], self.at_1[rows], self.at_2[rows], weights)
 
 
 def _match(
     slam_map: Map,
     keyframe: int,
-    neighbours: Tensor,
+    neighbors: Tensor,
     here: FreeKeypoints,
     there: FreeKeypoints,
     camera: Camera,
     config: Config,
     matcher: Matcher | None,
-) -> Matches:
-    """Along epipolar lines, by descriptors or by a matcher of one's own."""
-    T_21 = slam_map.T_cw[neighbours] @ se3_inverse(slam_map.T_cw[keyframe])
+) -> NewPointMatches:
+    """Match along epipolar lines, by descriptors or by a custom matcher."""
+    T_21 = slam_map.T_cw[neighbors] @ se3_inverse(slam_map.T_cw[keyframe])
     epipolar_px = config.mapping.max_epipolar_px
     if matcher is None or isinstance(matcher, DescriptorMatcher):
         limit = max_distance(here.features.descriptors, config.matching)
-        return Matches(*match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None)
-    views = [free_view(slam_map, row) for row in (keyframe, *neighbours.tolist())]
+        return NewPointMatches(
+            *match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None
+        )
+    views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
     prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=epipolar_px)
-    return Matches(*match_each(matcher, views, here, there, prior))
+    return NewPointMatches(*match_each(matcher, views, here, there, prior))
 
 
 def _triangulate(
     slam_map: Map,
     keyframe: int,
-    neighbours: Tensor,
+    neighbors: Tensor,
     here: FreeKeypoints,
     there: FreeKeypoints,
-    found: Matches,
+    found: NewPointMatches,
     camera: Camera,
     config: Config,
 ) -> None:
-    """Add the points of those matches that show one. Every match is a pair of views of its own, with one point."""
+    """Triangulate matches and add the points that pass all checks."""
     settings, limit = config.mapping, config.measurement.max_chi_square
-    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours][found.which]
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbors][found.which]
     seen_1, seen_2 = (0, found.at_1, None), (found.which, found.at_2, None)
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
     normalized = here.normalized[seen_1], there.normalized[seen_2]
@@ -111,7 +119,7 @@ def _triangulate(
         points_c = transform(T_cw, seen.points_w)
         good &= passes_gate(noise.squared_reprojection(points_c, seen_at, camera), limit)
     good &= seen.angles > math.radians(settings.min_parallax_deg)
-    sizes = tuple(size[found.which] for size in slam_map.scale_ranges(neighbours))
+    sizes = tuple(size[found.which] for size in slam_map.scale_ranges(neighbors))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
     keep = torch.nonzero(good)[:, 0]
     keep = keep[first_of_each(found.at_1[keep])]
@@ -129,20 +137,20 @@ def _triangulate(
     descriptors = here.features.descriptors[0, found.at_1]
     ids = slam_map.add_points(points_w[:, 0], descriptors, keyframe, covariances_w[:, 0])
     _observe(slam_map, keyframe, here.rows[0, found.at_1], ids, found.weights)
-    _observe(slam_map, neighbours[found.which], there.rows[found.which, found.at_2], ids, found.weights)
+    _observe(slam_map, neighbors[found.which], there.rows[found.which, found.at_2], ids, found.weights)
 
 
 def _observe(
     slam_map: Map, keyframes: int | Tensor, rows: Tensor, ids: Tensor, weights: Tensor | None
 ) -> None:
-    """Note that keypoints (n,) of keyframes, one or (n,), see points (n,), with weights (n,) if they have any."""
+    """Add observations of points (n,) by keypoints (n,) of keyframes, one or (n,), with optional weights (n,)."""
     slam_map.observe(keyframes, rows, ids)
     if weights is not None:
         slam_map.weigh(keyframes, rows, weights)
 
 
 def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
-    """What a keyframe saw, of which keypoints that see no point yet may match."""
+    """Return the features of a keyframe, masked to keypoints that observe no point."""
     view = slam_map.view(keyframe)
     return replace(view, mask=view.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))
 
@@ -150,7 +158,7 @@ def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
 def match_each(
     matcher: Matcher, views: list[FrameFeatures], here: FreeKeypoints, there: FreeKeypoints, prior: MatchPrior
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """As `match_along_epipolar_lines` of the first view with each of the others, by a matcher; and the weights (m,).
+    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights (m,) as well.
 
     prior: with T_21 (k, 4, 4) to all of the others
     """
@@ -167,15 +175,15 @@ def match_each(
 
 
 def slots_among(rows: Tensor) -> Tensor:
-    """(N,) where each of N keypoints stands among rows (n,), which may leave some out."""
+    """Return (N,) the position of each of N keypoints among rows (n,), arbitrary for missing ones."""
     found = torch.zeros(int(rows.max()) + 1 if len(rows) else 1, dtype=torch.int64, device=rows.device)
     return found.index_put((rows.flip(0),), torch.arange(len(rows), device=rows.device).flip(0))
 
 
-def has_baseline(slam_map: Map, keyframe: int, neighbours: Tensor, least: float) -> Tensor:
-    """(k,) whether a keyframe and neighbours (k,) are apart by a share of the median depth that the neighbour sees."""
-    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbours]
-    seen = slam_map.keyframes["point_ids"][neighbours]
+def has_baseline(slam_map: Map, keyframe: int, neighbors: Tensor, least: float) -> Tensor:
+    """Return (k,) bool: whether the baseline to neighbors (k,) is at least a ratio of the neighbor's median depth."""
+    T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbors]
+    seen = slam_map.keyframes["point_ids"][neighbors]
     depths = transform(T_2w, slam_map.positions_w[seen])[..., 2]
     depth = depths.masked_fill(seen == NO_POINT, torch.nan).nanmedian(-1).values
     apart = se3_inverse(T_1w)[:3, 3] - se3_inverse(T_2w)[:, :3, 3]
@@ -191,7 +199,7 @@ def has_consistent_scale(
     scale_range: tuple[Tensor, ...],
     factor: float = 1.8,
 ) -> Tensor:
-    """(..., n) whether a point's size in two images agrees with its distances: scale falls as distance grows.
+    """Return (..., n) bool: whether the scales in two images agree with the distances of the point.
 
     points_w: (..., n, 3); scale_1, scale_2: (..., n); scale_range: the finest and the coarsest of the second image
     """
