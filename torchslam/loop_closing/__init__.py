@@ -1,4 +1,4 @@
-"""Places that were seen before: which keyframes look like a frame."""
+"""Loop closing: keyframe database, loop detection, Sim(3) between keyframes, drift correction, map merging."""
 
 from __future__ import annotations
 

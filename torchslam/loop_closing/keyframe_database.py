@@ -1,8 +1,8 @@
-"""Which keyframes show the same place as a frame? The memory of places that relocalisation and loop closing ask.
+"""Keyframe database: place recognition for relocalization and loop closing.
 
-The score of two images sums, over the words they share, how rare the word is and how close their codes are
-(`global_descriptor`). It is 1 for an image with itself and 0 for images without anything in common. How well it
-finds places, beside the alternatives, and what a query costs: experiments/places.
+The score of two images sums, over the visual words they share, the rarity of the word times the similarity of their
+codes (`global_descriptor`). It is 1 for an image with itself and 0 for images without a common word. Recall and cost
+compared with alternatives: experiments/places.
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ from torch import Tensor
 
 from torchslam.loop_closing.global_descriptor import binary, likeness, rendered_words, words_and_codes
 
-STRONGEST = (
-    400  # descriptors of an image that count: nearly as good as all of them, at less than half the cost
-)
+STRONGEST = 400  # descriptors used per image: nearly as good as all of them, at less than half the cost
 NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
@@ -25,12 +23,12 @@ _MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a flo
 
 
 class KeyframeDatabase:
-    """Keyframes, named by keys of the caller, as words and codes; asked for those that look like a frame.
+    """Inverted index of keyframes, by key, that ranks them by similarity to an image.
 
-    Rows of descriptors are in order of falling strength, as the extractors give them. Floats (N, D) of unit length
-    serve as well as bits (N, 32); all images of one memory must be of one kind.
+    Descriptors are ordered by decreasing strength, as the extractors return them: bits (N, 32) or unit floats (N, D),
+    of one kind for all images.
 
-    words: (W, 32) uint8, the vocabulary. Without it, bits use that of rendered images, which the package brings along,
+    words: (W, 32) uint8, the vocabulary. By default bits use that of the package, which was trained on rendered images,
            and floats the descriptors of the first keyframe that has at least 64.
     """
 
@@ -42,7 +40,7 @@ class KeyframeDatabase:
         self._slots: dict[int, int] = {}
 
     def __len__(self) -> int:
-        """How many keyframes there are."""
+        """The number of keyframes."""
         return len(self._slots)
 
     def __contains__(self, key: int) -> bool:
@@ -56,7 +54,7 @@ class KeyframeDatabase:
     # --- changing --------------------------------------------------------------------------------------------
 
     def add(self, key: int, descriptors: Tensor, mask: Tensor) -> None:
-        """Remember a keyframe by its descriptors (N, 32) uint8 or (N, D) floats, those of the mask (N,).
+        """Add a keyframe with descriptors (N, 32) uint8 or (N, D) floats, those of the mask (N,).
 
         Raises ValueError for a negative key or one that is already there.
         """
@@ -75,7 +73,7 @@ class KeyframeDatabase:
         self._slots[key] = slot
 
     def remove(self, keys: Tensor | Iterable[int]) -> None:
-        """Forget keyframes (n,). Raises KeyError, before anything changes, where one is not there."""
+        """Remove keyframes (n,). Raises KeyError, before anything changes, if a key is missing."""
         keys = _as_list(keys)
         slots = [self._slots[key] for key in keys]
         self._keys[slots] = NO_KEY
@@ -86,7 +84,7 @@ class KeyframeDatabase:
     # --- asking ----------------------------------------------------------------------------------------------
 
     def query(self, descriptors: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """All keyframes by their similarity to an image of descriptors (N, 32) or (N, D), those of the mask (N,).
+        """Rank all keyframes by similarity to an image with descriptors (N, 32) or (N, D), those of the mask (N,).
 
         Returns keys (n,) int64 and scores (n,) float32 in [0, 1], the best first, of equals the lower key first.
         """
@@ -95,7 +93,7 @@ class KeyframeDatabase:
         return self._ranked(*words_and_codes(_strongest(descriptors, mask), self._words))
 
     def query_by_key(self, key: int) -> tuple[Tensor, Tensor]:
-        """As `query` for the image of a keyframe that is there. Raises KeyError where it is not."""
+        """Rank all keyframes by similarity to one of them, as `query`. Raises KeyError if the key is missing."""
         slot = self._slots[key]
         used = torch.nonzero(self._used[:, slot])[:, 0]
         return self._ranked(used, self._codes[used, slot])

@@ -37,7 +37,7 @@ WIDER = 2.0  # times the noise: a similarity has its own
 class RelativeSim3:
     """A keyframe of one map seen from another map.
 
-    S_21:    (4, 4) similarity from the world of map 1 to that of map 2
+    S_21:    (4, 4) similarity from the frame of map 1 to that of map 2
     forward: points of map 2 that keyframe 1 sees where S_21 has them; backward: of map 1 in keyframe 2
     pairs:   points that keyframe 1 sees and that both maps have
     """
@@ -127,7 +127,9 @@ def match_by_sim3_pose(
     view = other.view(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9)
+    pairs = match_projected_points(
+        slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9
+    )
     return pairs.first, pairs.second
 
 

@@ -1,1 +1,1 @@
-"""What a run knows of one world: its map, the frames posed in it, and where the camera was last."""
+"""Atlas, submaps, maps and the map file: keyframes, map points, observations, posed frames, tracking state."""

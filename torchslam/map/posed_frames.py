@@ -27,7 +27,7 @@ class RunGraph(ObservationGraph):
 
     frame_ids:      (F,) frames of the sequence of their session
     sessions:       (F,) which run over the map saw them
-    point_ids:      (P,) rows of the points of the map of their world
+    point_ids:      (P,) rows of the points of the submap's map
     keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
     """
 

@@ -1,1 +1,1 @@
-"""What a keyframe does to the map: new points, fusion, culling, local adjustment."""
+"""Local mapping: keyframes, new map points, landmark fusion, culling, local bundle adjustment."""
