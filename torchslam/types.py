@@ -1,4 +1,4 @@
-"""The values that travel between the stages of the pipeline: small frozen dataclasses of tensors.
+"""Values passed between the stages of the pipeline: small frozen dataclasses of tensors.
 
 Letters in shapes: B batch, N keypoints, M matches, L points; H, W image height and width.
 """
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, packed_information, unpacked_information
 
 
@@ -22,12 +23,12 @@ class Frame:
 
     index:     position in the sequence, from 0
     timestamp: seconds
-    image:     (1, 1, H, W) float32 in [0, 1], grey
-    name:      what the image is called in messages (its path, or `video.mp4#17`)
-    T_cw_groundtruth: (4, 4) float64 world to camera, where the sequence knows it. Read only by simulated features,
+    image:     (1, 1, H, W) float32 in [0, 1], gray
+    name:      of the image in messages (its path, or `video.mp4#17`)
+    T_cw_groundtruth: (4, 4) float64 world to camera, if the sequence has it. Read only by simulated features,
                by scale from ground truth and by evaluation.
     mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
-    features:  a batch of one, where they were found already: then nobody needs the image, and H and W may be 0
+    features:  a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0
     backlog:   number of newer frames already queued (live sources only)
     """
 
@@ -45,7 +46,7 @@ class Frame:
 class Features:
     """A batch of keypoints with descriptors. Invalid rows (`mask` False) are finite.
 
-    keypoints:   (B, N, 2) pixels (x, y) of the full-resolution image; (0, 0) is the centre of the top left pixel
+    keypoints:   (B, N, 2) pixels (x, y) of the full-resolution image; (0, 0) is the center of the top left pixel
     scores:      (B, N) response of the detector, higher is better
     scales:      (B, N) size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0,
                  unless the image was reduced before)
@@ -96,7 +97,7 @@ class Matches:
     indices_2: (B, M) int64 rows in the second set
     distances: (B, M) float32: Hamming distance in bits, or 1 - cosine
     mask:      (B, M) bool
-    weights:   (B, M) soft matching weights where they were asked for, else None
+    weights:   (B, M) matching weights, if the matcher gives some
     """
 
     indices_1: Tensor
@@ -108,16 +109,16 @@ class Matches:
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """What the system sees of one frame: its keypoints as the geometry uses them, unbatched.
+    """The features of one frame as the geometry uses them, unbatched.
 
     keypoints:   (N, 2) pixels, in the dtype of the geometry (float64 unless configured)
     scales:      (N,) pixels: the standard deviation of a keypoint grows with the size of its pyramid level
     angles:      (N,) radians
     descriptors: (N, D)
     mask:        (N,) bool
-    session:     which run over the same map saw it, from 0
-    information: (N, I) as in `KeypointNoise`: what the front end says of the keypoints' errors; nothing if left out
-    image:       (1, 1, H, W) grey, where a matcher wants it
+    session:     number of the run over the same map, from 0
+    information: (N, I) as in `KeypointNoise`, of the keypoints; (N, 0) if the front end gives none
+    image:       (1, 1, H, W) gray, if the matcher wants it
     backlog:     as in `Frame`
     """
 
@@ -135,7 +136,7 @@ class FrameFeatures:
     backlog: int = 0
 
     def __post_init__(self) -> None:
-        _nothing_said(self)
+        _fill_information(self)
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> FrameFeatures:
@@ -185,10 +186,45 @@ class FrameFeatures:
 
 
 @dataclass(frozen=True)
-class TwoViewMap:
-    """A pair of views good enough to start a map.
+class MatchPrior:
+    """Prior knowledge about the matches of two views. A matcher may ignore it: all matches are tested later.
 
-    reference, view: the two views; the camera of the reference is the world
+    radius_px:   (N,) search radii; the first view's keypoints are map points at their predicted pixels in the second
+    ratio:       maximum ratio of the best to the second best distance, with a radius; None: no ratio test
+    T_21:        (4, 4) from the first camera to the second; matches lie within `epipolar_px` of their epipolar lines
+    camera:      of both views, with `T_21`
+    """
+
+    radius_px: Tensor | None = None
+    ratio: float | None = None
+    T_21: Tensor | None = None
+    camera: Camera | None = None
+    epipolar_px: float = 0.0
+
+
+Matcher = Callable[[FrameFeatures, FrameFeatures, MatchPrior | None], Matches]
+"""Two views and a prior to a batch of one of `Matches`. Only keypoints of `mask` may match, each of the second view
+once.
+
+A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints. One whose
+attribute `wants_images` is true gets (1, 1, H, W) gray images in `FrameFeatures.image` for frames of this run, but not
+for projected map points."""
+
+
+@dataclass(frozen=True)
+class MatchIndices:
+    """Rows (m,), (m,) of matches, and their weights (m,); None: equal weights."""
+
+    first: Tensor
+    second: Tensor
+    weights: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class TwoViewMap:
+    """A map of two views, the result of initialization.
+
+    reference, view: the two views; the camera of the reference is the world frame
     T_cw:      (4, 4) pose of the second view
     points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
     """
@@ -203,18 +239,18 @@ class TwoViewMap:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A frame that knows where it is.
+    """Pose of a frame, with the inliers it was estimated from.
 
     T_cw:        (4, 4)
-    point_ids:   (m,) map points it sees, inliers alone; keypoints: (m,) at which keypoint
-    matches:     how many matches the inliers were chosen from
+    point_ids:   (m,) map points of the inliers; keypoints: (m,) their keypoints
+    matches:     number of matches from which the inliers were chosen
     covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
-    weights:     (m,) of the matches, where the matcher gave some
-    expected:    (n,) points that it should see; None: those that it does see
-    depth:       median depth of the points it sees
+    weights:     (m,) of the inliers, if the matcher gives some
+    expected:    (n,) points predicted to be visible; None: `point_ids`
+    depth:       median depth of the inliers
     error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
-    coverage_ratio: share of the image in which the points that were expected are found
-    explained_ratio: share of the image with keypoints in which some agree with the map
+    coverage_ratio: ratio of image cells with expected points in which these are found
+    explained_ratio: ratio of image cells with keypoints in which some agree with the map
     """
 
     T_cw: Tensor
@@ -234,15 +270,15 @@ class PoseEstimate:
         return len(self.point_ids)
 
 
-def _nothing_said(seen: FrameFeatures) -> None:
-    """Where no information was given there is none: (n, 0)."""
-    if seen.information.ndim == 1:
-        object.__setattr__(seen, "information", packed_information(None, seen.scales))
+def _fill_information(features: FrameFeatures) -> None:
+    """Replace information that was left out by an empty tensor (n, 0)."""
+    if features.information.ndim == 1:
+        object.__setattr__(features, "information", packed_information(None, features.scales))
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Which keyframe sees which point at which keypoint: flat index tensors, ordered by keyframe, then keypoint.
+    """Observations of points in keyframes: flat index tensors, ordered by keyframe, then keypoint.
 
     keyframe_index, keypoint_index, point_index: (O,) int64
     pixels: (O, 2); scales: (O,) pixels; information: (O, I) as in `KeypointNoise`
@@ -276,7 +312,7 @@ class Trajectory:
 
     @classmethod
     def empty(cls) -> Trajectory:
-        """Without poses."""
+        """A trajectory without poses."""
         return cls(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
 
     def __len__(self) -> int:
@@ -284,7 +320,7 @@ class Trajectory:
 
     @property
     def positions_w(self) -> Tensor:
-        """(N, 3) camera centres."""
+        """(N, 3) camera centers."""
         return self.T_wc[:, :3, 3]
 
 
@@ -348,31 +384,30 @@ class Rejection:
 
 
 class State(Enum):
-    """What the system is doing."""
+    """State of the system after a frame."""
 
     INITIALIZING = "initializing"
     """There is no map yet."""
     TRACKING = "tracking"
-    """There is a pose, and it may be believed."""
+    """There is a pose, and it is certain."""
     UNCERTAIN = "uncertain"
-    """There is a pose, but too little agrees with it, or it was just found again: nothing is built on it yet."""
+    """There is a pose that later frames have to confirm: it is doubtful, or the camera was just relocalized."""
     LOST = "lost"
     """There is a map, and no pose."""
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """What came out of one frame.
+    """The result of one frame.
 
-    state:       after the frame. Uncertain: there is a pose that may be wrong; nothing is built on it until later
-                 frames confirm it
+    state:       after the frame. Uncertain: there is a pose, which later frames have to confirm
     T_cw:        (4, 4) pose of the frame, world to camera; None while initializing or lost
     submap:       number of the submap the pose is in; None without a pose
-    covariance:  (6, 6) of the pose's left perturbation (translation, rotation); None where it was not estimated
+    covariance:  (6, 6) of the pose's left perturbation (translation, rotation); None if it was not estimated
     is_keyframe: whether the frame became a keyframe
     matches:     map points matched in this frame
-    inliers:     of these, those that agree with the pose
-    reason:      in words, why there is no pose or why the frame is a keyframe; empty otherwise
+    inliers:     number of these that agree with the pose
+    reason:      why there is no pose or why the frame is a keyframe, as text; empty otherwise
     stage_ms:    milliseconds per stage
     """
 

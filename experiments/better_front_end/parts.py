@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from torchslam.config import MatchingConfig
 from torchslam.features import match
-from torchslam.tracking.matcher import DescriptorMatcher, MatchPrior, max_distance
-from torchslam.types import FrameFeatures, Matches
+from torchslam.tracking.matcher import DescriptorMatcher, max_distance
+from torchslam.types import FrameFeatures, Matches, MatchPrior
 
 
 class Mutual:

@@ -12,8 +12,8 @@ from experiments import cached_features
 from experiments.better_front_end.parts import Mutual
 from experiments.recordings import Outcome, Outcomes, geometric_mean, interval, log_ratios, report
 from torchslam import ORB, load_config, open_sequence
-from torchslam.tracking.matcher import DescriptorMatcher, MatchPrior
-from torchslam.types import FrameFeatures
+from torchslam.tracking.matcher import DescriptorMatcher
+from torchslam.types import FrameFeatures, MatchPrior
 
 ROOM = "synthetic:room?frames=14"
 

@@ -13,8 +13,8 @@ from torchslam.config import load_config
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, transform
 from torchslam.map.atlas import Submap
 from torchslam.tracking.localizer import Localizer
-from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.tracker import Tracker
+from torchslam.types import MatchIndices
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)

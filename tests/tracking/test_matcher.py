@@ -14,8 +14,8 @@ from torch import Tensor
 from tests.walks import Walk, arc
 from torchslam import SLAM, Matches, Run, load_config
 from torchslam.errors import ConfigError
-from torchslam.tracking.matcher import DescriptorMatcher, Matcher, MatchPrior, nearest_keypoints
-from torchslam.types import FrameFeatures, State
+from torchslam.tracking.matcher import DescriptorMatcher, nearest_keypoints
+from torchslam.types import FrameFeatures, Matcher, MatchPrior, State
 
 CONFIG = load_config(
     None,

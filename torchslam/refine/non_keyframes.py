@@ -14,11 +14,10 @@ from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
 from torchslam.tracking.correspondences import match_keyframe
-from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import validate_pose
 from torchslam.tracking.relocalization import single_frame_state
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult
+from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate, State, StepResult
 
 NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame
 

@@ -31,11 +31,11 @@ from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
-from torchslam.tracking.matcher import Matcher, make_matcher, prepare_view
+from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.tracking.pose_confirmation import PoseConfirmation
 from torchslam.tracking.provisional_map import ProvisionalMap
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Frame, FrameFeatures, State, StepResult, Trajectory
+from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
 
 
@@ -51,7 +51,7 @@ class SLAM:
             `features.max_image_pixels` reduces them, and are scaled for larger ones.
         extractor: The front end, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
-        matcher: The matcher of two views, see `tracking.matcher.Matcher`; the configured one if None.
+        matcher: The matcher of two views, see `types.Matcher`; the configured one if None.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Who matches whom: views with views, map points with a view. The configured thresholds meet the pure matchers here."""
+"""Data association with the configured thresholds: views with views, map points with views."""
 
 from __future__ import annotations
 
@@ -12,20 +12,13 @@ from torchslam.config import MatchingConfig
 from torchslam.features import match
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
-from torchslam.tracking.matcher import (
-    DescriptorMatcher,
-    Matcher,
-    MatchIndices,
-    MatchPrior,
-    max_distance,
-    run_matcher,
-)
-from torchslam.types import FrameFeatures
+from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
+from torchslam.types import FrameFeatures, Matcher, MatchIndices, MatchPrior
 
 
 @dataclass(frozen=True)
 class Projected:
-    """Map points that a camera may see: ids (n,), pixels (n, 2), scales (n,) expected, angles (n,) last seen."""
+    """Map points predicted to be visible: ids (n,), pixels (n, 2), predicted scales (n,), last observed angles (n,)."""
 
     ids: Tensor
     pixels: Tensor
@@ -49,17 +42,19 @@ def project_points(
     max_view_angle_deg: float,
     scale_range: tuple[float, float],
 ) -> Projected:
-    """The living points of (n,) in front of the camera, inside the image and seen from a similar side as before.
+    """The valid points of ids (n,) in front of the camera, in the image and seen from a similar direction as before.
 
-    Expected scales stay in `scale_range`, those that the detector has.
+    Predicted scales are clamped to `scale_range`, the scales of the detector.
     """
-    pixels, scales, visible = look_at(slam_map, ids, T_cw, camera, max_view_angle_deg, scale_range)
+    pixels, scales, visible = predict_observations(
+        slam_map, ids, T_cw, camera, max_view_angle_deg, scale_range
+    )
     kept = torch.nonzero(visible)[:, 0]
     ids = ids[kept]
     return Projected(ids, pixels[kept], scales[kept], slam_map.points["angles"][ids])
 
 
-def look_at(
+def predict_observations(
     slam_map: Map,
     ids: Tensor,
     T_cw: Tensor,
@@ -67,9 +62,10 @@ def look_at(
     max_view_angle_deg: float,
     scale_range: tuple[float, float] | tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where points (n,) should appear in cameras (..., 4, 4): (..., n, 2) pixels, (..., n) scales, (..., n) whether.
+    """Predicted pixels (..., n, 2), scales (..., n) and visibility (..., n) of points (n,) in cameras (..., 4, 4).
 
-    scale_range: as in `project_points`, numbers or (..., 1)
+    Args:
+        scale_range: as in `project_points`, numbers or (..., 1)
     """
     points = slam_map.points
     positions_w = points["positions_w"][ids]
@@ -78,12 +74,12 @@ def look_at(
     distance = torch.linalg.vector_norm(rays_w, dim=-1).clamp(min=1e-12)
     cosine = (rays_w * points["view_directions_w"][ids]).sum(-1) / distance
     least = math.cos(math.radians(max_view_angle_deg))
-    valid &= points["is_valid"][ids]  # a track may still name points that died since
+    valid &= points["is_valid"][ids]  # the local map may contain points that were removed since
     scales = (points["scale_distance"][ids] / distance).clamp(*scale_range)
     return pixels, scales, valid & camera.in_image(pixels) & (cosine > least)
 
 
-def match_near(
+def match_projected_points(
     slam_map: Map,
     projected: Projected,
     view: FrameFeatures,
@@ -93,7 +89,7 @@ def match_near(
 ) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
-    The radius is in pixels of the pyramid level at which the point is expected.
+    The radius is in pixels of the pyramid level that is predicted for the point.
     """
     if len(projected.ids) == 0:
         return MatchIndices(projected.ids, projected.ids)
@@ -103,7 +99,7 @@ def match_near(
 
 
 def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> FrameFeatures:
-    """What the map expects a camera to see, as a view: points where they should appear, as they looked last."""
+    """Projected map points as a view, with their predicted pixels and scales and their last descriptors."""
     return FrameFeatures(
         view.index,
         view.timestamp,
@@ -117,7 +113,7 @@ def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> F
 
 
 def match_points(slam_map: Map, ids: Tensor, view: FrameFeatures, settings: MatchingConfig) -> MatchIndices:
-    """Point ids and keypoints that match by descriptor alone, wherever they are in the image."""
+    """Point ids and keypoints that match by descriptor alone, in the whole image."""
     if len(ids) == 0:
         return MatchIndices(ids, ids)
     matches = match(
@@ -132,7 +128,7 @@ def match_points(slam_map: Map, ids: Tensor, view: FrameFeatures, settings: Matc
 
 
 def match_keyframe(slam_map: Map, keyframe: int, view: FrameFeatures, matcher: Matcher) -> MatchIndices:
-    """Points that a keyframe sees and keypoints of a view, matched by the keyframe's own descriptors."""
+    """Points of a keyframe and keypoints of a view, matched by the keyframe's own descriptors."""
     seen = slam_map.view(keyframe)
     point_ids = slam_map.keyframes["point_ids"][keyframe]
     pairs = run_matcher(matcher, replace(seen, mask=seen.mask & (point_ids >= 0)), view)

@@ -20,8 +20,8 @@ from torchslam.geometry import (
     triangulate,
 )
 from torchslam.optim import BundleProblem, bundle_adjust
-from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
-from torchslam.types import FrameFeatures, Reason, Rejection, TwoViewMap
+from torchslam.tracking.matcher import make_matcher, run_matcher
+from torchslam.types import FrameFeatures, Matcher, Reason, Rejection, TwoViewMap
 
 TRIANGULATION_GATE_SIGMA = (
     3.0  # times the noise: how far a triangulated point may miss its pixels before it is refined

@@ -14,8 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.tracking.matcher import MatchPrior
-from torchslam.types import FrameFeatures, Matches
+from torchslam.types import FrameFeatures, Matches, MatchPrior
 from torchslam.utils.bounded_read import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights

@@ -21,7 +21,7 @@ from torchslam.geometry import (
 )
 from torchslam.map.map import Map
 from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
-from torchslam.tracking.correspondences import Projected, match_near, project_points
+from torchslam.tracking.correspondences import Projected, match_projected_points, project_points
 from torchslam.tracking.match_selection import (
     MATURE_OBSERVATIONS,
     coverage_ratio,
@@ -30,8 +30,8 @@ from torchslam.tracking.match_selection import (
     select_mature,
     subsample_per_cell,
 )
-from torchslam.tracking.matcher import DescriptorMatcher, MatchIndices
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.tracking.matcher import DescriptorMatcher
+from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate
 
 OUTLIER_GATE_FACTOR = 4.0
 """Factor on the chi-square gate before the first refinement: matches up to twice as far off may become inliers."""
@@ -97,7 +97,7 @@ class Localizer:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self.project(slam_map, candidates, T_cw, view)
-        guided = match_near(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
+        guided = match_projected_points(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
         ids, at, noise = guided.first, guided.second, view.noise[guided.second]
         if len(ids) < settings.min_inliers:
             return None

@@ -1,9 +1,8 @@
-"""Who matches whom between two views: the hook for matchers, and torchslam's own by descriptors."""
+"""Matching of two views: the descriptor matcher, and the checks of matchers from outside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,51 +11,13 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import match, match_by_projection
-from torchslam.geometry import Camera
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
-from torchslam.types import Frame, FrameFeatures, Matches
-
-
-@dataclass(frozen=True)
-class MatchPrior:
-    """What is known of two views before they are matched. A matcher may leave it alone: what it finds is tested.
-
-    radius_px:   (N,) of the first view's keypoints, which then are predictions: where points of the map should appear
-                 in the second view, with the scale and the descriptor they had; their partners lie so near
-    ratio:       of the best to the second best distance, where there is a radius; None: no such test
-    T_21:        (4, 4) from the first camera to the second, of length as in the map, and `camera` of both: partners lie
-                 within `epipolar_px` of their epipolar lines
-    """
-
-    radius_px: Tensor | None = None
-    ratio: float | None = None
-    T_21: Tensor | None = None
-    camera: Camera | None = None
-    epipolar_px: float = 0.0
-
-
-Matcher = Callable[[FrameFeatures, FrameFeatures, MatchPrior | None], Matches]
-"""Two views, and what is known before, to a batch of one of `Matches`. Only keypoints of `mask` may match, each of the
-second view once.
-
-A matcher whose attribute `weighs` is true gives `weights`, which multiply the information of the keypoints. One whose
-attribute `wants_images` is true finds (1, 1, H, W) gray images in `FrameFeatures.image`: of frames of this run, not of
-the appearance that the map predicts."""
-
-
-@dataclass(frozen=True)
-class MatchIndices:
-    """Rows (m,), (m,) that match, and what each match counts, (m,); None: all alike."""
-
-    first: Tensor
-    second: Tensor
-    weights: Tensor | None = None
+from torchslam.types import Frame, FrameFeatures, Matcher, Matches, MatchIndices, MatchPrior
 
 
 class DescriptorMatcher:
-    """torchslam's own: mutual nearest descriptors with the ratio test; near a prediction, or along an epipolar line,
-    where there is a prior."""
+    """Matches mutual nearest descriptors with the ratio test; with a prior, near a prediction or an epipolar line."""
 
     def __init__(self, settings: MatchingConfig) -> None:
         self.settings = settings
@@ -91,7 +52,7 @@ class DescriptorMatcher:
 
 
 def _all_alike(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances and mask of pairs (n,) that all match: nobody asks how well."""
+    """Distances and mask of pairs (n,) that all match; the distances are not used."""
     return rows.new_zeros(1, len(rows), dtype=torch.float32), torch.ones_like(rows, dtype=torch.bool)[None]
 
 
@@ -101,7 +62,7 @@ def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
 
 
 def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
-    """A matcher of one's own, or the configured one. Raises ConfigError where there is none of its name."""
+    """The given matcher, or else the configured one. Raises ConfigError if its name is unknown."""
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
 
@@ -112,7 +73,7 @@ def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Ma
 
 
 def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFeatures:
-    """A view as a matcher wants it: with the image, with stated noise that weights can multiply."""
+    """The view with what a matcher needs: the image, explicit noise that weights can multiply."""
     if getattr(matcher, "weighs", False):
         view = replace(view, information=view.noise.with_explicit_information().information)
     if getattr(matcher, "wants_images", False) and frame.image.numel():
@@ -123,7 +84,7 @@ def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFe
 def run_matcher(
     matcher: Matcher, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
 ) -> MatchIndices:
-    """Who matches whom. Raises ConfigError where a matcher's answer is not that of one."""
+    """Run a matcher. Raises ConfigError if its result is malformed."""
     found = matcher(view_1, view_2, prior)
     if not isinstance(matcher, DescriptorMatcher):
         check_matches(found, view_1, view_2, matcher)
@@ -135,7 +96,7 @@ def run_matcher(
 
 
 def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matcher: object) -> None:
-    """Raises ConfigError where `found` is not `Matches` between two views, each keypoint of the second used once."""
+    """Raise ConfigError unless `found` is `Matches` of two views that use each keypoint of the second once."""
     name = getattr(matcher, "__name__", type(matcher).__name__)
 
     def refuse(what: str) -> None:
@@ -165,11 +126,13 @@ def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matc
 
 
 def nearest_keypoints(pixels: Tensor, rows: Tensor, view: FrameFeatures, radius_px: float = 1.5) -> Matches:
-    """What a dense matcher or optical flow says, as matches of keypoints: pixels (n, 2) in a view of keypoints `rows`
-    (n,) of another one belong to the view's nearest keypoint.
+    """Convert the result of a dense matcher or optical flow to matches of keypoints.
 
-    Where there is none within the radius there is no match: a point of the map is always a keypoint of both views. Of
-    several that come to one keypoint the nearest counts.
+    Each pixel is matched with the view's nearest keypoint within the radius, each keypoint with its nearest pixel.
+
+    Args:
+        pixels: (n, 2) in `view`, where keypoints of another view appear
+        rows: (n,) of these keypoints
     """
     distances = torch.cdist(pixels.to(view.keypoints), view.keypoints).masked_fill(~view.mask, torch.inf)
     nearest, column = distances.min(1)

@@ -8,8 +8,8 @@ from torchslam.config import Config
 from torchslam.geometry import Camera, epipolar_offsets, se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.matcher import Matcher, make_matcher, run_matcher
-from torchslam.types import FrameFeatures, TwoViewMap
+from torchslam.tracking.matcher import make_matcher, run_matcher
+from torchslam.types import FrameFeatures, Matcher, TwoViewMap
 
 CHECK_INTERVAL = 5
 """Frames between two checks; a turning camera soon no longer sees what the first frame saw."""

@@ -11,10 +11,9 @@ from torchslam.config import Config
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.tracking.correspondences import match_keyframe
-from torchslam.tracking.matcher import MatchIndices
 from torchslam.tracking.pose_validation import validate_pose
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate
 
 Candidate = tuple[Submap, int]
 """A keyframe that may show the same place: its submap and row."""

@@ -16,21 +16,19 @@ from torchslam.geometry import (
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.tracking.correspondences import match_near, match_points
+from torchslam.tracking.correspondences import match_points, match_projected_points
 from torchslam.tracking.localizer import Localizer
-from torchslam.tracking.matcher import Matcher, MatchIndices, make_matcher
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.tracking.matcher import make_matcher
+from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 
 EMA_RATE = 0.1
 """Weight of the newest frame in the moving averages of the tracking state."""
 
 
 class Tracker:
-    """Follows the camera against the local map: the keyframes around the reference keyframe and their points.
+    """Tracks the camera against the local map: the keyframes covisible with the reference keyframe, and their points.
 
-    It keeps nothing itself: where the camera was is the track of the world.
-
-    counts: whether points remember when and how often they were seen; without it, tracking leaves the map as it is
+    Stateless: the state is `Submap.tracking`.
     """
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
@@ -44,10 +42,10 @@ class Tracker:
         """Choose whether observations are counted in the map; without it, tracking does not change the map."""
         self.counts = counts
 
-    # --- the track -------------------------------------------------------------------------------------------
+    # --- tracking state -------------------------------------------------------------------------------------------
 
     def reset_to_keyframe(self, submap: Submap, keyframe: int) -> None:
-        """Go on from a keyframe: the last frame is at its place."""
+        """Continue from a keyframe, as if the last frame had its pose."""
         T_cw = submap.map.T_cw[keyframe]
         seen = submap.map.keyframes["point_ids"][keyframe]
         submap.tracking = replace(
@@ -59,7 +57,7 @@ class Tracker:
         )
 
     def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
-        """A track that is at T_cw, seen from this keyframe; what is around the keyframe is the local map."""
+        """The tracking state of a frame at T_cw (4, 4) with this reference keyframe and its local map."""
         local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
         recent = self.settings.recent_frames if self.counts else 0
         if recent:
@@ -80,7 +78,7 @@ class Tracker:
         )
 
     def predict(self, submap: Submap) -> Tensor:
-        """(4, 4) where the next frame should be: constant velocity."""
+        """(4, 4) predicted pose of the next frame, by constant velocity."""
         if submap.tracking.velocity is None or not self.settings.motion_model:
             return submap.T_cw
         return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
@@ -88,9 +86,10 @@ class Tracker:
     # --- one frame -------------------------------------------------------------------------------------------
 
     def track(self, submap: Submap, view: FrameFeatures, is_sure: bool = True) -> PoseEstimate | None:
-        """Locate the frame that comes after the last one; None when it cannot be located.
+        """Estimate the pose of the next frame and update the tracking state; None if it cannot be found.
 
-        is_sure: the last frames are believed, so that the pose is looked for next to where they lead
+        Args:
+            is_sure: the last poses are certain, so that a pose near the predicted one is tried first
         """
         expected = self.predict(submap)
         candidates = self._candidates(submap, view, expected)
@@ -104,22 +103,24 @@ class Tracker:
         return estimate
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
-        """Ever wider guesses of who matches whom: near the prediction, in a wider window, anywhere."""
+        """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
         slam_map, tracking, settings = submap.map, submap.tracking, self.settings
         if settings.guided_matching:
             alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_near(slam_map, near, view, settings.search_radius_px, self.matcher, ratio=0.9)
+            yield match_projected_points(
+                slam_map, near, view, settings.search_radius_px, self.matcher, ratio=0.9
+            )
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
             wide = settings.search_radius_px * settings.wide_radius_factor
-            yield match_near(slam_map, local, view, wide, self.matcher, ratio=0.9)
+            yield match_projected_points(slam_map, local, view, wide, self.matcher, ratio=0.9)
         else:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
         yield match_points(slam_map, tracking.local_points, view, self.matching)
 
     def update(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """Take a frame over into the track: velocity, reference keyframe, counters of the points."""
+        """Update the tracking state by a frame: velocity, averages, reference keyframe, `last_seen_frame`."""
         slam_map, tracking = submap.map, submap.tracking
         tracking.velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
         tracking.last_inlier_points = estimate.point_ids
@@ -140,7 +141,7 @@ class Tracker:
             )
 
     def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """Begin a track anew, wherever in the map: at a frame that was located without one."""
+        """Start the tracking state at a frame that was posed without one."""
         best = int(submap.map.observers(estimate.point_ids).argmax())
         self._update_last_seen(submap.map, view, estimate)
         submap.tracking = replace(
@@ -150,24 +151,24 @@ class Tracker:
         )
 
     def count_visible(self, slam_map: Map, estimate: PoseEstimate) -> None:
-        """A frame is believed: the points that it should see were there to be seen."""
+        """Increment `times_visible` of the points that a frame with a certain pose should observe."""
         if self.counts:
             expected = estimate.point_ids if estimate.expected is None else estimate.expected
             slam_map.points["times_visible"][expected] += 1
 
     def count_found(self, slam_map: Map, estimate: PoseEstimate) -> None:
-        """A frame is believed: it speaks for the points that it saw."""
+        """Increment `times_found` of the points that a frame with a certain pose observes."""
         if self.counts:
             slam_map.points["times_found"][estimate.point_ids] += 1
 
     def _update_last_seen(self, slam_map: Map, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """The points that a frame saw remember when that was."""
+        """Set `last_seen_frame` of the points that a frame observes."""
         if self.counts:
             slam_map.points["last_seen_frame"][estimate.point_ids] = view.index
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
-    """How many points of a keyframe three local keyframes see: what the next frames can be expected to see."""
+    """Number of points of a keyframe that at least three local keyframes observe."""
     table = slam_map.keyframes["point_ids"]
     local = table[local_keyframes].flatten()
     counts = torch.bincount(local[local >= 0], minlength=len(slam_map.points))
