@@ -22,7 +22,7 @@ from torchslam.config import (
     load_config,
     to_toml,
 )
-from torchslam.config.schema import MAX_BYTES, Allowed, Settings, to_commented_toml, setting
+from torchslam.config.schema import MAX_BYTES, Allowed, Settings, setting, to_commented_toml
 from torchslam.errors import ConfigError
 
 SECTIONS = {

@@ -54,7 +54,7 @@ def test_an_index_of_more_frames_than_bytes(
     assert len(open_sequence(film, CAMERA)) == 5
     film.write_bytes(edited(film.read_bytes(), lambda name, body: change(body) if name == kind else body))
     with pytest.raises(
-        SequenceError, match=r"film\.mp4: damaged: its index speaks of 1\d{8} frames, the file has"
+        SequenceError, match=r"film\.mp4: damaged: its index declares 1\d{8} frames, but the file has"
     ):
         open_sequence(film, CAMERA)
 

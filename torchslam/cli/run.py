@@ -128,8 +128,8 @@ def execute(options: argparse.Namespace) -> int:
         import_rerun()
     saved = options.map
     if saved is not None and saved.is_dir():
-        beside = saved / CONFIG
-        options.config = options.config or (beside if beside.is_file() else None)
+        own = saved / CONFIG
+        options.config = options.config or (own if own.is_file() else None)
         saved = saved / MAP
     plan = Plan(
         source=options.path,

@@ -1,7 +1,7 @@
-"""Public sequences from their servers: fetched with resume, unpacked without trust, put in place at once.
+"""Download of public sequences: resumable transfers, safe unpacking, atomic placement.
 
-Neither the server nor the archive decides how much that takes: both have limits. An archive that cannot be unpacked, or
-is not the one that was wanted, is deleted, so that the next try fetches it again.
+The sizes of transfers and unpacked archives are limited. An archive that cannot be unpacked or has a wrong checksum is
+deleted, so that the next call downloads it again.
 
 Source of the archives: https://www.eth3d.net/slam_datasets
 """
@@ -38,7 +38,7 @@ MAX_BYTES = 1 << 34
 """An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
 UNPACKING, CONTENT = ".unpacking", "content"
 OF_THE_DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
-"""Errors that say nothing against an archive."""
+"""Errors that are not caused by the archive."""
 SLOWEST = 4096
 """Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
 MARGIN = 1 << 30
@@ -179,11 +179,11 @@ def _fetch(url: str, path: Path, progress: bool) -> None:
             failure = f"broke off after {arrived} of {total} bytes"
         arrived = part.stat().st_size if part.exists() else 0
         if attempt == ATTEMPTS or arrived <= before:
-            raise DownloadError(f"{url}: {failure}; run the same command again to go on from there")
+            raise DownloadError(f"{url}: {failure}; run the same command again to resume")
 
 
 def _transfer(url: str, part: Path, progress: bool) -> int | None:
-    """Append to `part` what is missing; returns the size the whole file should have, where the server says."""
+    """Append the missing bytes to `part`; return the size of the complete file, if the server reports it."""
     start = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
     try:

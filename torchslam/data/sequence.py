@@ -91,7 +91,7 @@ class Sequence(ABC):
         """Intrinsics, for the size of the images. Raises CalibrationError where they are missing."""
         if self._camera is None:
             raise CalibrationError(
-                f"{self.name}: nothing says which camera took the images ({self.kind}); give it with "
+                f"{self.name}: the camera is unknown ({self.kind}); give it with "
                 "--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], a calibration file, a preset such as tum-fr1, "
                 "or a guess: fov=65 (degrees), f=0.8w (image widths), exif"
             )

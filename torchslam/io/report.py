@@ -195,7 +195,7 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _describe_submaps(metrics: Mapping[str, Any]) -> dict[str, str]:
-    """The submaps beside the main one, and the sessions before this one, in words; nothing where there are none."""
+    """Describe other submaps and earlier sessions as rows for `table`; empty if there are none."""
     rows = {}
     if metrics["session"]:
         (main,) = (submap for submap in metrics["submaps"] if submap["submap"] == metrics["submap"])

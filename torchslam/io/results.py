@@ -115,13 +115,13 @@ def read_results(directory: Path) -> Results:
         raise ResultsError(f"{directory}: no such results folder")
     saved, metrics = read_atlas(directory / MAP), read_metrics(directory)
     main = [submap.map for submap in saved.atlas if submap.number == metrics["submap"]]
-    beside = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
+    paths = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     return Results(
         trajectory=read_trajectory(directory / TRAJECTORY) if metrics["posed"] else Trajectory.empty(),
         keyframes=read_trajectory(directory / KEYFRAMES) if metrics["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
-        others={number: read_trajectory(path) for number, path in beside.items() if path.exists()},
+        others={number: read_trajectory(path) for number, path in paths.items() if path.exists()},
         map=main[0] if main else Map(),
         submaps=tuple(saved.atlas),
         camera=saved.camera,

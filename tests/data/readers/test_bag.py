@@ -140,7 +140,7 @@ def test_several_topics(tmp_path: Path) -> None:
             recording.image(topic, image // (1 + ("1" in topic)), stamp)
     path = recording.close()
     with pytest.raises(
-        SequenceError, match=r"2 topics of images; which one\? Give '.*r\.bag\?topic=/cam0/image_raw' or"
+        SequenceError, match=r"2 topics of images; choose one: '.*r\.bag\?topic=/cam0/image_raw' or"
     ):
         open_sequence(path)
     second = open_sequence(f"{path}?topic=/cam1/image_raw")

@@ -132,5 +132,5 @@ def test_damaged_end_of_a_video(tmp_path: Path, video: Path) -> None:
     damaged.write_bytes(data)
     sequence = open_sequence(damaged, CAMERA)
     assert len(sequence) == 7
-    assert sequence.notes == ("7 frames can be decoded; the file speaks of 8",)
+    assert sequence.notes == ("7 frames can be decoded; the file declares 8",)
     assert float(sequence[6].image.mean()) == pytest.approx(180 / 255, abs=0.01)

@@ -19,7 +19,7 @@ from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.bounded_read import JSON_BYTES, parse_json
 
 MAX_BYTES = 1 << 18
-LARGEST = 1e12  # numbers in JSON have any number of digits
+LARGEST = 1e12  # JSON numbers may have any number of digits
 FISHEYES = ("equidistant", "fisheye", "kannala", "opencv_fisheye")
 BROWN = ("plumb_bob", "radtan", "radial-tangential", "radial_tangential", "rational_polynomial", "none", "")
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
@@ -44,9 +44,9 @@ COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """A calibration from a file, told by what is in it.
+    """Read a calibration file, recognized by its content.
 
-    Known are a line of numbers (`parse_numbers`, the distortion perhaps in a `distortion.txt` beside it), OpenCV's YAML
+    Supported are a line of numbers (`parse_numbers`, optionally with a `distortion.txt` next to it), OpenCV's YAML
     and XML, ROS camera_info, Kalibr's camchain, EuRoC's sensor.yaml, ORB-SLAM3's settings, COLMAP's cameras.txt and
     nerfstudio's transforms.json.
 
@@ -246,7 +246,7 @@ def _size(width: list[float] | None, height: list[float] | None) -> Size | None:
 
 
 def yaml_value(text: str, key: str) -> str | None:
-    """What stands behind the first `key:` as words; of a matrix its `data`; None where the key is missing."""
+    """Return the text after the first `key:`, of a matrix its `data`; None if the key is missing."""
     found = re.search(rf"^([ \t]*(?:- )?){re.escape(key)}[ \t]*:", text, re.MULTILINE)
     if found is None:
         return None
@@ -274,7 +274,7 @@ def yaml_numbers(text: str, keys: tuple[str, ...], where: str) -> list[float] | 
 
 
 def _bracketed(text: str) -> str:
-    """The words of a list in brackets, which may hold lists, over as many lines as it takes."""
+    """Return the words of a (nested) bracketed list, which may span lines."""
     depth, words = 0, []
     for part in re.findall(r"\[|\]|#[^\n]*|[^\[\]#]+", text):
         depth += (part == "[") - (part == "]")

@@ -17,7 +17,7 @@ MAX_FILES = 1_000_000
 FOLDERS = ("images", "rgb", "image", "color", "colour", "frames", "imgs", "img", "image_0", "image_2")
 """Subfolders that are searched for frames."""
 
-# Words of a name, set off by anything but letters, that say what an image is when it is no frame.
+# Words in the name of an image that is not a frame, separated by anything but letters.
 OTHER_KINDS = {
     "depth": "depth images",
     "disp": "disparities",
@@ -47,7 +47,7 @@ class Found:
 
     @property
     def notes(self) -> list[str]:
-        """What was left out, in words."""
+        """Notes on the images that were ignored."""
         kinds = ", ".join(f"{count} {kind}" for kind, count in self.left_out.items())
         return [f"ignored: {kinds}"] if kinds else []
 

@@ -50,7 +50,7 @@ class GivenPoses:
     T_cw:        (N, 4, 4) world to camera, camera axes x right, y down, z forward
     timestamps:  (N,) seconds, where images are known by their times
     names:       N names of image files, where they are known by these
-    calibration: of the images, where the program says it
+    calibration: of the images, if known
     """
 
     kind: str

@@ -26,9 +26,9 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp",
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
-"""An image file above this size is not read."""
+"""Size limit of image files."""
 MAX_PIXELS = 1 << 26
-"""Pixels of the largest image that is decoded: a small file may promise any number of them."""
+"""Maximum number of pixels; a small file may declare any number."""
 
 
 def read_gray(path: str | Path, where: str, bits: int = 8) -> Tensor:
@@ -57,7 +57,7 @@ def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
     if _is_truncated(data):
-        raise FrameError(f"{where}: {path} is truncated: it lacks the mark of its end")
+        raise FrameError(f"{where}: {path} is truncated: its end marker is missing")
     image = decode_pixels(data, flags)
     if image is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
@@ -67,7 +67,7 @@ def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
 def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     """An image file's bytes as (H, W) gray, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
     whole image."""
-    if not data or _promised_pixels(data) > MAX_PIXELS:
+    if not data or _declared_pixels(data) > MAX_PIXELS:
         return None
     if flags == AS_GRAY and (gray := decode_png_gray(data)) is not None:
         return gray
@@ -99,8 +99,8 @@ def bgr_to_tensor(image: np.ndarray) -> Tensor:
     return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
-def _promised_pixels(data: bytes) -> int:
-    """How many pixels a header promises, in all its pages; more than are decoded where it does not say."""
+def _declared_pixels(data: bytes) -> int:
+    """Return the number of pixels that a header declares; more than the limit if it cannot be read."""
     if data.startswith((b"II*\0", b"MM\0*")):
         return _tiff_pixels(data)
     try:
@@ -222,7 +222,7 @@ def decode_png_gray(data: bytes) -> np.ndarray | None:
             return kornia_rs.io.decode_image_png_u8(data, size, "mono")[..., 0]
         if (bits, color) == (8, PNG_COLOR):
             return cv2.transform(kornia_rs.io.decode_image_png_u8(data, size, "rgb"), TO_GRAY).reshape(size)
-    except Exception:  # the decoder has no error of its own
+    except Exception:  # the decoder has no exception type
         return None
     return None
 

@@ -64,7 +64,7 @@ COLORS = {
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of images, with the calibration that was recorded beside it.
+    """An image topic and its recorded calibration.
 
     times: seconds since 1970, by the images' own stamps, or by when they were recorded where they have none
     """
@@ -75,10 +75,10 @@ class Topic:
 
 
 class BagSequence(Sequence):
-    """The images of one topic, read in order; going back reads from the start again."""
+    """Images of one topic, read in order; seeking backwards reads from the start again."""
 
     def __init__(self, path: Path, reader: AnyReader, topic: Topic, camera: GivenCamera | None) -> None:
-        """Raises SequenceError where no image can be read, CalibrationError for a camera that does not fit."""
+        """Raises SequenceError if no image can be read, CalibrationError for a camera of another size."""
         self._path, self._reader, self._connection = path, reader, topic.connection
         # Messages may be recorded late: frames come in the order in which they were taken.
         order = sorted(range(len(topic.times)), key=lambda message: topic.times[message])
@@ -116,7 +116,7 @@ class BagSequence(Sequence):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Raises SequenceError where the recording has gone."""
+        """Raises SequenceError if the recording is gone."""
         self.__dict__.update(state)
         self._reader = _open_reader(self._path)
         self._connection = _connection(self._reader, state["_connection"])
@@ -138,7 +138,7 @@ class BagSequence(Sequence):
         self._stream, self._position = self._reader.messages([self._connection]), 0
 
     def _read(self, message: int) -> np.ndarray:
-        """(H, W) gray pixels of a message, by its place in the recording."""
+        """Return the gray pixels (H, W) of a message, by its index in the recording."""
         if message < self._position:
             self._rewind()
         where = f"{self._path}{self._connection.topic}, message {message}"
@@ -183,13 +183,13 @@ def to_gray(message: Any, where: str) -> np.ndarray:
 
 
 def matches(path: str) -> bool:
-    """Whether this is a bag's file, or the folder of one of ROS 2."""
+    """True for a bag file or the folder of a ROS 2 recording."""
     source = Path(path.partition("?topic=")[0])
     return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
-    """The images of a recording; without `camera`, by the camera_info beside them.
+    """Open the images of a recording; without `camera`, its camera_info is used.
 
     Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
     """
@@ -211,21 +211,21 @@ def _open_reader(path: Path) -> AnyReader:
             if not file.is_dir():
                 limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
                 check_regular(file, limit, "a file of a recording")
-        # A single file of ROS 2 is in the folder of its recording, or a recording of its own.
+        # A single ROS 2 file is part of a recording folder or a complete recording.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     return reader
 
 
 def _connection(reader: AnyReader, topic: str) -> Connection:
-    """The one that a topic's images come by."""
+    """Return the connection of an image topic."""
     return next(
         each for each in reader.connections if each.topic == topic and each.msgtype in (IMAGE, COMPRESSED)
     )
 
 
 def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
-    """The topic to be read. Raises SequenceError where there is none, or several and none is named."""
+    """Select the image topic. Raises SequenceError if there is none, or several without a choice."""
     if not all(isinstance(each.topic, str) for each in reader.connections):
         raise SequenceError(f"{path}: cannot be read: topics without a name")
     images = [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
@@ -237,7 +237,7 @@ def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
         raise SequenceError(f"{path}: no images on {wanted or 'any topic'}; topics of images: {there}")
     if len(topics) > 1:
         proposals = " or ".join(f"'{path}?topic={topic}'" for topic in topics[:6])
-        raise SequenceError(f"{path}: {len(topics)} topics of images; which one? Give {proposals}")
+        raise SequenceError(f"{path}: {len(topics)} topics of images; choose one: {proposals}")
     connection = _connection(reader, topics[0])
     beside = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
     infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == beside]
@@ -279,7 +279,7 @@ def from_camera_info(message: Any, source: str, rectified: bool) -> Calibration 
 
 @contextlib.contextmanager
 def _errors(where: str) -> Iterator[None]:
-    """What reading a recording may raise, as SequenceError at `where`: damaged files fail in any way there is."""
+    """Convert any exception of the reader to SequenceError at `where`: damaged files can raise anything."""
     try:
         yield
     except SequenceError:

@@ -32,7 +32,7 @@ def matches(path: str) -> bool:
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
 
-    TUM's archives carry none, but their name says which of its published cameras took them.
+    The archives of TUM contain no calibration; their name identifies the published camera.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     folder = Path(path)

@@ -19,7 +19,7 @@ from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 
 LOOKS_FOR = f"images, or a folder {'/, '.join(FOLDERS)}/ with images"
 DEFAULT_RATE = 30.0
-"""Frames per second where the images do not say."""
+"""Frame rate of images without timestamps."""
 
 
 def matches(path: str) -> bool:
@@ -45,7 +45,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
 
 
 def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
-    """Frames without times of their own, `rate` of them per second."""
+    """Build entries for frames without timestamps, `rate` per second."""
     return [ImageEntry(index / rate, image, str(image)) for index, image in enumerate(frames)]
 
 

@@ -1,4 +1,4 @@
-"""A sequence of image files: what the readers of ETH3D, TUM, KITTI, EuRoC and plain folders all end in."""
+"""Sequence of image files, used by the readers of datasets and plain folders."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 
 SAMPLES = 20
-"""Images in which the brightest pixel of a sequence of 16 bits is looked for."""
+"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
 ATTEMPTS = 20
-"""Unreadable images after which a sequence is given up."""
+"""Number of unreadable images after which opening a sequence fails."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ImageEntry:
 
 
 class ImageSequence(Sequence):
-    """Images from files, decoded when asked for."""
+    """Sequence of image files, decoded on access."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Folders of the KITTI odometry benchmark: `image_0/`, `times.txt`, `calib.txt`, poses beside the sequences.
+"""Folders of the KITTI odometry benchmark: `image_0/`, `times.txt`, `calib.txt`, poses next to the sequences.
 
 Source: the development kit of https://www.cvlibs.net/datasets/kitti/eval_odometry.php
 """
@@ -25,14 +25,14 @@ CAMERAS = ("image_0", "image_2")
 
 
 def matches(path: str) -> bool:
-    """Whether the folder is a sequence of the odometry benchmark."""
+    """True for a sequence of the odometry benchmark."""
     return (Path(path) / "times.txt").is_file() and any((Path(path) / name).is_dir() for name in CAMERAS)
 
 
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A KITTI odometry sequence, left gray images before left color ones; `camera` overrides `calib.txt`.
 
-    Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` beside `sequences/NN`.
+    Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` next to `sequences/NN`.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     base = Path(path)

@@ -1,4 +1,4 @@
-"""Drives of KITTI's raw data: `image_00/data/`, `image_00/timestamps.txt`, calibration beside the drive, GPS/INS poses.
+"""Drives of KITTI raw: `image_00/data/`, `image_00/timestamps.txt`, calibration next to the drive, GPS/INS poses.
 
 Sources: https://www.cvlibs.net/datasets/kitti/raw_data.php and dataformat.txt of its development kit; A. Geiger et al.,
 Vision meets Robotics: The KITTI Dataset, IJRR 2013 (coordinate systems, Mercator projection).
@@ -40,9 +40,9 @@ def matches(path: str) -> bool:
 def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a drive, gray before color; times are seconds since the day began, UTC.
 
-    The calibration lies in the drive or in the folder of its day: the rectified one, or for a drive `..._extract` that
-    of the images as they are. Ground truth is that of `oxts/`, where calib_velo_to_cam.txt and calib_imu_to_velo.txt
-    say how the camera lies to it.
+    The calibration is read from the drive or the folder of its day: the rectified one, or for a drive `..._extract`
+    that of the raw images. The ground truth is that of `oxts/`, if both calib_velo_to_cam.txt and calib_imu_to_velo.txt
+    exist.
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     drive = Path(path)
@@ -55,7 +55,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
         if not 0 <= number < len(times):
             raise SequenceError(f"{file}: timestamps.txt has no line for it among its {len(times)}")
         entries.append(ImageEntry(times[number], file, f"{folder / 'timestamps.txt'}:{number + 1}"))
-    calibration = _beside(drive, CALIBRATION)
+    calibration = _find_file(drive, CALIBRATION)
     if camera is None and calibration is not None:
         camera = _read_camera(calibration, folder.name[-2:], drive.resolve().name.endswith("_extract"))
     truth = _read_truth(drive, folder.name[-2:], calibration)
@@ -69,8 +69,8 @@ def _camera(drive: Path) -> Path | None:
     return None
 
 
-def _beside(drive: Path, name: str) -> Path | None:
-    """A file of the drive or of its day."""
+def _find_file(drive: Path, name: str) -> Path | None:
+    """Return a file of the drive or of its recording day."""
     return next((path for path in (drive / name, drive.resolve().parent / name) if path.is_file()), None)
 
 
@@ -119,8 +119,8 @@ def _read_camera(path: Path, number: str, as_taken: bool) -> Calibration:
 def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajectory | None:
     """The camera's poses from those of the GPS/INS; None where a file for it is missing."""
     velo_to_cam, imu_to_velo = (
-        _beside(drive, "calib_velo_to_cam.txt"),
-        _beside(drive, "calib_imu_to_velo.txt"),
+        _find_file(drive, "calib_velo_to_cam.txt"),
+        _find_file(drive, "calib_imu_to_velo.txt"),
     )
     packets = drive / "oxts" / "data"
     if calibration is None or velo_to_cam is None or imu_to_velo is None or not packets.is_dir():

@@ -1,4 +1,4 @@
-"""A camera by its number, or a stream by its address: frames that nobody has time for are gone after a while."""
+"""Live sources: a camera by number or a stream by address; frames are dropped if processing is too slow."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from torchslam.errors import FrameError, SequenceError
 LOOKS_FOR = "a camera's number, or an rtsp:// or http:// address"
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
-"""Seconds without a frame after which a stream is taken to have ended."""
+"""Seconds without a frame after which a stream has ended."""
 BACKLOG = 10
-"""Frames that wait while one takes long, as one that is mapped does; the oldest goes when there are more."""
+"""Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
-"""Seconds by which a source's own clock may run off from ours before it is not believed."""
+"""Maximum drift of the source's clock from ours in seconds, before it is ignored."""
 STALE = 0.5
-"""Seconds after which the frame that was looked at when the source was opened is no beginning of a run."""
+"""Age in seconds above which the frame read on opening is discarded."""
 
 
 class Capture(Protocol):
-    """As much of cv2.VideoCapture as a live source needs."""
+    """The subset of cv2.VideoCapture that a live source uses."""
 
     def grab(self) -> bool: ...
 
@@ -93,7 +93,7 @@ class LiveSequence(Sequence):
 
     def __len__(self) -> int:
         if self._limit is None:
-            raise TypeError(f"{self.name}: nobody knows how many frames there will be")
+            raise TypeError(f"{self.name}: a live source has no length")
         return self._limit
 
     @property
@@ -215,7 +215,7 @@ class CaptureClock:
 
     def at(self, own: float, now: float) -> float:
         """Seconds since 1970 of a frame that has the time `own` and came at `now`; it never goes back."""
-        stands = own <= self._own  # a source without a clock says the same every time
+        stands = own <= self._own  # a source without a clock reports a constant time
         if self._offset is None or stands or abs(own + self._offset - now) > STEADY:
             self._offset = now - own
         self._own = own

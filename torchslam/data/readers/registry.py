@@ -1,4 +1,4 @@
-"""The readers: for each kind of sequence a module that says whether it is one, and opens it."""
+"""Registry of the readers: one module per kind of sequence, which recognizes and opens it."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from torchslam.data.synthetic import sequence as synthetic
 
 
 class Reader(Protocol):
-    """What a module of a reader offers.
+    """Interface of a reader module.
 
-    LOOKS_FOR: by what it knows its kind, in words
+    LOOKS_FOR: description of the files by which it recognizes its kind.
     """
 
     LOOKS_FOR: str
 
     def matches(self, path: str) -> bool:
-        """Whether what lies at the path is of its kind."""
+        """Return True for a path of its kind."""
 
     def open(self, path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
         """Open it. `rate`: frames per second, for kinds without times. Raises SequenceError and its kin."""
 
 
-# The first that matches opens: those that know a layout by its own files before those that take any image.
+# The first match is used: readers of specific layouts precede those of plain images.
 READERS: tuple[Reader, ...] = (
     synthetic,
     live,
@@ -55,5 +55,5 @@ READERS: tuple[Reader, ...] = (
 
 
 def find_reader(path: str) -> Reader | None:
-    """The reader for what lies at the path."""
+    """Return the reader for a path; None if there is none."""
     return next((reader for reader in READERS if reader.matches(path)), None)

@@ -30,14 +30,14 @@ LOOKS_FOR = f"a video ({', '.join(sorted(SUFFIXES))})"
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_BYTES = 1 << 40
 MAX_FRAMES = 2_000_000
-"""Frames of a video that are counted: 18 hours at 30 a second."""
+"""Maximum number of frames: 18 hours at 30 frames per second."""
 
 
 class VideoSequence(Sequence):
     """Frames of a video at their presentation times, in seconds from the beginning of its stream.
 
-    All frames are decoded once to learn how many there are and when: what a container says of them in advance is an
-    estimate, and wrong where the rate varies. Frames are turned as the file says that they are to be shown.
+    All frames are decoded once to determine their number and times, since the container's values are estimates and
+    wrong for variable frame rates. Frames are rotated to the display orientation of the file.
     """
 
     def __init__(self, path: Path, camera: GivenCamera | None) -> None:
@@ -57,7 +57,7 @@ class VideoSequence(Sequence):
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         if len(times) > 1 and max(times) == min(times) and rate > 0:
             times = [index / rate for index in range(len(times))]
-            notes.append(f"the file has no times; {rate:g} frames per second are taken")
+            notes.append(f"the file has no timestamps; {rate:g} frames per second are assumed")
         self._frames = _rising(times)
         first = self._read(0) if self._frames else None
         if first is None:
@@ -66,9 +66,9 @@ class VideoSequence(Sequence):
             notes.append(
                 f"left out {len(times) - len(self._frames)} frames whose time is not after the one before"
             )
-        # Some containers do not know; a stream that breaks off has fewer than promised.
+        # Some containers do not know the number; a truncated stream has fewer frames than declared.
         if len(times) < promised and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".avi"):
-            notes.append(f"{len(times)} frames can be decoded; the file speaks of {promised}")
+            notes.append(f"{len(times)} frames can be decoded; the file declares {promised}")
         size = (first.shape[1], first.shape[0])
         super().__init__(
             path.stem,
@@ -131,7 +131,7 @@ class VideoSequence(Sequence):
 
 
 def matches(path: str) -> bool:
-    """Whether the file has a video's suffix."""
+    """True for a file with a video suffix."""
     return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
 
 
@@ -141,7 +141,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequ
 
 
 def _check(path: Path) -> None:
-    """Raises SequenceError for what is no regular file, and for an MP4 that claims more frames than it has bytes."""
+    """Raise SequenceError for a special file, and for an MP4 that declares more frames than it has bytes."""
     try:
         check_regular(path, MAX_BYTES, "a video that is read")
         claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
@@ -150,12 +150,12 @@ def _check(path: Path) -> None:
         raise SequenceError(f"{path}: cannot be read: {cause.strerror}") from cause
     if claimed > size:
         raise SequenceError(
-            f"{path}: damaged: its index speaks of {claimed} frames, the file has {size} bytes"
+            f"{path}: damaged: its index declares {claimed} frames, but the file has {size} bytes"
         )
 
 
 def _rising(times: list[float]) -> list[int]:
-    """Which times are later than all before them."""
+    """Return the indices of the times that are later than all before them."""
     chosen: list[int] = []
     for index, time in enumerate(times):
         if np.isfinite(time) and (not chosen or time > times[chosen[-1]]):

@@ -133,7 +133,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Painter:
-    """Makes rectangles, each with a texture of its own, lit from above and a little from the front.
+    """Builds rectangles with individual textures, lit from above and slightly from the front.
 
     rng:   of the textures
     texel: meters, at most

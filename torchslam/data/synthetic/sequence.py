@@ -38,7 +38,7 @@ class Scene:
     build:            rectangles from a seed
     path:             T_wc from the phase of each frame
     frames_per_round: frames in a phase of 2 pi
-    frames:           how many there are where the name does not say
+    frames:           default number of frames
     """
 
     build: Callable[[int], list[Rectangle]]
@@ -82,7 +82,7 @@ class RenderOptions:
 
 
 class SyntheticSequence(Sequence):
-    """A scene rendered when a frame is asked for; the same name gives the same bytes."""
+    """Sequence whose frames are rendered on access; deterministic for a given name."""
 
     def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
         path, frames_per_round = SCENES[scene].path, SCENES[scene].frames_per_round
@@ -103,7 +103,7 @@ class SyntheticSequence(Sequence):
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
         image *= 1.0 + options.exposure * np.sin(0.1 * index)
-        # Noise of its own for each frame, whatever the order in which they are asked for.
+        # The noise of a frame does not depend on the order of access.
         rng = np.random.default_rng((options.seed, index))
         image += options.noise * rng.standard_normal(image.shape, dtype=np.float32)
         return gray_to_tensor(image.round().clip(0, 255).astype(np.uint8))

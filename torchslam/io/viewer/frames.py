@@ -27,8 +27,8 @@ from torchslam.types import State, StepResult, Trajectory
 
 VIDEO = "tracked.mp4"
 MAX_WIDTH = 960  # pixels of the film: it is to stay small
-BAR = 26  # pixels, for the words under the image
-USUAL_RATE = 30.0  # frames per second of a film of what nobody knows the rate of
+BAR = 26  # pixels, for the text under the image
+USUAL_RATE = 30.0  # frames per second of a video of unknown rate
 COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
     State.TRACKING: (65, 190, 87),
@@ -147,9 +147,9 @@ class LiveView:
         rr = import_rerun()
         recording = rr.RecordingStream(APPLICATION)
         try:
-            # It came with rerun; that is not on the path where the environment is not activated.
-            beside = shutil.which("rerun", path=str(Path(sys.executable).parent))
-            rr.spawn(recording=recording, executable_path=beside)
+            # The viewer comes with rerun, but is not on the path if the environment is not activated.
+            executable = shutil.which("rerun", path=str(Path(sys.executable).parent))
+            rr.spawn(recording=recording, executable_path=executable)
         except RuntimeError as error:
             raise ResultsError(f"--view: the viewer of rerun does not start: {error}") from None
         return cls(slam, recording)
@@ -179,7 +179,7 @@ class LiveView:
     def close(self) -> None:
         try:
             self._recording.flush(timeout_sec=FLUSH_SECONDS)
-        except RuntimeError as error:  # somebody closed the window: the run itself is well
+        except RuntimeError as error:  # the window was closed; the run goes on
             warnings.warn(f"the viewer of rerun did not get everything: {error}", stacklevel=2)
         self._recording.disconnect()
 
