@@ -1,4 +1,4 @@
-"""The way back: who is posed, and where it ends."""
+"""Backward tracking: which frames get a pose, where it ends, and the frames without one."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways, world_in
 from torchslam.config import Config, PoseValidationConfig
-from torchslam.map.atlas import Submap
+from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, track_back
+from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, UnposedFrames, track_back
 from torchslam.tracking.pose_confirmation import PendingFrame
+from torchslam.tracking.provisional_map import ProvisionalMap
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 
@@ -142,3 +143,53 @@ def test_strange_frames_are_kept_once_as_many_certain_ones_as_are_asked_for_foll
         ledger = walked(away)
         assert list(ledger.taken) == posed
         assert ledger.tried == list(range(98, 96 - certain, -1))
+
+
+def views(*indices: int) -> list[FrameFeatures]:
+    return [SCENE.view(index, pose()) for index in indices]
+
+
+def unposed_frames(limit: int, *indices: int) -> UnposedFrames:
+    unposed = UnposedFrames(limit)
+    unposed.add(*views(*indices))
+    return unposed
+
+
+def indices(unposed: UnposedFrames) -> list[int]:
+    return [view.index for view in unposed]
+
+
+def test_the_latest_frames_wait_in_order() -> None:
+    unposed = unposed_frames(3, 0, 1, 2, 3)
+    unposed.add(*views(5))
+    assert indices(unposed) == [2, 3, 5]
+    assert len(unposed) == 3
+
+
+def test_frames_from_in_between_find_their_place() -> None:
+    unposed = unposed_frames(10, 1, 2, 7, 8)
+    unposed.add(*views(4, 5))
+    assert indices(unposed) == [1, 2, 4, 5, 7, 8]
+
+
+def test_frames_that_were_posed_wait_no_longer() -> None:
+    unposed = unposed_frames(10, 1, 2, 3, 4)
+    unposed.remove(views(2, 4, 9))
+    assert indices(unposed) == [1, 3]
+    unposed.add()
+    assert indices(unposed) == [1, 3]
+
+
+def test_nobody_waits_where_nobody_may() -> None:
+    assert len(unposed_frames(0, 1, 2)) == 0
+
+
+def test_a_young_world_counts_its_frames_from_the_start_on() -> None:
+    submap = Atlas(CAMERA.params).create()
+    youth = ProvisionalMap(submap, views(0, 1))
+    assert youth.age == 0
+    for view in views(2, 3, 4):
+        youth.add_frame(view)
+    assert youth.age == 3
+    assert [view.index for view in youth.views] == [0, 1, 2, 3, 4]
+    assert youth.submap is submap
