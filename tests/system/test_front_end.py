@@ -10,7 +10,7 @@ import torch
 
 from torchslam import SLAM
 from torchslam.config import Config, FeaturesConfig
-from torchslam.config.schema import enlarged
+from torchslam.config.schema import scale_pixel_settings
 from torchslam.data import open_sequence
 from torchslam.data.transforms import resize
 from torchslam.features import match
@@ -45,7 +45,7 @@ def test_what_is_not_said_in_units_of_a_scale_grows() -> None:
     config = Config()
     assert config.for_size((1241, 376)) == config
     large = config.for_size((1920, 1440))
-    assert large == enlarged(config, 3.0)
+    assert large == scale_pixel_settings(config, 3.0)
     for section in config.__dataclass_fields__:
         before, after = getattr(config, section), getattr(large, section)
         names = getattr(before, "__dataclass_fields__", {})

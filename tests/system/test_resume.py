@@ -159,7 +159,7 @@ def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: P
     write_atlas(tmp_path / "map", [], WALK.camera)
     with pytest.raises(ResultsError, match="a map, but not a checkpoint"):
         read_checkpoint(tmp_path / "map", WALK, CONFIG)
-    with pytest.raises(ResultsError, match="foreign tensors: run"):
+    with pytest.raises(ResultsError, match="unknown tensors: run"):
         read_atlas(checkpoint)
 
 
@@ -268,7 +268,7 @@ def test_results_are_not_overwritten_unless_told(
 ) -> None:
     (tmp_path / "map.safetensors").write_bytes(b"the work of years")
     assert command(tmp_path) == 2
-    assert "results of an earlier run, which would be replaced" in capsys.readouterr().err
+    assert "results of an earlier run, which would be lost" in capsys.readouterr().err
     assert command(tmp_path, "--resume") == 2
     assert "no checkpoint to resume" in capsys.readouterr().err
     assert (tmp_path / "map.safetensors").read_bytes() == b"the work of years"
@@ -378,7 +378,7 @@ def test_a_saved_map_is_gone_on_in_and_localised_in(
     assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration beside the map
     assert "session" in capsys.readouterr().out
     grown = read_atlas(tmp_path / "second" / "map.safetensors")
-    (submap,) = grown.submaps
+    (submap,) = grown.atlas
     assert grown.sessions == 2
     assert len(submap.trajectory(0)) == len(submap.trajectory(1)) == FRAMES
     assert len(read_trajectory(tmp_path / "second" / "trajectory.txt")) == FRAMES

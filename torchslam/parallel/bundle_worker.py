@@ -1,4 +1,4 @@
-"""The adjustment around a keyframe in a process of its own, while this one tracks the next frames: the same bytes.
+"""Local bundle adjustment in a worker process, while this one tracks the next frames; the result is the same.
 
 `mapping.local_bundle` selects the window and applies the result; this process only solves it.
 """
@@ -18,13 +18,13 @@ from torchslam.optim import BundleProblem, Marginals
 from torchslam.parallel.worker import WithWorker, pack_task, requests, send_result, try_call, unwrap
 
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
-"""What tells one problem around a keyframe from another of the same run."""
+"""The fields of a problem that differ between problems of one run."""
 
 
 class BundleWorker(WithWorker):
-    """Solves with another process, see `mapping.local_bundle.Solver`; here until it has started, or where it was ended.
+    """A `mapping.local_bundle.Solver` that uses a worker, which runs while this is entered.
 
-    There is a process while this is entered.
+    Problems are solved in this process until the worker has started, and after it was killed.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -43,7 +43,7 @@ class BundleWorker(WithWorker):
         return answer
 
     def _send(self, problem: BundleProblem, iterations: int, covariances: bool) -> int | None:
-        """The number under which an answer will come; None where there is nobody to answer."""
+        """Send a problem; return its number, or None without a worker."""
         if not self._worker.is_there():
             return None
         if not self._has_task:
@@ -54,7 +54,7 @@ class BundleWorker(WithWorker):
         return self._number if self._worker.send(message) else None
 
     def _receive(self, number: int) -> BundleResult | None:
-        """The answer of a number; those before it were not wanted in the end. None where there is nobody to answer."""
+        """Wait for the result of a problem, and skip those of dropped ones; None without a worker."""
         while (answer := self._worker.receive()) is not None:
             answered, found = answer
             if answered == number:
@@ -74,7 +74,7 @@ def _arrays(adjusted: BundleResult) -> list[np.ndarray]:
 
 
 def _work(connection: Connection, camera: Camera) -> None:
-    """Solve the problems that come, each with its number."""
+    """Solve one numbered problem after the other."""
 
     def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
         columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}

@@ -40,7 +40,7 @@ class FeaturePrefetcher:
     """The frames of a sequence with their features; each is to be read once, in the order of its index.
 
     The workers run while this is entered. Frames are read in this process until a worker has started, and after one
-    was ended by somebody else.
+    was killed.
 
     camera:    whose size frames must have
     clock:     records as "features" how long features were waited for

@@ -1,6 +1,6 @@
-"""A process beside this one, with a pipe to it: started, asked, noticed when it ends, ended; and what it does there.
+"""A worker process with a pipe to it: start, request, receive, detect its end, stop; and the loop that it runs.
 
-It is a copy of this one where that is safe, and then there at once; elsewhere a new interpreter has to import all.
+It is forked where that is safe, which takes no time; elsewhere a new interpreter has to import everything.
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ import torch
 
 from torchslam.errors import TorchslamError
 
-READY = b""  # what a process says when it is there
+READY = b""  # first message of a worker
 THREADS = Path("/proc/self/task")  # one entry each, on Linux
 
 
 def starts_at_once() -> bool:
-    """Whether a process may be a copy of this one: a lock that another thread holds would stay locked in the copy.
+    """Whether workers may be forked: a lock that another thread holds would stay locked in the fork.
 
-    That a process computes on a GPU does not survive being copied either. Elsewhere than on Linux the system's own
-    libraries may hold such locks.
+    The use of a GPU does not survive a fork either. Elsewhere than on Linux the system's own libraries may hold locks.
     """
     return sys.platform == "linux" and len(list(THREADS.iterdir())) == 1 and not torch.cuda.is_initialized()
 
 
 class Worker:
-    """A process that does `work` at the other end of a pipe, once it has said READY and was sent its `task`.
+    """A process that does `work` at the other end of a pipe, once it is READY and was sent its task.
 
     work: (connection, *task) -> None, until the pipe is closed
     """
@@ -72,7 +71,7 @@ class Worker:
         return self._is_there
 
     def send(self, message: bytes) -> bool:
-        """Whether there is somebody to read it."""
+        """Send a message; return whether the worker is there to read it."""
         try:
             if self._is_there:
                 self._ours.send_bytes(message)
@@ -81,7 +80,7 @@ class Worker:
         return self._is_there
 
     def receive(self) -> Any:
-        """The next answer, unpickled; None where the process has ended."""
+        """Wait for the next result, unpickled; None if the process has ended."""
         try:
             return pickle.loads(self._ours.recv_bytes())
         except (EOFError, OSError):
@@ -89,13 +88,13 @@ class Worker:
             return None
 
     def end(self) -> None:
-        """Let the process go."""
+        """Stop the process."""
         self._ours.close()
         self._process.terminate()
         self._process.join()
 
     def _lose(self) -> None:
-        """The process was ended by somebody else."""
+        """Warn that the process was killed."""
         if not self._has_ended:
             self._process.join()
             status = self._process.exitcode
@@ -106,7 +105,7 @@ class Worker:
 
 
 def _copied(work: Callable[..., None], theirs: Connection, ours: Connection) -> None:
-    """A process that begins as a copy of the one that started it, whose ends of pipes and signals are not its own."""
+    """Run `serve` in a fork, without the pipe ends and signal handlers of the parent."""
     ours.close()  # so that the other's end is noticed
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what `end` sends
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
@@ -114,7 +113,7 @@ def _copied(work: Callable[..., None], theirs: Connection, ours: Connection) -> 
 
 
 class WithWorker:
-    """What has a process beside this one that does `work`, while it is entered."""
+    """Owner of a worker that does `work` while this is entered."""
 
     def __init__(self, work: Callable[..., None]) -> None:
         self._work = work
@@ -133,7 +132,7 @@ class WithWorker:
 
 
 def pack_task(*parts: object) -> bytes:
-    """What a process is to be sent first: `work` is called with the parts, and torch has as many threads as here.
+    """Pickle the arguments of `work`, and the number of threads of torch.
 
     Not by multiprocessing's own pickling, which would move tensors to shared memory.
     """
@@ -141,7 +140,7 @@ def pack_task(*parts: object) -> bytes:
 
 
 def serve(work: Callable[..., None], connection: Connection) -> None:
-    """A process: say that there is somebody, take the task, then work until the one that asks has gone."""
+    """Main function of a worker: report READY, receive the task, then work until the pipe is closed."""
     try:
         connection.send_bytes(READY)
         threads, *parts = pickle.loads(connection.recv_bytes())
@@ -152,20 +151,20 @@ def serve(work: Callable[..., None], connection: Connection) -> None:
 
 
 def requests(connection: Connection) -> Iterator[Any]:
-    """What is asked, one after the other. Raises EOFError, or OSError, when nobody asks any more."""
+    """Yield one request after the other. Raises EOFError, or OSError, when the pipe is closed."""
     while True:
         yield pickle.loads(connection.recv_bytes())
 
 
 def send_result(connection: Connection, answer: object) -> None:
-    """Send an answer; raises OSError where nobody waits for it."""
+    """Send a result. Raises OSError when the pipe is closed."""
     connection.send_bytes(pickle.dumps(answer))
 
 
 def try_call(what: str, answer: Callable[..., object], *question: object) -> Any:
-    """The answer to a question, found in inference mode; an error is an answer too, for `unwrap` to raise.
+    """Call a function in inference mode, and return its result or its exception, for `unwrap` to raise.
 
-    what: the process does, to be said of errors that are not torchslam's own, which say all by themselves
+    what: the process does, added as a note to exceptions that are not torchslam's own
     """
     try:
         with torch.inference_mode():
@@ -177,7 +176,7 @@ def try_call(what: str, answer: Callable[..., object], *question: object) -> Any
 
 
 def unwrap(answer: Any) -> Any:
-    """An answer where it is wanted. Raises what was raised on the other side."""
+    """The result of `try_call`. Raises the exception that was raised in the worker."""
     if isinstance(answer, BaseException):
         raise answer
     return answer
@@ -185,7 +184,7 @@ def unwrap(answer: Any) -> Any:
 
 @contextmanager
 def _without_interrupts(is_copied: bool) -> Iterator[None]:
-    """Processes that are started in here are not ended by Ctrl-C, which is for this one to see to; none is lost.
+    """Start processes that ignore Ctrl-C, which this process handles; no signal is lost.
 
     is_copied: SIGTERM has to wait as well, until a copy no longer has this process's handler for it
     """

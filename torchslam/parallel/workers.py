@@ -1,7 +1,7 @@
-"""What other processes see to while this one tracks and maps: the same bytes with any number of them.
+"""The workers of a run; its result does not depend on their number.
 
-Frames are read and their features found ahead of their turn (`prefetch`, `live_prefetch`); the adjustment around a
-keyframe is computed while the next frames are tracked (`bundle_worker`).
+Prefetch workers read frames and extract features ahead of their turn (`prefetch`); the bundle worker solves local
+bundle adjustments while the next frames are tracked (`bundle_worker`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ some 40 frames; a copy of this process starts at once."""
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """Number of processors that this process may use."""
     known = getattr(os, "sched_getaffinity", None)  # not on every system
     return os.cpu_count() or 1 if known is None else len(known(0))
 
 
 def best_number(sequence: Sequence, start: int) -> int:
-    """How many processes are best for a sequence from frame `start` on."""
+    """Best number of processes for a sequence from frame `start` on."""
     length = sequence.known_length
     frames = WORTH if length is None else length - start
     if processors() == 1 or frames < (WORTH_AT_ONCE if starts_at_once() else WORTH):
@@ -43,10 +43,10 @@ def best_number(sequence: Sequence, start: int) -> int:
 
 @contextmanager
 def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
-    """The frames of a sequence from `start` on, for a run that other processes help while this is entered.
+    """The frames of a sequence from `start` on, for a run that uses workers while this is entered.
 
-    processes: how many, this one included; None: what is best. With 2 one reads frames ahead, or adjusts where that
-               cannot be; with 3 one adjusts and the others read ahead.
+    processes: their number, this one included; None: the best one. With 2 there is a prefetch worker, or a bundle
+               worker if frames cannot be prefetched; with more one bundle worker, and the others prefetch.
     """
     wanted = best_number(sequence, start) if processes is None else processes
     slam.warm_up()
@@ -72,7 +72,7 @@ def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: i
 def reader(
     sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
 ) -> FeaturePrefetcher | LivePrefetcher | None:
-    """What reads the frames of a sequence ahead; None where nothing can, or should."""
+    """The prefetcher of a sequence; None if frames cannot or should not be prefetched."""
     alone = why_alone(sequence, slam)
     if processes == 1 or alone:
         if processes > 1 and is_asked_for:
@@ -84,7 +84,7 @@ def reader(
 
 
 def why_alone(sequence: Sequence, slam: SLAM) -> str:
-    """Why the frames of a sequence cannot be read ahead, in words; nothing where they can."""
+    """Why the frames of a sequence cannot be prefetched; empty if they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
     if slam.has_custom_components:

@@ -1,5 +1,5 @@
-"""The SLAM system: its state machine, sessions, runs and checkpoints.
+"""The SLAM system: pipeline, state machine, sessions, runs and checkpoints.
 
-`slam` is the entry point; `state_machine` initializes, tracks, closes loops and relocalizes; `local_mapping` inserts
-keyframes, `tentative_mapping` those of poses that are still uncertain; `backward_tracking` poses earlier frames.
+`slam` has the pipeline of a frame; `state_machine` tracks, relocalizes, initializes and closes loops; `local_mapping`
+adds frames and keyframes to the map; `session` has the components; `run` processes a sequence.
 """

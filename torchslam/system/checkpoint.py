@@ -1,9 +1,8 @@
-"""The state of a run between two frames, in one file: after a power cut the run goes on from there.
+"""Checkpoints: the state of a run between two frames in one file, from which the run can be resumed.
 
-It is a map file with more in it: the results so far, where the camera is, and which pixels stay in place. What is not
-in it: frames that still wait for a pose, which stay without one, and the frame that the next one would be compared
-with in search of pixels that stay. A provisional map, held-back frames and the search for a start are not in
-it either, since no checkpoint is taken while there are any (`SLAM.can_checkpoint`).
+A checkpoint is a map file with more in it: results so far, tracking state, evidence of static overlays. Frames that
+wait for a pose are left out and stay without one, and so is the frame that the next one would be compared with. There
+is no provisional map and no held-back frame, since no checkpoint is written then (`SLAM.can_checkpoint`).
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ UNKNOWN = "not a whole checkpoint"
 
 
 def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
-    """Write the state after a frame, whole or not at all. The system must be settled (`SLAM.can_checkpoint`)."""
+    """Write the state after a frame, atomically. Raises ValueError unless `SLAM.can_checkpoint`."""
     submap = slam.submap
     if submap is None or not slam.can_checkpoint:
         raise ValueError("a checkpoint needs a submap that is followed and nothing that is held back")
@@ -74,7 +73,7 @@ def read_checkpoint(
     device: torch.device | str = "cpu",
     extractor: FrontEnd | None = None,
 ) -> tuple[SLAM, RunProgress]:
-    """The system and what it had done when the checkpoint was taken.
+    """Read the system and the progress of its run from a checkpoint.
 
     Raises ResultsError for a file that is missing or damaged, or of a run over another sequence or with another
     configuration.
@@ -107,7 +106,7 @@ def read_checkpoint(
 
 
 def fingerprint(of: Sequence | Config) -> str:
-    """What tells one sequence, or one configuration, from another."""
+    """Hash of a sequence or a configuration."""
     if isinstance(of, Config):
         return hashlib.sha256(to_toml(of).encode()).hexdigest()
     about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.known_length])
@@ -134,8 +133,8 @@ def _restore(
     ):
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
             raise ValueError(f"where the camera was names rows beyond {count}")
-    for each, asked in zip(saved.atlas, run["num_cull_checked"], strict=True):
-        each.num_cull_checked = int(asked)
+    for each, num_checked in zip(saved.atlas, run["num_cull_checked"], strict=True):
+        each.num_cull_checked = int(num_checked)
     index, timestamp = run["last_frame"]
     session = Session(saved.camera, saved.atlas, saved.sessions - 1)
     slam.start_session(session, submap, (int(index), float(timestamp)))
@@ -199,7 +198,7 @@ def _stack(matrices: list[Tensor], size: int) -> Tensor:
 
 
 def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> list[StepResult]:
-    """What `_packed` packed."""
+    """Invert `_packed`."""
     counts, times = tensors["run.counts"].tolist(), tensors["run.stage_ms"].tolist()
     timestamps, stages = tensors["run.timestamps"].tolist(), run["stages"]
     T_cw, covariances = tensors["run.T_cw"].to(device), tensors["run.covariances"].to(device)

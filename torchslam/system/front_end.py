@@ -1,4 +1,4 @@
-"""From a frame to its features: by a front end, or by the sequence itself, as simulated ones are."""
+"""Feature extraction: from a frame to its features, by a front end or by a simulation; checks of frames."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from torchslam.plugins import load_front_end
 from torchslam.types import Features, Frame
 
 FrontEnd = Callable[..., Features]
-"""Images (B, 1, H, W), floats in [0, 1], to the features of each: `ORB()`, `XFeat(weights)`, any module or function.
+"""Extracts features of images (B, 1, H, W), floats in [0, 1]: `ORB()`, `XFeat(weights)`, any module or function.
 
 It may take a second argument: (B, 1, H, W) bool, where keypoints are wanted. The same object serves `SLAM`, `ClipSLAM`
 and, by its name, the command line.
 """
 
 Extractor = Callable[[Frame], Features]
-"""What a system does with a front end: from a frame to its features."""
+"""Extracts the features of a frame."""
 
 
 def image_extractor(
     config: Config, device: torch.device | str = "cpu", front_end: FrontEnd | None = None
 ) -> Extractor:
-    """The features of frames by a front end, the configured one if None; under a frame's mask it finds nothing.
+    """Create the feature extractor of a system from a front end, the configured one if None.
 
-    Much larger images than configured it reduces first, and its keypoints and their scales grow back. What the front
-    end returns is checked, see `check_features`.
+    It finds nothing under a frame's mask. Images that are larger than configured are reduced first, and keypoints and
+    scales are given in pixels of the full image. The features are checked, see `check_features`.
     """
     settings = config.features
     if front_end is None:
@@ -65,7 +65,7 @@ def image_extractor(
 
 
 def _takes_two(front_end: FrontEnd) -> bool:
-    """Whether a front end takes a mask beside the images."""
+    """Whether a front end takes a mask as second argument."""
     called = front_end.forward if isinstance(front_end, nn.Module) else front_end
     try:
         signature(called).bind(None, None)
@@ -77,7 +77,7 @@ def _takes_two(front_end: FrontEnd) -> bool:
 
 
 def reduced(image: Tensor, wanted: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
-    """An image and the mask of it, less wide and high by a factor."""
+    """Reduce an image and its mask by a factor."""
     height, width = image.shape[-2:]
     size = max(1, round(height / factor)), max(1, round(width / factor))
     if image.shape[-2:] == size:
@@ -99,7 +99,7 @@ def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> 
 
 
 def check_size(frame: Frame, camera: Camera) -> None:
-    """Raises FrameError where the image has not the size that the camera has."""
+    """Raise FrameError if the image has another size than the camera."""
     height, width = frame.image.shape[-2:]
     if (width, height) != camera.size:
         raise FrameError(
@@ -110,7 +110,7 @@ def check_size(frame: Frame, camera: Camera) -> None:
 
 
 def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
-    """Raises FrameError where a frame does not come after the last one, by index and timestamp, or has no time."""
+    """Raise FrameError if a frame does not come after the last one, by index and timestamp, or has no finite time."""
     if not math.isfinite(frame.timestamp):
         raise FrameError(f"{_name(frame)} has the time {frame.timestamp}")
     if last is not None and (frame.index <= last[0] or frame.timestamp <= last[1]):
@@ -125,7 +125,7 @@ def _name(frame: Frame) -> str:
 
 
 class Simulated:
-    """Simulated features as a source of their own: sequences whose frames bring the features of a made-up scene.
+    """Simulated features of a random scene around the true trajectory.
 
     T_cw_groundtruth: (F, 4, 4) true poses, around which the scene lies
     """
@@ -147,18 +147,18 @@ class Simulated:
         )
 
     def __call__(self, frame: Frame) -> Features:
-        """What a frame shows of the scene. Raises ConfigError where its true pose is not known."""
+        """The features of a frame. Raises ConfigError if its true pose is unknown."""
         if frame.T_cw_groundtruth is None:
             raise ConfigError(f"simulated features need the true pose of every frame; {frame.name} has none")
         return self._scene(frame.T_cw_groundtruth, frame.index)
 
     def of(self, sequence: Sequence) -> Sequence:
-        """The same frames, with features."""
+        """The frames of a sequence with simulated features."""
         return WithFeatures(sequence, self)
 
 
 class WithFeatures(Transformed):
-    """A sequence whose frames bring their features, found when they are asked for.
+    """A sequence whose frames bring features, extracted when they are read.
 
     extract: from a frame of the sequence to its features
     """
@@ -180,7 +180,7 @@ class WithFeatures(Transformed):
 
 
 def source(sequence: Sequence, config: Config, camera: Camera) -> Sequence:
-    """The sequence as a run takes it: with simulated features where these are configured, else as it is.
+    """The sequence as a run reads it: with simulated features if these are configured, else as it is.
 
     camera: that of the run, on its device. Raises ConfigError for simulated features without true poses.
     """

@@ -1,4 +1,4 @@
-"""A whole sequence through the system, and what it leaves behind."""
+"""Process a whole sequence, and the result of it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from torchslam.types import Frame, Reason, State, StepResult, Trajectory
 
 
 class System(Protocol):
-    """What a run needs of what it feeds its frames to: of `torchslam.system.slam.SLAM`."""
+    """The part of `torchslam.system.slam.SLAM` that a run needs."""
 
     camera: Camera
     config: Config
@@ -51,14 +51,14 @@ class Frames(Protocol):
 class Run:
     """The result of a run.
 
-    submaps:      what was built, in the order in which it began; mostly one
-    results:     one per processed frame
-    skipped:     the frames that could not be read, in words
-    interrupted: whether the run was stopped by the user
-    failure:     why no frame has a pose; empty when some have
-    recalls:     the places that were recognised, which may have joined submaps
-    session:     number of the run among those over the same map; frames and trajectories are those of this session
-    sessions:    how many sessions the map has; one that was only localised is none of them
+    submaps:       in the order of their creation; mostly one
+    results:       one per processed frame
+    skipped:       messages about the frames that could not be read
+    interrupted:   whether the run was stopped by the user
+    failure:       why no frame has a pose; empty if some have
+    loop_closures: the loops that were closed, and the places at which submaps were merged
+    session:       number of the run among those over the same map; frames and trajectories are those of this session
+    sessions:      number of sessions of the map, without those that only localized
     """
 
     submaps: tuple[Submap, ...]
@@ -79,7 +79,7 @@ class Run:
 
     @property
     def map(self) -> Map:
-        """Of the main submap; empty where there is none."""
+        """The map of the main submap; empty where there is none."""
         return Map() if self.main is None else self.main.map
 
     @property
@@ -89,17 +89,17 @@ class Run:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every posed frame of the main submap, after everything that was learned later."""
+        """The final pose of every posed frame of the main submap."""
         return Trajectory.empty() if self.main is None else self.main.trajectory(self.session)
 
     @property
     def keyframes(self) -> Trajectory:
-        """The keyframes of the main submap alone."""
+        """The final poses of the keyframes of the main submap."""
         return keyframe_trajectory(self.map, self.session)
 
     @property
     def online(self) -> Trajectory:
-        """The poses as they were given, frame by frame, in the main submap."""
+        """The poses that were returned frame by frame in the main submap."""
         return Trajectory.empty() if self.main is None else self._given_in(self.main.number)
 
     @property
@@ -117,7 +117,7 @@ class Run:
         return [part for number in numbers if len(part := self._given_in(number))]
 
     def _given_in(self, number: int) -> Trajectory:
-        """The poses as they were given in the submap of a number."""
+        """The poses that were returned in the submap of a number."""
         given = [result for result in self.results if result.T_cw is not None and result.submap == number]
         if not given:
             return Trajectory.empty()
@@ -166,9 +166,9 @@ def run_sequence(
     A frame that cannot be read, or that does not fit the camera or the order of time, is skipped with a warning and
     counted; an interrupt ends the run, or its final adjustment, and keeps what there is.
 
-    so_far:    where to go on, and what is kept up to date after every frame
-    adjusting: told before each iteration of the final adjustments its number and how many there are at most
-    frames:    those of the sequence, from elsewhere than from itself
+    so_far:    progress to resume from; it is updated after every frame
+    adjusting: called before each iteration of the final adjustments with its number and the most there are
+    frames:    the frames of the sequence, if they are not read from itself
 
     Raises TorchslamError where the system has processed frames that `so_far` does not know of.
     """
