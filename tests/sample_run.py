@@ -11,9 +11,8 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
+from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.map.atlas import Submap
-from torchslam.map.atlas import TrackingState
 from torchslam.system.run import Run
 from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult, Trajectory
 
