@@ -12,7 +12,7 @@ from experiments.benchmarks.slam import run, stages
 from torchslam.io.frames_file import write_frames
 from torchslam.types import State, StepResult
 
-OURS = ["ours", "ours, one process", "ours, fast", "ours, fast, one process"]
+OURS = ["ours", "ours, one process"]
 
 
 def test_the_time_of_all_processes_counts() -> None:
