@@ -115,7 +115,7 @@ def test_others_find_what_would_be_found_here(sequence: Sequence) -> None:
     with ahead(sequence, clock, processes=2) as frames:
         # The first one is read here, while the others are asked for: here the run begins at frame 2.
         theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
-        assert len(frames._asked) == 0
+        assert len(frames._requested) == 0
     assert theirs == [index not in (2, BAD, SMALL) for index in range(2, FRAMES)]
     assert clock.take()["features"] > 0
     assert isinstance(look(sequence, BAD), str)
@@ -126,18 +126,18 @@ def test_others_find_what_would_be_found_here(sequence: Sequence) -> None:
 def test_no_more_than_a_few_frames_are_asked_for() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         assert frames[10].features is None
-        assert sorted(frames._asked) == [*range(11, 19)]
+        assert sorted(frames._requested) == [*range(11, 19)]
         assert frames[11].features is not None
-        assert sorted(frames._asked) == [*range(12, 20)]
+        assert sorted(frames._requested) == [*range(12, 20)]
 
 
 @pytest.mark.usefixtures("patient")
 def test_what_comes_after_the_first_frame_is_read_while_the_run_is_prepared() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         frames.begin(5)
-        assert sorted(frames._asked) == [*range(6, 14)]
+        assert sorted(frames._requested) == [*range(6, 14)]
         assert frames[5].features is None
-        assert sorted(frames._asked) == [*range(6, 14)]
+        assert sorted(frames._requested) == [*range(6, 14)]
         assert frames[6].features is not None
 
 
@@ -147,7 +147,7 @@ def test_a_process_that_has_not_started_is_asked_for_nothing(
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
     with ahead(sequence) as frames:
         frames.begin(0)
-        assert frames._asked == {}
+        assert frames._requested == {}
         assert frames._next is None  # so that it still may be
 
 
@@ -304,6 +304,6 @@ def test_a_signal_to_all_ends_the_run_with_results(
         assert child.wait(PATIENCE) == status
     said = (tmp_path / "err").read_text()
     assert "Traceback" not in said
-    assert "interrupted; the results up to here are written" in said
+    assert "interrupted; the results so far were written" in said
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["interrupted"]
     wait_for_end(child.pid)
