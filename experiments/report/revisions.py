@@ -35,8 +35,8 @@ spent = 1e3 * (time.process_time() - start) / len(sequence)
 poses = run.trajectory
 truth = sequence.groundtruth
 ate = None if truth is None or len(poses) < 3 else evaluate(poses, truth).ate_m
-hash_json = hashlib.sha256(poses.T_wc.numpy().tobytes()).hexdigest()
-print(json.dumps({"posed": len(poses), "frames": len(sequence), "ate": ate, "ms": spent, "hash_json": hash_json}))
+digest = hashlib.sha256(poses.T_wc.numpy().tobytes()).hexdigest()
+print(json.dumps({"posed": len(poses), "frames": len(sequence), "ate": ate, "ms": spent, "digest": digest}))
 """
 
 
@@ -111,7 +111,7 @@ def compared(name: str, before: list[dict[str, Any]], after: list[dict[str, Any]
         f"{ates[1] / ates[0]:.2f}" if has_ate else "",
         *(f"{each:.0f}" for each in times),
         f"{times[1] / times[0]:.2f}",
-        "same bytes" if a["hash_json"] == b["hash_json"] else "different",
+        "same bytes" if a["digest"] == b["digest"] else "different",
     ]
 
 

@@ -59,7 +59,7 @@ def run_row(name: str) -> dict[str, Any]:
         "cpu_s": round(seconds, 2),
         "ms_median": round(median(frame_ms), 2),
         "ms_p95": round(float(torch.tensor(frame_ms).quantile(0.95)), 2),
-        "trajectory": hash_json(run),
+        "trajectory": trajectory_digest(run),
         "config": hashlib.sha256(to_toml(config).encode()).hexdigest()[:DIGEST],
     }
 
@@ -72,7 +72,7 @@ def accuracy(run: Run, sequence: Sequence) -> dict[str, float]:
     return {"ate": round(ate, 6), "extent": round(extent(sequence.groundtruth.positions_w), 4)}
 
 
-def hash_json(run: Run) -> str:
+def trajectory_digest(run: Run) -> str:
     """Of the bytes that `torchslam run` would write as trajectory.txt."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / TRAJECTORY
