@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
@@ -29,13 +30,13 @@ class Camera:
 
     Attributes:
         model: "pinhole", "radial_tangential" or "fisheye".
-        params: (..., P) fx, fy, cx, cy in pixels, then the distortion as OpenCV orders and defines it: none for a
+        params: fx, fy, cx, cy in pixels, then the distortion as OpenCV orders and defines it: none for a
             pinhole, k1, k2, p1, p2, k3 for radial_tangential, k1, k2, k3, k4 for fisheye.
         size: (width, height) in pixels.
     """
 
     model: str
-    params: Tensor
+    params: Float[Tensor, "*batch P"]
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
@@ -85,27 +86,27 @@ class Camera:
         return Camera("fisheye", _stack(fx, fy, cx, cy, k1, k2, k3, k4), size)
 
     @property
-    def fx(self) -> Tensor:
+    def fx(self) -> Float[Tensor, "*batch"]:
         """(...) focal length along x, pixels."""
         return self.params[..., 0]
 
     @property
-    def fy(self) -> Tensor:
+    def fy(self) -> Float[Tensor, "*batch"]:
         """(...) focal length along y, pixels."""
         return self.params[..., 1]
 
     @property
-    def cx(self) -> Tensor:
+    def cx(self) -> Float[Tensor, "*batch"]:
         """(...) x of the principal point, pixels."""
         return self.params[..., 2]
 
     @property
-    def cy(self) -> Tensor:
+    def cy(self) -> Float[Tensor, "*batch"]:
         """(...) y of the principal point, pixels."""
         return self.params[..., 3]
 
     @property
-    def focal(self) -> Tensor:
+    def focal(self) -> Float[Tensor, "*batch"]:
         """(...) the geometric mean of fx and fy, pixels."""
         return (self.fx * self.fy).sqrt()
 
@@ -120,14 +121,14 @@ class Camera:
         return self.size[1]
 
     @property
-    def K(self) -> Tensor:
+    def K(self) -> Float[Tensor, "*batch 3 3"]:
         """(..., 3, 3) calibration matrix, without the distortion."""
         zero, one = torch.zeros_like(self.fx), torch.ones_like(self.fx)
         entries = (self.fx, zero, self.cx, zero, self.fy, self.cy, zero, zero, one)
         return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
     @cached_property
-    def limit(self) -> Tensor:
+    def limit(self) -> Float[Tensor, "*batch"]:
         """(...) extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
         return self._distortion.limit(self.params.detach()[..., 4:])
 
@@ -135,7 +136,7 @@ class Camera:
     def _distortion(self) -> distortion.Distortion:
         return distortion.MODELS[self.model]
 
-    def with_params(self, params: Tensor) -> Camera:
+    def with_params(self, params: Float[Tensor, "*batch P"]) -> Camera:
         """Replace the parameters, keeping model and size."""
         # Not `replace`: compiled graphs of torch 2.5 do not take it.
         return Camera(self.model, params, self.size)
@@ -166,11 +167,13 @@ class Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
-    def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
+    def project(
+        self, points_c: Float[Tensor, "*#batch N 3"]
+    ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"]]:
         """Project points in the camera frame.
 
         Args:
-            points_c: (..., N, 3) points.
+            points_c: points.
 
         Returns:
             Pixels (..., N, 2), always finite, and valid (..., N): in front of the camera and within the monotone
@@ -180,7 +183,9 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
-    def project_with_point_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project_with_point_jacobians(
+        self, points_c: Float[Tensor, "*#batch N 3"]
+    ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
         """Project points, with the analytic derivative with respect to the points.
 
         Returns:
@@ -201,7 +206,14 @@ class Camera:
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
 
-    def project_with_jacobians(self, points_c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def project_with_jacobians(
+        self, points_c: Float[Tensor, "*#batch N 3"]
+    ) -> tuple[
+        Float[Tensor, "*#batch N 2"],
+        Bool[Tensor, "*#batch N"],
+        Float[Tensor, "*#batch N 2 3"],
+        Float[Tensor, "*#batch N 2 P"],
+    ]:
         """Project points, with the analytic derivatives with respect to points and parameters.
 
         Returns:
@@ -217,8 +229,8 @@ class Camera:
         J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
-    def normalize(self, pixels: Tensor) -> Tensor:
-        """Compute undistorted image coordinates x/z, y/z of pixels. (..., N, 2) -> (..., N, 2).
+    def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
+        """Compute undistorted image coordinates x/z, y/z of pixels.
 
         Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
         """
@@ -226,21 +238,21 @@ class Camera:
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
-    def unproject(self, pixels: Tensor) -> Tensor:
-        """Compute bearings of unit length of pixels. (..., N, 2) -> (..., N, 3)."""
+    def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
+        """Compute bearings of unit length of pixels."""
         normalized = self.normalize(pixels)
         ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
         return ray / ray.norm(dim=-1, keepdim=True)
 
-    def in_image(self, pixels: Tensor, border: float = 0.0) -> Tensor:
-        """Test whether pixels lie inside the image, `border` pixels away from its edge. (..., N, 2) -> (..., N)."""
+    def in_image(self, pixels: Float[Tensor, "*batch 2"], border: float = 0.0) -> Bool[Tensor, "*batch"]:
+        """Test whether pixels lie inside the image, `border` pixels away from its edge."""
         x, y = pixels.unbind(-1)
         # The image reaches half a pixel beyond the centers of its outermost pixels.
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
-    def pixel_scale(self, normalized: Tensor) -> Tensor:
-        """Pixels per unit of undistorted image coordinates, along x and y, locally. (..., N, 2) -> (..., N, 2).
+    def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
+        """Pixels per unit of undistorted image coordinates, along x and y, locally.
 
         Exact without distortion; with it, the mean over all directions.
         """
@@ -269,7 +281,7 @@ class Camera:
         return torch.where(valid[..., None], normalized, 0.0), valid
 
 
-def _stack(*values: Scalar) -> Tensor:
+def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
     """(..., P) from floats and tensors; float64 unless a tensor says otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = tensors[0].dtype if tensors else torch.float64

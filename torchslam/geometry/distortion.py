@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.estimate_gradients import first_order, needs_gradient
@@ -41,8 +42,8 @@ class Distortion:
     coordinate: Callable[[Tensor], Tensor]
 
 
-def first_positive_root(coefficients: Tensor) -> Tensor:
-    """Smallest positive root of 1 + c_1 u + ... + c_K u^K, infinity where there is none. (..., K) -> (...).
+def first_positive_root(coefficients: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
+    """Smallest positive root of 1 + c_1 u + ... + c_K u^K, infinity where there is none.
 
     Found as the largest real eigenvalue 1/u of the companion matrix of the reversed polynomial, which stays
     monic whichever coefficients vanish.
@@ -62,8 +63,10 @@ def _converged(step: Tensor) -> bool:
     return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
 
-def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
-    """-J^-1 residual for 2x2 systems. (..., 2, 2), (..., 2) -> (..., 2)."""
+def _implicit_step(
+    J: Float[Tensor, "*#batch 2 2"], residual: Float[Tensor, "*#batch 2"]
+) -> Float[Tensor, "*#batch 2"]:
+    """-J^-1 residual for 2x2 systems."""
     (a, b), (c, d) = J[..., 0, :].unbind(-1), J[..., 1, :].unbind(-1)
     determinant = a * d - b * c
     determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
@@ -71,7 +74,7 @@ def _implicit_step(J: Tensor, residual: Tensor) -> Tensor:
     return -_stack_columns(d * x - b * y, a * y - c * x) / determinant[..., None]
 
 
-def length(xy: Tensor) -> Tensor:
+def length(xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of vectors (..., 2) -> (...), not differentiable at zero.
 
     Many times as fast as `norm` where each coordinate is in one piece of memory.

@@ -10,6 +10,7 @@ import math
 from functools import lru_cache
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -27,7 +28,9 @@ _NEWTON_STEPS = 5
 
 
 @full_precision
-def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
+def five_point(
+    x_1: Float[Tensor, "B 5 2"], x_2: Float[Tensor, "B 5 2"]
+) -> tuple[Float[Tensor, "R 3 3"], Int[Tensor, " R"]]:
     """Compute the essential matrices of samples of five matches.
 
     Solutions closer together than 1.4 degrees of the last unknown's angle can be missed; degenerate samples may
@@ -35,8 +38,8 @@ def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     solution to the five-point relative pose problem", 2004.
 
     Args:
-        x_1: (S, 5, 2) undistorted image coordinates in view 1.
-        x_2: (S, 5, 2) undistorted image coordinates in view 2.
+        x_1: undistorted image coordinates in view 1.
+        x_2: undistorted image coordinates in view 2.
 
     Returns:
         E (R, 3, 3) of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample
@@ -60,8 +63,8 @@ def five_point(x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
     return E[good].unflatten(-1, (3, 3)), sample[good]
 
 
-def _null_space(x_1: Tensor, x_2: Tensor) -> Tensor:
-    """Four orthonormal solutions of the five epipolar equations. (S, 5, 2) twice -> (S, 4, 9)."""
+def _null_space(x_1: Float[Tensor, "B 5 2"], x_2: Float[Tensor, "B 5 2"]) -> Float[Tensor, "B 4 9"]:
+    """Four orthonormal solutions of the five epipolar equations."""
     equations = _outer(x_2, x_1)
     solved = torch.linalg.solve_ex(equations[..., _SOLVED], -equations[..., _FREE])[0].nan_to_num()
     basis = solved.new_zeros(len(solved), 4, 9)
@@ -76,8 +79,8 @@ def _null_space(x_1: Tensor, x_2: Tensor) -> Tensor:
     return torch.cat(rows, dim=1)
 
 
-def _outer(x_2: Tensor, x_1: Tensor) -> Tensor:
-    """The nine coefficients of the epipolar equation. (..., 2) twice -> (..., 9)."""
+def _outer(x_2: Float[Tensor, "*batch 2"], x_1: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 9"]:
+    """The nine coefficients of the epipolar equation."""
     one = torch.ones_like(x_1[..., :1])
     x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
     return (x_2[..., :, None] * x_1[..., None, :]).flatten(-2)
@@ -99,8 +102,8 @@ def _monomials(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor
     return torch.tensor(pairs, device=device).T, table.flatten(1)
 
 
-def _constraints(basis: Tensor) -> Tensor:
-    """Ten cubic equations: 2 E E^T E = tr(E E^T) E and det E = 0. (S, 4, 9) -> (S, 10, 20)."""
+def _constraints(basis: Float[Tensor, "B 4 9"]) -> Float[Tensor, "B 10 20"]:
+    """Ten cubic equations: 2 E E^T E = tr(E E^T) E and det E = 0."""
     (first, second), table = _monomials(basis.dtype, basis.device)
     E = basis.permute(1, 2, 0).contiguous().view(4, 3, 3, -1)  # the samples last
     E_1, E_2 = E[first], E[second]
@@ -127,7 +130,7 @@ def _matrix_product(A: Tensor, B: Tensor) -> Tensor:
     return product
 
 
-def _elimination(constraints: Tensor) -> Tensor:
+def _elimination(constraints: Float[Tensor, "B 10 20"]) -> Float[Tensor, "B 3 3 5"]:
     """Three equations in x, y, 1 with polynomials in z. (S, 10, 20) -> (S, 3, 3, 5), lowest power first."""
     reduced = torch.linalg.solve_ex(constraints[..., :10], constraints[..., 10:])[0]
     # rows 4 to 9 are x^2 z, x^2, y^2 z, y^2, xyz, xy; each first minus z times the second cancels
@@ -157,7 +160,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
     return (a[..., :, None] * b[..., None, :]).flatten(-2) @ table
 
 
-def _determinant(B: Tensor) -> Tensor:
+def _determinant(B: Float[Tensor, "B 3 3 5"]) -> Float[Tensor, "B 11"]:
     """The determinant, a polynomial of degree ten. (S, 3, 3, 5) -> (S, 11), lowest power first."""
     x, y, one = B[:, :, 0, :4], B[:, :, 1, :4], B[:, :, 2]
     minors = _product(y.roll(-1, 1), one.roll(-2, 1)) - _product(y.roll(-2, 1), one.roll(-1, 1))
@@ -172,8 +175,8 @@ def _angle_grid(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tenso
     return angle, angle.sin() ** k * angle.cos().clamp_min(0.0) ** (10 - k)
 
 
-def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
-    """Real roots of polynomials of degree ten, with the row of each. (S, 11) -> (R,), (R,).
+def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
+    """Real roots of polynomials of degree ten, with the row of each.
 
     With z = tan(angle) all of them lie in a bounded interval; sign changes on a grid bracket them, Newton's method
     with bisection finishes.
@@ -206,20 +209,24 @@ def _real_roots(polynomial: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @full_precision
-def essential_from_pose(R_21: Tensor, t_21: Tensor) -> Tensor:
-    """Compute essential matrices E = [t]x R. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
+def essential_from_pose(
+    R_21: Float[Tensor, "*#batch 3 3"], t_21: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*#batch 3 3"]:
+    """Compute essential matrices E = [t]x R."""
     return skew(t_21) @ R_21
 
 
 @full_precision
-def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
+def decompose_essential(
+    E: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 2 3 3"], Float[Tensor, "*batch 3"]]:
     """Decompose essential matrices of any scale into two rotations and a direction up to sign.
 
     Without a singular value decomposition, so that the gradient is correct at the equal singular values. Source:
     Horn, "Recovering baseline and orientation from essential matrix", 1990.
 
     Args:
-        E: (..., 3, 3) essential matrices.
+        E: essential matrices.
 
     Returns:
         R (..., 2, 3, 3) and t (..., 3) of unit length: the poses are (R_i, t) and (R_i, -t).
@@ -240,22 +247,22 @@ def decompose_essential(E: Tensor) -> tuple[Tensor, Tensor]:
 
 @full_precision
 def sampson_errors(
-    E: Tensor,
-    x_1: Tensor,
-    x_2: Tensor,
-    variance_1: Tensor | float = 1.0,
-    variance_2: Tensor | float = 1.0,
-) -> Tensor:
+    E: Float[Tensor, "*#batch 3 3"],
+    x_1: Float[Tensor, "*#batch N 2"],
+    x_2: Float[Tensor, "*#batch N 2"],
+    variance_1: Float[Tensor, "*#batch N"] | float = 1.0,
+    variance_2: Float[Tensor, "*#batch N"] | float = 1.0,
+) -> Float[Tensor, "*#batch N"]:
     """Compute signed Sampson distances to the epipolar constraint, zero at both epipoles.
 
     Source: Hartley and Zisserman, "Multiple view geometry", 2004, eq. 11.9.
 
     Args:
-        E: (..., 3, 3) essential matrices.
-        x_1: (..., N, 2) undistorted image coordinates in view 1.
-        x_2: (..., N, 2) undistorted image coordinates in view 2.
-        variance_1: (..., N) of the coordinates in view 1; None: one.
-        variance_2: (..., N) of the coordinates in view 2; None: one.
+        E: essential matrices.
+        x_1: undistorted image coordinates in view 1.
+        x_2: undistorted image coordinates in view 2.
+        variance_1: of the coordinates in view 1; None: one.
+        variance_2: of the coordinates in view 2; None: one.
 
     Returns:
         (..., N) first-order distances over both images together, in standard deviations.
@@ -270,14 +277,18 @@ def sampson_errors(
 
 @full_precision
 def epipolar_offsets(
-    T_21: Tensor, pixels_1: Tensor, pixels_2: Tensor, camera_1: Camera, camera_2: Camera
-) -> tuple[Tensor, Tensor]:
+    T_21: Float[Tensor, "*#batch 4 4"],
+    pixels_1: Float[Tensor, "*#batch N 2"],
+    pixels_2: Float[Tensor, "*#batch N 2"],
+    camera_1: Camera,
+    camera_2: Camera,
+) -> tuple[Float[Tensor, "*#batch N"], Float[Tensor, "*#batch N"]]:
     """Compute the offsets of matches from the epipolar lines of a motion, across and along them.
 
     Args:
-        T_21: (..., 4, 4) from camera 1 to camera 2.
-        pixels_1: (..., N, 2) matches in view 1.
-        pixels_2: (..., N, 2) matches in view 2.
+        T_21: from camera 1 to camera 2.
+        pixels_1: matches in view 1.
+        pixels_2: matches in view 2.
         camera_1: of view 1.
         camera_2: of view 2.
 

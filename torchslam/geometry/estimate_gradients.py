@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch._C import _are_functorch_transforms_active
 from torch.autograd import forward_ad
@@ -20,7 +21,7 @@ def needs_gradient(*tensors: Tensor) -> bool:
     return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
-def first_order(tensor: Tensor) -> Tensor:
+def first_order(tensor: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The tensor, whose first derivatives are right while the second are not: to take these raises RuntimeError."""
     result: Tensor = _FirstOrder.apply(tensor)
     return result
@@ -65,7 +66,9 @@ class _Last(torch.autograd.Function):
         )
 
 
-def implicit_step(objective: Callable[[Tensor], Tensor], template: Tensor) -> Tensor:
+def implicit_step(
+    objective: Callable[[Tensor], Tensor], template: Float[Tensor, "B D"]
+) -> Float[Tensor, "B D"]:
     """A step of value zero that carries the gradient of the minimizer with respect to the data.
 
     objective: (B, D) -> (B,), a function of the local parameters, zero at the minimizer, that is also a function

@@ -7,21 +7,24 @@ n^T points_1 = 1.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.precision import full_precision
 
 
 @full_precision
-def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
+def homography_from_matches(
+    x_1: Float[Tensor, "*batch N 2"], x_2: Float[Tensor, "*batch N 2"]
+) -> Float[Tensor, "*batch 3 3"]:
     """Compute homographies with H_33 = 1 of samples of four or more matches, in the algebraic least-squares sense.
 
     For samples of more than four, coordinates should be of order one. Source: Hartley and Zisserman, 2004, alg.
     4.1.
 
     Args:
-        x_1: (..., N, 2) coordinates in view 1.
-        x_2: (..., N, 2) coordinates in view 2.
+        x_1: coordinates in view 1.
+        x_2: coordinates in view 2.
 
     Returns:
         (..., 3, 3); degenerate samples (three points on a line) give zeros, or anything.
@@ -39,8 +42,10 @@ def homography_from_matches(x_1: Tensor, x_2: Tensor) -> Tensor:
 
 
 @full_precision
-def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
-    """Compute rotations that take two rays to two rays, exact for the first. (..., 2, 3) twice -> (..., 3, 3)."""
+def rotation_from_matches(
+    rays_1: Float[Tensor, "*batch 2 3"], rays_2: Float[Tensor, "*batch 2 3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Compute rotations that take two rays to two rays, exact for the first."""
 
     def frame(rays: Tensor) -> Tensor:
         a, b = rays.unbind(-2)
@@ -52,13 +57,15 @@ def rotation_from_matches(rays_1: Tensor, rays_2: Tensor) -> Tensor:
 
 
 @full_precision
-def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
+def transfer_errors(
+    H: Float[Tensor, "*#batch 3 3"], x_1: Float[Tensor, "*#batch N 2"], x_2: Float[Tensor, "*#batch N 2"]
+) -> Float[Tensor, "*#batch N 2"]:
     """Compute differences H(x_1) - x_2, very large where H takes a point behind the camera.
 
     Args:
-        H: (..., 3, 3) homographies.
-        x_1: (..., N, 2) coordinates in view 1.
-        x_2: (..., N, 2) coordinates in view 2.
+        H: homographies.
+        x_1: coordinates in view 1.
+        x_2: coordinates in view 2.
 
     Returns:
         (..., N, 2) differences.
@@ -70,13 +77,15 @@ def transfer_errors(H: Tensor, x_1: Tensor, x_2: Tensor) -> Tensor:
 
 
 @full_precision
-def decompose_homography(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def decompose_homography(
+    H: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 4 3 3"], Float[Tensor, "*batch 4 3"], Float[Tensor, "*batch 4 3"]]:
     """Decompose homographies into the four motions and planes that explain them, two of which have the scene in front.
 
     Not differentiable by design. Source: Ma et al., "An invitation to 3-D vision", 2004, section 5.3.3.
 
     Args:
-        H: (..., 3, 3) of any scale and sign.
+        H: of any scale and sign.
 
     Returns:
         R (..., 4, 3, 3), t (..., 4, 3) in units of the plane's distance, and unit normals (..., 4, 3) in the first

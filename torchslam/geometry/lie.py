@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.precision import full_precision
@@ -40,8 +41,8 @@ def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 @full_precision
-def skew(v: Tensor) -> Tensor:
-    """The matrix of the cross product: skew(v) @ u = v x u. (..., 3) -> (..., 3, 3)."""
+def skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix of the cross product: skew(v) @ u = v x u."""
     shape = (*v.shape, 3)
     return torch.linalg.cross(
         v[..., None].expand(shape), torch.eye(3, dtype=v.dtype, device=v.device).expand(shape), dim=-2
@@ -49,16 +50,16 @@ def skew(v: Tensor) -> Tensor:
 
 
 @full_precision
-def vee(W: Tensor) -> Tensor:
-    """The vector of the antisymmetric part of a matrix, the inverse of `skew`. (..., 3, 3) -> (..., 3)."""
+def vee(W: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """The vector of the antisymmetric part of a matrix, the inverse of `skew`."""
     return 0.5 * torch.stack(
         (W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]), dim=-1
     )
 
 
 @full_precision
-def rigid(R: Tensor, t: Tensor) -> Tensor:
-    """Homogeneous matrix [R t; 0 1]. (..., 3, 3), (..., 3) -> (..., 4, 4)."""
+def rigid(R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 4 4"]:
+    """Homogeneous matrix [R t; 0 1]."""
     if R.shape[:-2] != t.shape[:-1]:
         shape = torch.broadcast_shapes(R.shape[:-2], t.shape[:-1])
         R, t = R.expand(*shape, 3, 3), t.expand(*shape, 3)
@@ -67,13 +68,15 @@ def rigid(R: Tensor, t: Tensor) -> Tensor:
 
 
 @full_precision
-def transform(T: Tensor, points: Tensor) -> Tensor:
-    """Points under homogeneous transforms. (..., 4, 4), (..., N, 3) -> (..., N, 3)."""
+def transform(
+    T: Float[Tensor, "*#batch R 4"], points: Float[Tensor, "*#batch N 3"]
+) -> Float[Tensor, "*#batch N 3"]:
+    """Points under homogeneous transforms, whose last row may be left out."""
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
 @full_precision
-def so3_exp(omega: Tensor) -> Tensor:
+def so3_exp(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of rotation vectors. (..., 3) radians -> (..., 3, 3)."""
     a, b, _, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
@@ -81,19 +84,19 @@ def so3_exp(omega: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def identity(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "D D"]:
     """Identity matrix, cached: (size, size)."""
     return torch.eye(size, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=16)
-def generators(dtype: torch.dtype, device: torch.device) -> Tensor:
+def generators(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 3 3"]:
     """The generators of SO(3), cached: (3, 3, 3)."""
     return skew(torch.eye(3, dtype=dtype, device=device))
 
 
-def cayley_rotation(omega: Tensor) -> Tensor:
-    """Rotation of the Cayley map: exp(omega) to second order, and cheaper. (P, 3) -> (P, 3, 3)."""
+def cayley_rotation(omega: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 3"]:
+    """Rotation of the Cayley map: exp(omega) to second order, and cheaper."""
     W = (omega @ generators(omega.dtype, omega.device).view(3, 9)).view(-1, 3, 3)
     factor = 1 / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
     turn = torch.baddbmm(W, W, W, alpha=0.5)  # W + W^2 / 2
@@ -101,15 +104,15 @@ def cayley_rotation(omega: Tensor) -> Tensor:
 
 
 @full_precision
-def so3_left_jacobian(omega: Tensor) -> Tensor:
-    """J with exp(omega + d) = exp(J d) exp(omega) to first order. (..., 3) -> (..., 3, 3)."""
+def so3_left_jacobian(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """J with exp(omega + d) = exp(J d) exp(omega) to first order."""
     _, b, c, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + b * W + c * (W @ W)
 
 
-def _so3_left_jacobian_inverse(omega: Tensor) -> Tensor:
-    """Inverse of the left Jacobian, for angles below 2 pi. (..., 3) -> (..., 3, 3)."""
+def _so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Inverse of the left Jacobian, for angles below 2 pi."""
     _, b, c, d = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     factor = (c - 2 * d) / (2 * b)  # (1 - (a/2) cot(a/2)) / a^2 without cancellation
@@ -117,8 +120,8 @@ def _so3_left_jacobian_inverse(omega: Tensor) -> Tensor:
 
 
 @full_precision
-def quaternion_from_matrix(R: Tensor) -> Tensor:
-    """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices. (..., 3, 3) -> (..., 4).
+def quaternion_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices.
 
     The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd,
     1978).
@@ -137,8 +140,8 @@ def quaternion_from_matrix(R: Tensor) -> Tensor:
 
 
 @full_precision
-def matrix_from_quaternion(q_xyzw: Tensor) -> Tensor:
-    """Rotation matrices of quaternions (x, y, z, w) of any non-zero length. (..., 4) -> (..., 3, 3)."""
+def matrix_from_quaternion(q_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of quaternions (x, y, z, w) of any non-zero length."""
     v, w = q_xyzw[..., :3], q_xyzw[..., 3:, None]
     twice = 2 / (q_xyzw * q_xyzw).sum(-1)[..., None, None]
     V = skew(v)
@@ -146,7 +149,7 @@ def matrix_from_quaternion(q_xyzw: Tensor) -> Tensor:
 
 
 @full_precision
-def so3_log(R: Tensor) -> Tensor:
+def so3_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotation vectors, of length at most pi, of rotation matrices. (..., 3, 3) -> (..., 3) radians."""
     v, w = quaternion_from_matrix(R).split((3, 1), dim=-1)
     sine_squared = (v * v).sum(-1, keepdim=True)
@@ -163,8 +166,8 @@ def so3_log(R: Tensor) -> Tensor:
 
 
 @full_precision
-def se3_exp(xi: Tensor) -> Tensor:
-    """Rigid transforms of tangent vectors [rho, omega]. (..., 6) -> (..., 4, 4)."""
+def se3_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """Rigid transforms of tangent vectors [rho, omega]."""
     rho, omega = xi.split(3, dim=-1)
     a, b, c, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
@@ -175,31 +178,35 @@ def se3_exp(xi: Tensor) -> Tensor:
 
 
 @full_precision
-def se3_log(T: Tensor) -> Tensor:
-    """Tangent vectors [rho, omega] of rigid transforms. (..., 4, 4) -> (..., 6)."""
+def se3_log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """Tangent vectors [rho, omega] of rigid transforms."""
     omega = so3_log(T[..., :3, :3])
     rho = (_so3_left_jacobian_inverse(omega) @ T[..., :3, 3:]).squeeze(-1)
     return torch.cat((rho, omega), dim=-1)
 
 
 @full_precision
-def se3_inverse(T: Tensor) -> Tensor:
-    """Inverse of rigid transforms. (..., 4, 4) -> (..., 4, 4)."""
+def se3_inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of rigid transforms."""
     R = T[..., :3, :3].mT
     return rigid(R, -(R @ T[..., :3, 3:]).squeeze(-1))
 
 
 @full_precision
-def se3_adjoint(T: Tensor) -> Tensor:
-    """Ad with T exp(xi) = exp(Ad xi) T. (..., 4, 4) -> (..., 6, 6)."""
+def se3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6 6"]:
+    """Ad with T exp(xi) = exp(Ad xi) T."""
     R, t = T[..., :3, :3], T[..., :3, 3]
     top = torch.cat((R, skew(t) @ R), dim=-1)
     return torch.cat((top, torch.cat((torch.zeros_like(R), R), dim=-1)), dim=-2)
 
 
 @full_precision
-def se3_interpolate(T_0: Tensor, T_1: Tensor, fraction: Tensor | float) -> Tensor:
-    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1). (..., 4, 4) twice, (...) -> (..., 4, 4).
+def se3_interpolate(
+    T_0: Float[Tensor, "*#batch 4 4"],
+    T_1: Float[Tensor, "*#batch 4 4"],
+    fraction: Float[Tensor, "*#batch"] | float,
+) -> Float[Tensor, "*#batch 4 4"]:
+    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1).
 
     Interpolating the inverses gives the inverse of the interpolation.
     """
@@ -221,8 +228,10 @@ _PARTIAL_WEIGHTS = _integration_matrix(_NODES).tolist()
 _NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()
 
 
-def _sim3_translation_matrix(omega: Tensor, sigma: Tensor) -> Tensor:
-    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^). (..., 3), (...) -> (..., 3, 3).
+def _sim3_translation_matrix(
+    omega: Float[Tensor, "*batch 3"], sigma: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^).
 
     By quadrature: no case distinctions for a small angle or scale, and smooth everywhere.
     """
@@ -238,7 +247,7 @@ def _sim3_translation_matrix(omega: Tensor, sigma: Tensor) -> Tensor:
 
 
 @full_precision
-def sim3_exp(xi: Tensor) -> Tensor:
+def sim3_exp(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 4 4"]:
     """Similarities [sR t; 0 1] of tangent vectors [rho, omega, sigma], s = exp(sigma).
 
     (..., 7) -> (..., 4, 4).
@@ -249,14 +258,14 @@ def sim3_exp(xi: Tensor) -> Tensor:
 
 
 @full_precision
-def sim3_scale(T: Tensor) -> Tensor:
-    """The scale s of similarities [sR t; 0 1]. (..., 4, 4) -> (...)."""
+def sim3_scale(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
+    """The scale s of similarities [sR t; 0 1]."""
     return T[..., 0, :3].norm(dim=-1)
 
 
 @full_precision
-def sim3_log(T: Tensor) -> Tensor:
-    """Tangent vectors [rho, omega, sigma] of similarities. (..., 4, 4) -> (..., 7)."""
+def sim3_log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 7"]:
+    """Tangent vectors [rho, omega, sigma] of similarities."""
     scale = sim3_scale(T)
     sigma, omega = scale.log(), so3_log(T[..., :3, :3] / scale[..., None, None])
     W = _sim3_translation_matrix(omega, sigma)
@@ -265,15 +274,15 @@ def sim3_log(T: Tensor) -> Tensor:
 
 
 @full_precision
-def sim3_inverse(T: Tensor) -> Tensor:
-    """Inverse of similarities. (..., 4, 4) -> (..., 4, 4)."""
+def sim3_inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of similarities."""
     inverse = T[..., :3, :3].mT / sim3_scale(T).square()[..., None, None]
     return rigid(inverse, -(inverse @ T[..., :3, 3:]).squeeze(-1))
 
 
 @full_precision
-def sim3_adjoint(T: Tensor) -> Tensor:
-    """Ad with T exp(xi) = exp(Ad xi) T for similarities. (..., 4, 4) -> (..., 7, 7)."""
+def sim3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 7 7"]:
+    """Ad with T exp(xi) = exp(Ad xi) T for similarities."""
     sR, t = T[..., :3, :3], T[..., :3, 3:]
     R = sR / sim3_scale(T)[..., None, None]
     zero, column = torch.zeros_like(R), torch.zeros_like(t)
@@ -285,22 +294,27 @@ def sim3_adjoint(T: Tensor) -> Tensor:
 
 
 @full_precision
-def sim3_left_jacobian(xi: Tensor) -> Tensor:
-    """J with exp(xi + d) = exp(J d) exp(xi) to first order. (..., 7) -> (..., 7, 7)."""
+def sim3_left_jacobian(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
+    """J with exp(xi + d) = exp(J d) exp(xi) to first order."""
     (W, Q, q), rotation = _sim3_left_jacobian_blocks(xi)
     return _sim3_jacobian_from_blocks(W, Q, -q, rotation)
 
 
 @full_precision
-def sim3_left_jacobian_inverse(xi: Tensor) -> Tensor:
-    """Inverse of the left Jacobian, for angles below 2 pi. (..., 7) -> (..., 7, 7)."""
+def sim3_left_jacobian_inverse(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
+    """Inverse of the left Jacobian, for angles below 2 pi."""
     (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)
     rotation = _so3_left_jacobian_inverse(xi[..., 3:6])
     W = torch.linalg.inv_ex(W)[0]
     return _sim3_jacobian_from_blocks(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
 
 
-def _sim3_left_jacobian_blocks(xi: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+def _sim3_left_jacobian_blocks(
+    xi: Float[Tensor, "*batch 7"],
+) -> tuple[
+    tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]],
+    Float[Tensor, "*batch 3 3"],
+]:
     """W, Q, q and the rotation's Jacobian of J = [W Q -q; 0 J_rotation 0; 0 0 1].
 
     J is the integral over s in [0, 1] of Ad(exp(s xi)), that is, of [e^(s sigma) R(s), t(s)^ R(s), -t(s); ...], where
@@ -326,8 +340,13 @@ def _sim3_left_jacobian_blocks(xi: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor
     return (W, (skew(moments) @ powers).sum(-3), moments[..., 0, :]), rotation
 
 
-def _sim3_jacobian_from_blocks(W: Tensor, Q: Tensor, q: Tensor, rotation: Tensor) -> Tensor:
-    """[W Q q; 0 rotation 0; 0 0 1]. (..., 3, 3), (..., 3, 3), (..., 3), (..., 3, 3) -> (..., 7, 7)."""
+def _sim3_jacobian_from_blocks(
+    W: Float[Tensor, "*batch 3 3"],
+    Q: Float[Tensor, "*batch 3 3"],
+    q: Float[Tensor, "*batch 3"],
+    rotation: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 7 7"]:
+    """[W Q q; 0 rotation 0; 0 0 1]."""
     top = torch.cat((W, Q, q[..., None]), dim=-1)
     middle = torch.nn.functional.pad(rotation, (3, 1))
     bottom = torch.zeros_like(top[..., :1, :])

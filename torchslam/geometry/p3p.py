@@ -5,13 +5,16 @@ from __future__ import annotations
 from functools import lru_cache
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.precision import full_precision
 
 
 @full_precision
-def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def p3p(
+    rays: Float[Tensor, "*batch 3 3"], points: Float[Tensor, "*batch 3 3"]
+) -> tuple[Float[Tensor, "*batch 4 3 3"], Float[Tensor, "*batch 4 3"], Bool[Tensor, "*batch 4"]]:
     """Compute all poses R, t with ray_i parallel to R point_i + t for three rays and points.
 
     Not differentiable by design: it generates hypotheses. The three distance equations in the depths form a pencil
@@ -20,8 +23,8 @@ def p3p(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     problem", 2023.
 
     Args:
-        rays: (..., 3, 3) rows of unit length.
-        points: (..., 3, 3) one point per row.
+        rays: rows of unit length.
+        points: one point per row.
 
     Returns:
         R (..., 4, 3, 3), t (..., 4, 3) and valid (..., 4) for up to four solutions. Invalid entries, and all
@@ -87,7 +90,9 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
     return torch.tensor(_ADJUGATE_PAIRS, device=device), times[:, None], conics
 
 
-def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+def _depths(
+    rays: Float[Tensor, "3 3 B"], points: Float[Tensor, "3 3 B"]
+) -> tuple[Float[Tensor, "3 4 B"], Bool[Tensor, "4 B"]]:
     """Depths (3, 4, S) along the rays (3, 3, S) to the points (3, 3, S), and which are real and positive (4, S)."""
     # of the pairs 12, 23, 31
     distance = (points - points.roll(-1, 0)).square_().sum(1)
@@ -109,8 +114,8 @@ def _depths(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     return depths * unit.sqrt(), (depths > 0).all(0) & real & on_conic
 
 
-def _line_pair(D: Tensor) -> tuple[Tensor, Tensor]:
-    """The two lines of a degenerate conic in the pencil of two. (2, 6, S) -> (2, 2, S), (S,).
+def _line_pair(D: Float[Tensor, "2 6 B"]) -> tuple[Float[Tensor, "2 2 B"], Bool[Tensor, " B"]]:
+    """The two lines of a degenerate conic in the pencil of two.
 
     Each line as p, q of depth_1 = p depth_2 + q depth_3, in the first dimension. Also, whether the lines are real.
     """
@@ -131,7 +136,9 @@ def _line_pair(D: Tensor) -> tuple[Tensor, Tensor]:
     return lines, (squares >= 0).all(0)
 
 
-def _intersections(lines: Tensor, conic: Tensor) -> tuple[Tensor, Tensor]:
+def _intersections(
+    lines: Float[Tensor, "2 2 B"], conic: Float[Tensor, "6 B"]
+) -> tuple[Float[Tensor, "3 4 B"], Bool[Tensor, "4 B"]]:
     """Intersections of two lines with a conic without entry 01: (2, 2, S), (6, S) -> (3, 4, S), real (4, S)."""
     p, q = lines
     xx, _, xz, yy, zz, yz = conic
@@ -160,8 +167,10 @@ def _cubic_root(b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     return x - torch.addcmul(d, torch.addcmul(c, x + b, x), x) / slope
 
 
-def _polish(depths: Tensor, cosine: Tensor, distance: Tensor) -> Tensor:
-    """A Newton step on the three distance equations. (3, 4, S), (3, 1, S), (3, 1, S) -> (3, 4, S)."""
+def _polish(
+    depths: Float[Tensor, "3 4 B"], cosine: Float[Tensor, "3 1 B"], distance: Float[Tensor, "3 1 B"]
+) -> Float[Tensor, "3 4 B"]:
+    """A Newton step on the three distance equations."""
     following = depths.roll(-1, 0)
     # J = 2 [[a1 b1 0], [0 a2 b2], [b3 0 a3]], solved by Cramer's rule
     a, b = (

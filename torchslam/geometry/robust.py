@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
@@ -34,9 +35,9 @@ class Robustified(NamedTuple):
     curvature: rho'', never positive
     """
 
-    rho: Tensor
-    weight: Tensor
-    curvature: Tensor
+    rho: Float[Tensor, "*batch"]
+    weight: Float[Tensor, "*batch"]
+    curvature: Float[Tensor, "*batch"]
 
 
 def _none(s: Tensor, scale: Tensor) -> Robustified:
@@ -80,10 +81,12 @@ _KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
 }
 
 
-def robustify(squared: Tensor, kernel: Kernel, scale: Tensor) -> Robustified:
+def robustify(
+    squared: Float[Tensor, "*#batch"], kernel: Kernel, scale: Float[Tensor, "*#batch"]
+) -> Robustified:
     """rho, rho' and rho'' of squared whitened residuals.
 
-    squared: (...) not negative; scale: broadcastable to it, positive. Differentiable to both, except on the
+    squared: not negative; scale: broadcastable to it, positive. Differentiable to both, except on the
     boundary of "huber" (rho'') and "truncated". Raises ValueError for an unknown kernel.
     """
     if kernel not in _KERNELS:

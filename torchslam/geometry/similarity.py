@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -30,11 +31,11 @@ from torchslam.geometry.ransac import (
 
 @full_precision
 def umeyama(
-    source: Tensor,
-    target: Tensor,
-    weights: Tensor | None = None,
+    source: Float[Tensor, "*#batch N 3"],
+    target: Float[Tensor, "*#batch N 3"],
+    weights: Float[Tensor, "*#batch N"] | Bool[Tensor, "*#batch N"] | None = None,
     with_scale: bool = True,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]]:
     """Align points by the similarity that minimizes sum_i w_i |target_i - (s R source_i + t)|^2.
 
     Differentiable once in points and weights (a second time raises RuntimeError), on exact data and at repeated
@@ -44,9 +45,9 @@ def umeyama(
     between two point patterns", 1991.
 
     Args:
-        source: (..., N, 3) points.
-        target: (..., N, 3) corresponding points.
-        weights: (..., N) non-negative weights or a boolean mask; rows of weight zero may hold anything.
+        source: points.
+        target: corresponding points.
+        weights: non-negative weights or a boolean mask; rows of weight zero may hold anything.
         with_scale: False fixes the scale to one.
 
     Returns:
@@ -71,8 +72,8 @@ def umeyama(
     return scale, R, t
 
 
-def _nearest_rotation(M: Tensor) -> Tensor:
-    """The rotation that maximizes tr(R^T M), with a finite first-order gradient. (..., 3, 3) -> (..., 3, 3).
+def _nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation that maximizes tr(R^T M), with a finite first-order gradient.
 
     At the maximum S = M R^T is symmetric; for a change of M the rotation moves by exp(omega) with
     (tr(S) I - S) omega = vee(2 antisymmetric part of dM R^T).
@@ -110,31 +111,31 @@ class Similarity:
     """Similarities between the coordinates of B pairs of cameras.
 
     Attributes:
-        S_21: (B, 4, 4) from camera 1 to camera 2; the identity where none was found.
-        inliers: (B, N) pairs of points within the threshold of their pixels in both images.
-        success: (B,) whether the inliers are significant and not all on one line.
-        score: (B,) sum over the pairs of 1 - min((larger error / threshold)^2, 1).
+        S_21: from camera 1 to camera 2; the identity where none was found.
+        inliers: pairs of points within the threshold of their pixels in both images.
+        success: whether the inliers are significant and not all on one line.
+        score: sum over the pairs of 1 - min((larger error / threshold)^2, 1).
     """
 
-    S_21: Tensor
-    inliers: Tensor
-    success: Tensor
-    score: Tensor
+    S_21: Float[Tensor, "B 4 4"]
+    inliers: Bool[Tensor, "B N"]
+    success: Bool[Tensor, " B"]
+    score: Float[Tensor, " B"]
 
 
 @full_precision
 def estimate_similarity(
-    points_1: Tensor,
-    points_2: Tensor,
-    pixels_1: Tensor,
-    pixels_2: Tensor,
+    points_1: Float[Tensor, "B N 3"],
+    points_2: Float[Tensor, "B N 3"],
+    pixels_1: Float[Tensor, "B N 2"],
+    pixels_2: Float[Tensor, "B N 2"],
     camera_1: Camera,
     camera_2: Camera,
-    sigmas_1: Tensor | None = None,
-    sigmas_2: Tensor | None = None,
+    sigmas_1: Float[Tensor, "B N"] | None = None,
+    sigmas_2: Float[Tensor, "B N"] | None = None,
     threshold: float = _THRESHOLD,
     depth_sigma: float = _DEPTH_SIGMA,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     with_scale: bool = True,
     confidence: float = 0.9999,
@@ -148,19 +149,19 @@ def estimate_similarity(
     system", 2015, section VII-B; for the minimal solution `umeyama`.
 
     Args:
-        points_1: (B, N, 3) points in the coordinates of camera 1.
-        points_2: (B, N, 3) the same points in the coordinates of camera 2.
-        pixels_1: (B, N, 2) where camera 1 saw them.
-        pixels_2: (B, N, 2) where camera 2 saw them.
+        points_1: points in the coordinates of camera 1.
+        points_2: the same points in the coordinates of camera 2.
+        pixels_1: where camera 1 saw them.
+        pixels_2: where camera 2 saw them.
         camera_1: one or B.
         camera_2: one or B.
-        sigmas_1: (B, N) standard deviations of `pixels_1`, pixels; None: one.
-        sigmas_2: (B, N) standard deviations of `pixels_2`, pixels; None: one.
+        sigmas_1: standard deviations of `pixels_1`, pixels; None: one.
+        sigmas_2: standard deviations of `pixels_2`, pixels; None: one.
         threshold: reprojection error of an inlier in standard deviations, of the points of each camera in the other
             image.
         depth_sigma: relative standard deviation of the depths in camera 2. They determine the scale where both
             cameras are at one place, as in a loop closure, and pixels do not depend on it.
-        mask: (B, N) pairs in use; pairs that are not finite, behind their camera, or with a sigma not above zero
+        mask: pairs in use; pairs that are not finite, behind their camera, or with a sigma not above zero
             are never used.
         seed: of the random samples.
         with_scale: False fixes the scale to one.
@@ -200,15 +201,15 @@ def estimate_similarity(
 class _View:
     """One direction: points of the other camera, (B, N, 3), and where this one saw them, pixels (B, N, 2).
 
-    sigmas: (B, N) thresholds in pixels; normalized: (B, N, 2) undistorted; scale: (B, N, 2) thresholds per unit of it
+    sigmas: thresholds in pixels; normalized: (B, N, 2) undistorted; scale: (B, N, 2) thresholds per unit of it
     """
 
-    points: Tensor
-    pixels: Tensor
-    sigmas: Tensor
+    points: Float[Tensor, "B N 3"]
+    pixels: Float[Tensor, "B N 2"]
+    sigmas: Float[Tensor, "B N"]
     camera: Camera
-    normalized: Tensor
-    scale: Tensor
+    normalized: Float[Tensor, "B N 2"]
+    scale: Float[Tensor, "B N 2"]
 
     @staticmethod
     def of(points: Tensor, pixels: Tensor, sigmas: Tensor, camera: Camera, threshold: float) -> _View:
@@ -224,7 +225,9 @@ class _View:
         chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
         return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
 
-    def undistorted_errors(self, P: Tensor, rows: Tensor | None = None) -> Tensor:
+    def undistorted_errors(
+        self, P: Float[Tensor, "B K 3 4"], rows: Int[Tensor, "B n"] | None = None
+    ) -> Float[Tensor, "B K _"]:
         """Squared errors of many mappings (B, M, 3, 4) in thresholds; infinite or NaN behind. (B, M, N)."""
         points, x, scale = self.points, self.normalized, self.scale
         if rows is not None:
@@ -232,7 +235,9 @@ class _View:
         homogeneous = torch.nn.functional.pad(points, (0, 1), value=1.0).mT
         return squared_projections(P, homogeneous.to(P.dtype), x.to(P.dtype), scale)
 
-    def residuals(self, P: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def residuals(
+        self, P: Float[Tensor, "B 3 4"]
+    ) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 2"], Float[Tensor, "B N 2 3"], Bool[Tensor, "B N"]]:
         """One mapping (B, 3, 4) each, through the distortion: moved points (B, N, 3), residuals (B, N, 2) in
         thresholds and their derivatives (B, N, 2, 3) in the moved points, and validity (B, N).
         """
@@ -251,7 +256,7 @@ class _Problem:
 
     forward: _View
     backward: _View
-    mask: Tensor
+    mask: Bool[Tensor, "B N"]
     with_scale: bool
     depth_sigma: float
 
@@ -260,7 +265,9 @@ class _Problem:
         forward, backward = self.forward.select(rows), self.backward.select(rows)
         return replace(self, forward=forward, backward=backward, mask=self.mask[rows])
 
-    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def solve(
+        self, seed: int, confidence: float, max_samples: int
+    ) -> tuple[Float[Tensor, "B 4 4"], Bool[Tensor, " B"], Float[Tensor, "B N"], Float[Tensor, " B"]]:
         """S_21 (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
         generator = torch.Generator().manual_seed(seed)
         (P,) = search(
@@ -298,15 +305,15 @@ class _Problem:
         near = (self.larger_errors(P) < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
-    def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
-        """Truncated scores of many similarities on some of the pairs, or all, in float32. (B, M, 12) -> (B, M)."""
+    def score(self, P: Float[Tensor, "B K 12"], rows: Int[Tensor, "B n"] | None) -> Float[Tensor, "B K"]:
+        """Truncated scores of many similarities on some of the pairs, or all, in float32."""
         P = P.unflatten(-1, (3, 4))
         mask = self.mask if rows is None else self.mask.gather(1, rows)
         there = self.forward.undistorted_errors(P.float(), rows)
         back = self.backward.undistorted_errors(_inverse(P).float(), rows)
         return truncated_score(torch.maximum(there, back), mask)
 
-    def larger_errors(self, P: Tensor) -> Tensor:
+    def larger_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
         """The larger of both squared errors in thresholds; infinite where a point cannot be seen. (B, N)."""
         squared = []
         for view, mapping in ((self.forward, P), (self.backward, _inverse(P))):
@@ -314,7 +321,9 @@ class _Problem:
             squared.append(residual.square().sum(-1).masked_fill(~valid, torch.inf))
         return torch.maximum(*squared).nan_to_num(torch.inf)
 
-    def fit(self, P: Tensor, iterations: int, width: float) -> tuple[Tensor, Tensor]:
+    def fit(
+        self, P: Float[Tensor, "B 3 4"], iterations: int, width: float
+    ) -> tuple[Float[Tensor, "B 3 4"], Float[Tensor, " B"]]:
         """Similarities (B, 3, 4) of least truncated squared error in both images and in depth, and their costs (B,)."""
         dims = 7 if self.with_scale else 6
 
@@ -339,7 +348,9 @@ class _Problem:
         (P,), cost = levenberg_marquardt((P,), evaluate, _retract, iterations)
         return P, cost
 
-    def depths(self, moved: Tensor) -> tuple[Tensor, Tensor]:
+    def depths(
+        self, moved: Float[Tensor, "B N 3"]
+    ) -> tuple[Float[Tensor, "B N 1"], Float[Tensor, "B N 1 3"]]:
         """Differences (B, N, 1) of the logarithms of depths in camera 2, in thresholds, and their derivatives
         (B, N, 1, 3) in the moved points (B, N, 3); zero where a depth is not positive.
         """
@@ -348,7 +359,7 @@ class _Problem:
         slope = torch.where(front, 1 / (self.depth_sigma * depth), 0.0)
         return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
 
-    def is_success(self, inliers: Tensor) -> Tensor:
+    def is_success(self, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
         """Test whether the inliers are significant and fix the similarity: four or more, not on one line. (B,)."""
         weights = inliers[..., None].to(self.forward.points.dtype)
         count = self.mask.sum(-1)
@@ -367,14 +378,14 @@ class _Problem:
         return success
 
 
-def _inverse(P: Tensor) -> Tensor:
-    """Inverse of similarities [sR t]. (..., 3, 4) -> (..., 3, 4)."""
+def _inverse(P: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:
+    """Inverse of similarities [sR t]."""
     linear = P[..., :3].mT / P[..., :1, :3].square().sum(-1, keepdim=True)
     return torch.cat((linear, -linear @ P[..., 3:]), dim=-1)
 
 
-def _chain(J: Tensor, points: Tensor) -> Tensor:
-    """Derivatives in [rho, omega, sigma] of what depends on points by J. (..., R, 3), (..., 3) -> (..., R, 7)."""
+def _chain(J: Float[Tensor, "*batch R 3"], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch R 7"]:
+    """Derivatives in [rho, omega, sigma] of what depends on points by J."""
     rotation = torch.linalg.cross(points[..., None, :].expand_as(J), J, dim=-1)
     return torch.cat((J, rotation, J @ points[..., None]), dim=-1)
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -30,21 +31,23 @@ from torchslam.geometry.lie import (
 )
 
 
-def pose_distance(T_cw: Tensor, T_kw: Tensor, depth: Tensor | float) -> tuple[Tensor, Tensor]:
+def pose_distance(
+    T_cw: Float[Tensor, "4 4"], T_kw: Float[Tensor, "K 4 4"], depth: Float[Tensor, ""] | float
+) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
     """Distances of cameras T_kw (k, 4, 4) from T_cw (4, 4): (k,) in units of a depth, and (k,) degrees."""
     T_ck = T_cw @ se3_inverse(T_kw)
     translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
     return translation, torch.rad2deg(rotation_angle(T_ck[:, :3, :3]))
 
 
-def rotation_angle(R: Tensor) -> Tensor:
+def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Angles of rotation matrices, to decide by: without a gradient at 0 and pi. (..., 3, 3) -> (...) radians."""
     sine = torch.linalg.vector_norm(R - R.mT, dim=(-2, -1)) / math.sqrt(8)
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.atan2(sine, cosine)
 
 
-def reorthonormalized(T: Tensor) -> Tensor:
+def reorthonormalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Reorthonormalize the rotations of nearly rigid transforms (..., 4, 4), to machine precision.
 
     Where a pose is predicted from those before it, with transposes for inverses, what they lack of a rotation grows by
@@ -55,8 +58,12 @@ def reorthonormalized(T: Tensor) -> Tensor:
 
 
 def carry_points(
-    points_w: Tensor, covariances_w: Tensor, normals_w: Tensor, T_cw: Tensor, S_cw: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    points_w: Float[Tensor, "*batch 3"],
+    covariances_w: Float[Tensor, "*batch 3 3"],
+    normals_w: Float[Tensor, "*batch 3"],
+    T_cw: Float[Tensor, "*batch 4 4"],
+    S_cw: Float[Tensor, "*batch 4 4"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
     """Move points, covariances and unit normals as the pose T_cw of their camera is corrected to a similarity S_cw.
 
     points_w: (..., 3); covariances_w: (..., 3, 3); normals_w: (..., 3); T_cw, S_cw: (..., 4, 4), one for each point,
@@ -69,18 +76,22 @@ def carry_points(
     return moved_w, R_wc @ covariances_w @ R_wc.mT, normals
 
 
-def with_unit(T: Tensor, unit: Tensor) -> Tensor:
+def with_unit(
+    T: Float[Tensor, "*#batch 4 4"], unit: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*#batch 4 4"]:
     """Rigid transforms (..., 4, 4) in a unit of length that is (...) times as long."""
     return rigid(T[..., :3, :3], T[..., :3, 3] / unit[..., None])
 
 
-def without_scale(S_cw: Tensor) -> Tensor:
+def without_scale(S_cw: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """The pose (..., 4, 4) of the camera of a similarity: its rotation and its center, in the unit of the world."""
     scale = sim3_scale(S_cw)
     return rigid(S_cw[..., :3, :3] / scale[..., None, None], S_cw[..., :3, 3] / scale[..., None])
 
 
-def covariances_with_unit(covariances: Tensor, unit: Tensor) -> Tensor:
+def covariances_with_unit(
+    covariances: Float[Tensor, "*#batch 6 6"], unit: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*#batch 6 6"]:
     """Covariances (..., 6, 6) of poses, translation first, in a unit of length that is (...) times as long."""
     units = torch.ones_like(covariances[..., 0])
     units[..., :3] = 1 / unit[..., None]
@@ -90,7 +101,7 @@ def covariances_with_unit(covariances: Tensor, unit: Tensor) -> Tensor:
 HALF_PIXEL = 0.5  # from an origin at the center of the top left pixel to one at its corner
 
 
-def corner_pixels(pixels: Tensor) -> Tensor:
+def corner_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
     """Pixels (..., 2) from the corner of the image, not from the center of its first pixel."""
     return pixels + HALF_PIXEL
 
@@ -102,17 +113,17 @@ def corner_camera(camera: Camera) -> Camera:
     return camera.with_params(params)
 
 
-def opengl(T_wc: Tensor) -> Tensor:
+def opengl(T_wc: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Convert camera-to-world (..., 4, 4) to camera axes x right, y up, z backward."""
     return T_wc * T_wc.new_tensor((1.0, -1.0, -1.0, 1.0))
 
 
-def quaternion_wxyz(R: Tensor) -> Tensor:
+def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions (..., 4), w first and not negative, of rotation matrices (..., 3, 3)."""
     return quaternion_from_matrix(R).roll(1, dims=-1)
 
 
-def upright_rotation(T_wc: Tensor) -> Tensor:
+def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
     """Rotation (3, 3) from the world to one whose z is up and whose x is as close to the world's x as possible.
 
     T_wc: (N, 4, 4). Gravity is not known: up is the mean up direction of the cameras. Where they have none, as when

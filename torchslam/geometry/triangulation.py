@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -18,22 +19,22 @@ class Triangulation:
     """Points seen in two views. Invalid rows are finite.
 
     Attributes:
-        points_w: (..., N, 3) points.
-        angles: (..., N) parallax between the two rays at the point, radians.
-        depths_1: (..., N) z in camera 1.
-        depths_2: (..., N) z in camera 2.
-        errors_1: (..., N) reprojection error in pixels; infinite where the point does not project.
-        errors_2: (..., N) reprojection error in pixels; infinite where the point does not project.
-        mask: (..., N) the input mask, where the rays intersect in front of both cameras.
+        points_w: points.
+        angles: parallax between the two rays at the point, radians.
+        depths_1: z in camera 1.
+        depths_2: z in camera 2.
+        errors_1: reprojection error in pixels; infinite where the point does not project.
+        errors_2: reprojection error in pixels; infinite where the point does not project.
+        mask: the input mask, where the rays intersect in front of both cameras.
     """
 
-    points_w: Tensor
-    angles: Tensor
-    depths_1: Tensor
-    depths_2: Tensor
-    errors_1: Tensor
-    errors_2: Tensor
-    mask: Tensor
+    points_w: Float[Tensor, "*batch N 3"]
+    angles: Float[Tensor, "*batch N"]
+    depths_1: Float[Tensor, "*batch N"]
+    depths_2: Float[Tensor, "*batch N"]
+    errors_1: Float[Tensor, "*batch N"]
+    errors_2: Float[Tensor, "*batch N"]
+    mask: Bool[Tensor, "*batch N"]
 
 
 @dataclass(frozen=True)
@@ -41,30 +42,30 @@ class MultiViewTriangulation:
     """Points seen in up to V views. Invalid rows are finite.
 
     Attributes:
-        points_w: (..., N, 3) points.
-        angles: (..., N) largest parallax between two of the rays, radians.
-        depths: (..., N, V) z in each camera.
-        errors: (..., N, V) reprojection error in pixels; infinite where the point does not project.
-        mask: (..., N) seen in two views or more, and in front of all cameras that see it.
+        points_w: points.
+        angles: largest parallax between two of the rays, radians.
+        depths: z in each camera.
+        errors: reprojection error in pixels; infinite where the point does not project.
+        mask: seen in two views or more, and in front of all cameras that see it.
     """
 
-    points_w: Tensor
-    angles: Tensor
-    depths: Tensor
-    errors: Tensor
-    mask: Tensor
+    points_w: Float[Tensor, "*batch N 3"]
+    angles: Float[Tensor, "*batch N"]
+    depths: Float[Tensor, "*batch N V"]
+    errors: Float[Tensor, "*batch N V"]
+    mask: Bool[Tensor, "*batch N"]
 
 
 @full_precision
 def triangulate(
-    T_1w: Tensor,
-    T_2w: Tensor,
-    pixels_1: Tensor,
-    pixels_2: Tensor,
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
+    pixels_1: Float[Tensor, "*#batch N 2"],
+    pixels_2: Float[Tensor, "*#batch N 2"],
     camera_1: Camera,
     camera_2: Camera,
-    mask: Tensor | None = None,
-    normalized: tuple[Tensor, Tensor] | None = None,
+    mask: Bool[Tensor, "*#batch N"] | None = None,
+    normalized: tuple[Float[Tensor, "*#batch N 2"], Float[Tensor, "*#batch N 2"]] | None = None,
 ) -> Triangulation:
     """Triangulate matches of two views, with the least squared error in undistorted coordinates.
 
@@ -73,13 +74,13 @@ def triangulate(
     the noise).
 
     Args:
-        T_1w: (..., 4, 4) world to camera 1.
-        T_2w: (..., 4, 4) world to camera 2.
-        pixels_1: (..., N, 2) matches in view 1.
-        pixels_2: (..., N, 2) matches in view 2.
+        T_1w: world to camera 1.
+        T_2w: world to camera 2.
+        pixels_1: matches in view 1.
+        pixels_2: matches in view 2.
         camera_1: of view 1.
         camera_2: of view 2.
-        mask: (..., N) matches in use; rows outside it may hold anything.
+        mask: matches in use; rows outside it may hold anything.
         normalized: the pixels undistorted, twice (..., N, 2), if the caller has them already.
 
     Returns:
@@ -118,22 +119,22 @@ def triangulate(
 
 @full_precision
 def triangulation_covariance(
-    T_1w: Tensor,
-    T_2w: Tensor,
-    points_w: Tensor,
-    sigmas_1: Tensor,
-    sigmas_2: Tensor,
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
+    points_w: Float[Tensor, "*#batch N 3"],
+    sigmas_1: Float[Tensor, "*#batch N"] | Float[Tensor, "*#batch N 2 2"],
+    sigmas_2: Float[Tensor, "*#batch N"] | Float[Tensor, "*#batch N 2 2"],
     camera_1: Camera,
     camera_2: Camera,
-) -> Tensor:
+) -> Float[Tensor, "*#batch N 3 3"]:
     """Covariances (sum of J^T J / sigma^2)^-1 of points triangulated from two views with exact poses.
 
     Args:
-        T_1w: (..., 4, 4) world to camera 1.
-        T_2w: (..., 4, 4) world to camera 2.
-        points_w: (..., N, 3) points.
-        sigmas_1: (..., N) standard deviations of the pixels in view 1, or (..., N, 2, 2) their covariances.
-        sigmas_2: (..., N) or (..., N, 2, 2), of view 2.
+        T_1w: world to camera 1.
+        T_2w: world to camera 2.
+        points_w: points.
+        sigmas_1: standard deviations of the pixels in view 1, or (..., N, 2, 2) their covariances.
+        sigmas_2: or (..., N, 2, 2), of view 2.
         camera_1: of view 1.
         camera_2: of view 2.
 
@@ -156,15 +157,17 @@ def triangulation_covariance(
 
 
 @full_precision
-def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor]:
+def correct_matches(
+    E: Float[Tensor, "*#batch 3 3"], x_1: Float[Tensor, "*#batch N 2"], x_2: Float[Tensor, "*#batch N 2"]
+) -> tuple[Float[Tensor, "*#batch N 2"], Float[Tensor, "*#batch N 2"]]:
     """Move matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
 
     Source: Lindstrom, "Triangulation made easy", 2010.
 
     Args:
-        E: (..., 3, 3) essential matrices.
-        x_1: (..., N, 2) undistorted image coordinates in view 1.
-        x_2: (..., N, 2) undistorted image coordinates in view 2.
+        E: essential matrices.
+        x_1: undistorted image coordinates in view 1.
+        x_2: undistorted image coordinates in view 2.
 
     Returns:
         The corrected x_1 and x_2.
@@ -189,10 +192,10 @@ def correct_matches(E: Tensor, x_1: Tensor, x_2: Tensor) -> tuple[Tensor, Tensor
 
 @full_precision
 def triangulate_many(
-    T_cw: Tensor,
-    pixels: Tensor,
+    T_cw: Float[Tensor, "*#batch V 4 4"],
+    pixels: Float[Tensor, "*#batch N V 2"],
     camera: Camera,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "*#batch N V"] | None = None,
     iterations: int = 3,
 ) -> MultiViewTriangulation:
     """Triangulate points from V views: linear on the rays, then Gauss-Newton on the reprojection error.
@@ -201,10 +204,10 @@ def triangulate_many(
     `depths` and `errors`.
 
     Args:
-        T_cw: (..., V, 4, 4) world to camera.
-        pixels: (..., N, V, 2) observations; entries outside the mask may hold anything.
+        T_cw: world to camera.
+        pixels: observations; entries outside the mask may hold anything.
         camera: of all views.
-        mask: (..., N, V) which views see the point.
+        mask: which views see the point.
         iterations: of Gauss-Newton.
 
     Returns:
@@ -262,8 +265,8 @@ def _refine_points(points_w: Tensor, T_cw: Tensor, pixels: Tensor, camera: Camer
     return torch.where(better[..., None], moved, points_w)
 
 
-def _solve_3x3(A: Tensor, b: Tensor) -> Tensor:
-    """A^-1 b by the adjugate; zero where A is singular. (..., 3, 3), (..., 3) -> (..., 3)."""
+def _solve_3x3(A: Float[Tensor, "*batch 3 3"], b: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """A^-1 b by the adjugate; zero where A is singular."""
     columns = A.unbind(-1)
     rows = torch.stack([torch.linalg.cross(columns[i - 2], columns[i - 1], dim=-1) for i in range(3)], dim=-2)
     determinant = (rows[..., 0, :] * columns[0]).sum(-1)
