@@ -16,7 +16,7 @@ from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, read_map, write_atlas
 from torchslam.map.map import Map
 from torchslam.types import FrameFeatures, PoseEstimate
-from torchslam.utils.atomic_write import PART, write_whole
+from torchslam.utils.files import PART, write_whole
 
 
 @pytest.fixture

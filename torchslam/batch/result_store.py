@@ -20,8 +20,7 @@ from typing import Any
 import torchslam
 from torchslam.data.synthetic import sequence as synthetic
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
-from torchslam.utils.atomic_write import whole_folder, write_whole
-from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
+from torchslam.utils.files import JSON_BYTES, parse_json, read_text, whole_folder, write_whole
 
 RUNS = "runs"
 ERRORS = "errors"

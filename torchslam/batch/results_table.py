@@ -17,7 +17,7 @@ from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, rea
 from torchslam.batch.task import TIMES, Task, configuration
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.io import plots
-from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
+from torchslam.utils.files import JSON_BYTES, parse_json, read_text
 
 CSV = "table.csv"
 PARQUET = "table.parquet"

@@ -10,7 +10,7 @@ from torchslam.io.results import CHECKPOINT, results_in
 from torchslam.system.checkpoint import write_checkpoint
 from torchslam.system.run import RunProgress
 from torchslam.system.slam import SLAM
-from torchslam.utils.atomic_write import write_whole
+from torchslam.utils.files import write_whole
 
 GROWTH = (
     0.05  # minimum interval as a ratio of the keyframes so far, so that all checkpoints together cost O(n)

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from torchslam.errors import ConfigError
 from torchslam.plugins import is_known, registered
-from torchslam.utils.bounded_read import read_text
+from torchslam.utils.files import read_text
 
 Value = TypeVar("Value", bool, int, float, str)
 Section = TypeVar("Section", bound="Settings")

@@ -11,7 +11,7 @@ import torch
 from torchslam.data.formats.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
-from torchslam.utils.atomic_write import write_whole
+from torchslam.utils.files import write_whole
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"

@@ -27,7 +27,7 @@ from torchslam.data.formats.image_file import MAX_BYTES
 from torchslam.data.formats.text_file import parse_floats
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
-from torchslam.utils import bounded_read as regular_file
+from torchslam.utils.files import read_bytes
 
 EXIF_BLOCK = 0x8769
 FOCAL_LENGTH_35MM = 0xA405
@@ -50,7 +50,7 @@ def read_focal(path: Path) -> FocalGuess:
     Raises CalibrationError for a file without one.
     """
     try:
-        content = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
+        content = read_bytes(path, MAX_BYTES, "an image that is read")
         with Image.open(io.BytesIO(content)) as image:
             found = image.getexif().get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH_35MM)
     except Exception as cause:  # a damaged block fails in any way

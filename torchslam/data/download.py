@@ -25,8 +25,8 @@ from tqdm import tqdm
 
 from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
-from torchslam.utils import bounded_read as regular_file
 from torchslam.utils.console import tqdm_options
+from torchslam.utils.files import check_regular
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
@@ -103,7 +103,7 @@ def unpack(archive: Path, target: Path) -> None:
     """
     staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=UNPACKING, dir=target.parent))
     try:
-        regular_file.check_regular(archive, MAX_BYTES, "an archive that is read")
+        check_regular(archive, MAX_BYTES, "an archive that is read")
         with zipfile.ZipFile(archive) as contents:
             _check_size(archive, contents.infolist(), target)
             for entry in contents.infolist():

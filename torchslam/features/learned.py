@@ -21,7 +21,7 @@ from torchslam.features.contract import only_where
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.types import Features
-from torchslam.utils.bounded_read import check_regular
+from torchslam.utils.files import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0

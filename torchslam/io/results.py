@@ -27,7 +27,7 @@ from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.types import State, StepResult, Trajectory
-from torchslam.utils.bounded_read import JSON_BYTES, parse_json, read_text
+from torchslam.utils.files import JSON_BYTES, parse_json, read_text
 
 TRAJECTORY = "trajectory.txt"
 OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 
 from torchslam.errors import ResultsError
-from torchslam.utils.atomic_write import write_whole
+from torchslam.utils.files import write_whole
 
 Log = Callable[[str, float, int], None]
 """Called with name, value and step, like `SummaryWriter.add_scalar` of TensorBoard."""

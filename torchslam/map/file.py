@@ -21,8 +21,7 @@ from torchslam.geometry import Camera
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema, Table
-from torchslam.utils.atomic_write import write_whole
-from torchslam.utils.bounded_read import check_regular, parse_json
+from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
 TABLES: dict[str, Schema] = {

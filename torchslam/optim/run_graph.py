@@ -28,7 +28,7 @@ from torchslam.optim._core.levenberg_marquardt import Progress
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.pose._refinement import refine_pose
 from torchslam.types import Trajectory
-from torchslam.utils.bounded_read import check_regular
+from torchslam.utils.files import check_regular
 
 _FRAMES_AT_ONCE = 64
 _MAX_BYTES = 1 << 34

@@ -21,7 +21,7 @@ from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.io.export.scene import Scene, scene_of
 from torchslam.refine.pose_refinement import RefinementResult
 from torchslam.types import Trajectory
-from torchslam.utils.bounded_read import JSON_BYTES, parse_json
+from torchslam.utils.files import JSON_BYTES, parse_json
 
 COVARIANCES = "covariances.txt"
 # Keys of a camera in a transforms.json; all of them are replaced.

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.types import FrameFeatures, Matches, MatchPrior
-from torchslam.utils.bounded_read import check_regular
+from torchslam.utils.files import check_regular
 
 MAX_BYTES = 1 << 30  # of a file of weights
 

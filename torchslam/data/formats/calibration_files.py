@@ -16,7 +16,7 @@ from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.formats.text_file import numbered_lines, parse_floats, read_text
 from torchslam.errors import CalibrationError
 from torchslam.geometry.transforms import HALF_PIXEL
-from torchslam.utils.bounded_read import JSON_BYTES, parse_json
+from torchslam.utils.files import JSON_BYTES, parse_json
 
 MAX_BYTES = 1 << 18
 LARGEST = 1e12  # JSON numbers may have any number of digits

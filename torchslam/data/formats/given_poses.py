@@ -20,7 +20,7 @@ from torchslam.data.trajectories import nearest, read_trajectory
 from torchslam.errors import CalibrationError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
-from torchslam.utils import bounded_read as regular_file
+from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
@@ -168,7 +168,7 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
     images = []
     try:
-        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
+        data = read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
         at = 8
         for _ in range(count):
@@ -185,7 +185,7 @@ def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
 def _binary_camera(path: Path) -> Calibration:
     """The single camera of a cameras.bin."""
     try:
-        data = regular_file.read_bytes(path, _MAX_BYTES, "a model that is read")
+        data = read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
@@ -204,7 +204,7 @@ def _binary_camera(path: Path) -> Calibration:
 def _read_transforms(path: Path) -> GivenPoses:
     """Frames as nerfstudio, instant-ngp and the first NeRF write them; a world that was moved stays as it is."""
     try:
-        content: Any = regular_file.parse_json(read_text(path, TrajectoryError, regular_file.JSON_BYTES))
+        content: Any = parse_json(read_text(path, TrajectoryError, JSON_BYTES))
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
         T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64)
     except (ValueError, KeyError, TypeError, RuntimeError, OverflowError) as cause:

@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from torchslam.errors import FrameError
-from torchslam.utils import bounded_read as regular_file
+from torchslam.utils.files import read_bytes
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
@@ -53,7 +53,7 @@ def read_pixels(path: str | Path, where: str) -> np.ndarray:
 
 def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
     try:
-        data = regular_file.read_bytes(path, MAX_BYTES, "an image that is read")
+        data = read_bytes(path, MAX_BYTES, "an image that is read")
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
     if _is_truncated(data):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from torchslam.errors import TorchslamError
-from torchslam.utils import bounded_read as regular_file
+from torchslam.utils import files
 
 MAX_BYTES = 1 << 27
 """Size limit of text files; a million poses are smaller."""
@@ -24,7 +24,7 @@ def read_text(path: str | Path, error: type[TorchslamError], limit: int | None =
     limit: bytes; None: MAX_BYTES
     """
     try:
-        return regular_file.read_text(path, MAX_BYTES if limit is None else limit, "a text that is read")
+        return files.read_text(path, MAX_BYTES if limit is None else limit, "a text that is read")
     except OSError as cause:
         raise error(f"{path}: cannot be read: {cause.strerror}") from cause
     except ValueError as cause:

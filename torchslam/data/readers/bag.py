@@ -24,7 +24,7 @@ from torchslam.data.formats.calibration_files import checked
 from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
-from torchslam.utils.bounded_read import check_regular
+from torchslam.utils.files import check_regular
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -21,7 +21,7 @@ from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, SequenceError
-from torchslam.utils.bounded_read import check_regular
+from torchslam.utils.files import check_regular
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}

@@ -17,7 +17,7 @@ from torchslam.errors import LONGEST, TorchslamError
 from torchslam.features.learned import XFeat
 from torchslam.io.results import read_frames
 from torchslam.map.file import read_atlas
-from torchslam.utils.bounded_read import check_regular, parse_json, read_bytes, read_text
+from torchslam.utils.files import check_regular, parse_json, read_bytes, read_text
 
 READERS: dict[str, Callable[[Path], object]] = {
     "trajectory": read_trajectory,
