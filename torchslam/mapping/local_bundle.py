@@ -21,7 +21,7 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BundleProblem, Marginals, Progress, bundle_adjust
-from torchslam.optim.bundle.local_numpy import adjust_local_bundle
+from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 
@@ -71,10 +71,10 @@ def select_window(
 
     Other keyframes that observe these points are fixed, and so is the first keyframe of the map.
     """
-    covisible = slam_map.covisible(keyframe, settings.local_window - 1)
+    covisible = slam_map.covisible_keyframes(keyframe, settings.local_window - 1)
     free = torch.cat([covisible.new_tensor([keyframe]), covisible])
     free = free[free != 0]
-    shared = slam_map.observers(slam_map.points_seen_by(free))
+    shared = slam_map.count_observed(slam_map.observed_points(free))
     shared[free] = 0
     return build_window(slam_map, free, top_rows(shared, settings.max_fixed_keyframes, least=1), camera)
 
@@ -84,7 +84,7 @@ def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> B
 
     The covariances are those of `bundle_adjust` at the solution, so that they do not change it.
     """
-    T_cw, points_w, _ = adjust_local_bundle(problem, HUBER, iterations, LOCAL_TOLERANCE)
+    T_cw, points_w, _ = bundle_adjust_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
     if not covariances:
         return BundleResult(T_cw, points_w, None)
     solved = replace(problem, T_cw=T_cw, points_w=points_w)
@@ -127,7 +127,7 @@ def build_window(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> 
     """Build the problem of free keyframes (k,), their points and the fixed keyframes; None if nothing is observed."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
-    rows = true_indices(is_among(seen.point_index, slam_map.points_seen_by(free)))
+    rows = true_indices(is_among(seen.point_index, slam_map.observed_points(free)))
     ids = seen.point_index.index_select(0, rows)
     which = ranks_among(ids, distinct(ids))
     seen = select(seen, rows[torch.bincount(which)[which] >= 2])
@@ -176,14 +176,14 @@ def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, came
     if result.marginals is not None:
         slam_map.set_covariances(window.keyframes, window.point_ids, result.marginals)
     remove_outliers(slam_map, window.seen, camera)
-    slam_map.refresh(window.keyframes)
+    slam_map.update_appearance(window.keyframes)
 
 
 def remove_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     """Remove observations that fail the chi-square test, and points that fewer than two keyframes still observe."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
     wrong = ~passes_gate(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
-    slam_map.drop(seen, wrong)
+    slam_map.remove_masked_observations(seen, wrong)
 
 
 def select(seen: Observations, rows: Tensor) -> Observations:

@@ -17,7 +17,7 @@ from torchslam.optim._core import tangent
 from torchslam.optim._core.batching import Tensors, index_tree, where_tree
 from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
-from torchslam.optim._core.linear import DefiniteFactor, factorize
+from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
 from torchslam.optim._core.residuals import Linearization, flat_along
 
 Manifold = Literal["euclidean", "se3", "sim3"]
@@ -285,7 +285,7 @@ class _Problem:
 
     def step(self, model: _Model, damping: Tensor) -> tuple[Tensors, Tensor]:
         diagonal = damping[:, None] * model.hessian.diagonal(dim1=-2, dim2=-1)
-        floor = torch.finfo(damping.dtype).tiny ** 0.5  # what nothing depends on stays where it is
+        floor = diagonal_floor(damping.dtype)  # what nothing depends on stays where it is
         factor = factorize(model.hessian + torch.diag_embed(diagonal + floor), strict=False)
         step = factor.solve(model.gradient[..., None]).squeeze(-1)
         predicted_reduction = 0.5 * (step * model.gradient).sum(-1)

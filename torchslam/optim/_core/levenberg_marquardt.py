@@ -18,10 +18,11 @@ from torch import Tensor
 
 from torchslam.optim._core.batching import concat_tree, index_tree
 
-_INITIAL_DAMPING = 1e-4
-_DAMPING_DOWN, _DAMPING_UP = 0.1, 10.0
+INITIAL_DAMPING = 1e-4
+DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
 _DAMPING_RANGE = (1e-10, 1e8)
-_CURVATURE_BELOW = 1e-2  # predicted relative reduction of the cost below which the kernel's curvature is used
+CURVATURE_BELOW = 1e-2
+"""Predicted relative reduction of the cost below which the kernel's curvature is used."""
 
 Progress = Callable[[int, int], None]
 """Called before each iteration with its number, from 0, and the maximum number of iterations."""
@@ -123,7 +124,7 @@ def minimize_batch(
     vanished = rounding**1.5 * initial_cost
     if isinstance(problem, Rounded):
         vanished = torch.maximum(vanished, problem.rounding())
-    damping = torch.full_like(initial_cost, _INITIAL_DAMPING)
+    damping = torch.full_like(initial_cost, INITIAL_DAMPING)
     steps = torch.zeros_like(active, dtype=torch.int64)
     rows, finished = torch.arange(len(active), device=active.device), []
     for iteration in range(iterations):
@@ -131,12 +132,12 @@ def minimize_batch(
             progress(iteration, iterations)
         estimate, predicted_reduction = problem.step(model, damping)
         relative_reduction = predicted_reduction.detach() / model.cost.detach()
-        trial = problem.evaluate(estimate, relative_reduction < _CURVATURE_BELOW)
+        trial = problem.evaluate(estimate, relative_reduction < CURVATURE_BELOW)
         accept = active & (relative_reduction < torch.inf) & (trial.cost <= slack * model.cost)
         steps = steps.index_add(0, rows, active.long())
         active = active & (relative_reduction > tolerance) & (model.cost.detach() > vanished)
         model = problem.select(accept, trial, model)
-        damping = torch.where(accept, damping * _DAMPING_DOWN, damping * _DAMPING_UP).clamp(*_DAMPING_RANGE)
+        damping = torch.where(accept, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():
             break
         if isinstance(problem, Divisible) and not active.all():

@@ -10,6 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+LOWER_3X3 = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+"""The entries of a symmetric 3x3 block that are stored, in the order of `inverse_root_3x3`."""
+
+
+def diagonal_floor(dtype: torch.dtype) -> float:
+    """What a diagonal entry grows by to stay solvable without observations; its step is then zero."""
+    return torch.finfo(dtype).tiny ** 0.5
+
+
+def smallest_pivot(dtype: torch.dtype) -> float:
+    """The pivot, of a matrix scaled to a unit diagonal, above which it is positive beyond rounding."""
+    return torch.finfo(dtype).eps ** 0.4
+
 
 @dataclass(frozen=True)
 class DefiniteFactor:
@@ -47,8 +60,8 @@ def factorize(matrix: Tensor, strict: bool = True) -> DefiniteFactor:
     factor, info = torch.linalg.cholesky_ex(scaled)
     definite = info == 0
     if strict:
-        smallest = torch.finfo(matrix.dtype).eps ** 0.4
-        definite = definite & (factor.diagonal(dim1=-2, dim2=-1) > smallest).all(-1)
+        pivots = factor.diagonal(dim1=-2, dim2=-1)
+        definite = definite & (pivots > smallest_pivot(matrix.dtype)).all(-1)
     if not definite.all():  # unit matrices instead: what follows stays finite, its gradient included
         unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
         factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], scaled, unit))
@@ -59,7 +72,7 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
     """Lower triangular Q with Q^T Q = block^-1 of many symmetric 3x3 blocks, by a written-out Cholesky factorization.
 
     Args:
-        lower: six tensors or NumPy arrays of one shape, the entries 00, 10, 11, 20, 21 and 22 of the blocks.
+        lower: six tensors or NumPy arrays of one shape, the entries `LOWER_3X3` of the blocks.
         mask: bool of that shape, which blocks to invert.
         smallest: a block counts as definite where the pivots of the block scaled to a unit diagonal exceed this.
 

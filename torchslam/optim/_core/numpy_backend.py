@@ -1,8 +1,8 @@
-"""Least squares by NumPy in double precision, for the two problems that every frame of a run solves.
+"""Least squares by NumPy in double precision, for the two problems that every run solves again and again.
 
-Used by `optim.pose.frame_pose` and `optim.bundle.local_numpy`. With a few hundred values, the overhead of a call
-dominates, and a NumPy call costs about a third of a PyTorch call. There are no gradients: the graph of a finished run
-is solved by `optim.run_graph`, which has them.
+They are the pose of a frame (`optim.pose.frame_pose`) and the local map of a keyframe (`optim.bundle.dense_numpy`).
+With a few hundred values, the overhead of a call dominates, and a NumPy call costs about a third of a PyTorch call.
+There are no gradients: `optim.run_graph`, which solves the graph of a finished run, has them.
 """
 
 from __future__ import annotations
@@ -11,8 +11,17 @@ from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from torchslam.optim._core.levenberg_marquardt import (
+    CURVATURE_BELOW,
+    DAMPING_DOWN,
+    DAMPING_UP,
+    INITIAL_DAMPING,
+)
+from torchslam.optim._core.linear import smallest_pivot
 
 Array = NDArray[Any]
 """A NumPy array, of float64 unless stated otherwise."""
@@ -23,9 +32,6 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-# As in `_core.levenberg_marquardt`.
-_INITIAL_DAMPING, _DAMPING_DOWN, _DAMPING_UP = 1e-4, 0.1, 10.0
-_CURVATURE_BELOW = 1e-2  # predicted relative reduction of the cost below which the kernel's curvature is used
 _COST_SLACK = 1 + 1e-13  # an increase of the cost by rounding does not reject a step
 
 X = TypeVar("X", covariant=True)
@@ -54,22 +60,22 @@ def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tole
         iterations: maximum number of steps.
         tolerance: stop after a step with a predicted reduction of at most this share of the cost.
     """
-    damping, use_curvature = _INITIAL_DAMPING, False
+    damping, use_curvature = INITIAL_DAMPING, False
     for _ in range(iterations):
         proposal = model.step(damping, use_curvature)
         if proposal is None:
-            damping *= _DAMPING_UP
+            damping *= DAMPING_UP
             continue
         state, predicted_reduction = proposal
         trial = evaluate(state)
         converged = not predicted_reduction > tolerance * model.cost
         accepted = trial.cost <= _COST_SLACK * model.cost
         if accepted:
-            use_curvature = predicted_reduction < _CURVATURE_BELOW * model.cost
+            use_curvature = predicted_reduction < CURVATURE_BELOW * model.cost
             model = trial
         if converged:
             break
-        damping *= _DAMPING_DOWN if accepted else _DAMPING_UP
+        damping *= DAMPING_DOWN if accepted else DAMPING_UP
     return model
 
 
@@ -168,7 +174,7 @@ def solve_symmetric(matrix: Array, right: Array) -> Array | None:
 def is_definite(matrix: Array) -> bool:
     """Whether a matrix is clearly positive definite, whatever its units, as in `_core.linear.factorize`."""
     factor = _scaled_cholesky(matrix)
-    return factor is not None and bool(factor[2].diagonal().min() > np.finfo(matrix.dtype).eps ** 0.4)
+    return factor is not None and bool(factor[2].diagonal().min() > smallest_pivot(torch.float64))
 
 
 def _scaled_cholesky(matrix: Array) -> tuple[Array, Array, Array] | None:

@@ -1,1 +1,1 @@
-"""Bundle adjustment of poses, points and cameras: sparse, dense in batches, and the NumPy backend of tracking."""
+"""Bundle adjustment in two formulations: sparse, and dense with a backend in PyTorch and one in NumPy."""

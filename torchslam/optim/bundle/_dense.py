@@ -1,8 +1,8 @@
-"""Many small bundle adjustments at once, every frame of one against every point of it.
+"""The dense formulation of bundle adjustments by PyTorch: batches of small problems, differentiable.
 
-What the sparse equations of `_schur` gather and scatter is dense here, with the points along the last dimension: every
-operation streams through contiguous memory, sums over frames and points are batched matrix products, and the Schur
-complement is one product per problem. For windows of a few frames that see most of the same points.
+Every frame is paired with every point, with the points along the last dimension, so that sums over frames and points
+are batched matrix products and the Schur complement is one product per problem. It suits windows of a few frames that
+see most of the same points; `_sparse` is the formulation for maps, `dense_numpy` the backend for a single problem.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.batching import Tensors, index_tree, where_tree
-from torchslam.optim._core.linear import DefiniteFactor, factorize, inverse_root_3x3
+from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize, inverse_root_3x3
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
@@ -298,7 +298,7 @@ def factorize_dense(
     reduced, frames = equations.reduced, equations.reduced.shape[-1] - num_camera
     if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
         growth = damping[:, None] * reduced.diagonal(dim1=-2, dim2=-1)
-        growth[:, :frames] += torch.finfo(growth.dtype).tiny ** 0.5
+        growth[:, :frames] += diagonal_floor(growth.dtype)
         reduced = reduced + torch.diag_embed(growth)
     reduced = torch.baddbmm(reduced, whitened, whitened.mT, alpha=-1)
     if gauge is not None:

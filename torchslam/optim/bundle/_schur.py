@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchslam.optim._core.linear import DefiniteFactor, factorize
+from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
 
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
@@ -181,9 +181,8 @@ class NormalEquations:
         rows = torch.arange(6 * num_frames, device=reduced.device).view(num_frames, 6)
         frames = _damped(self.frames, damping)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
-            frames = frames + torch.finfo(frames.dtype).tiny ** 0.5 * torch.eye(
-                6, dtype=frames.dtype, device=frames.device
-            )
+            eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
+            frames = frames + diagonal_floor(frames.dtype) * eye
         reduced[rows[:, :, None], rows[:, None, :]] = frames
         if num_camera:
             split = 6 * num_frames

@@ -21,7 +21,7 @@ from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.batching import Tensors
 from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
-from torchslam.optim._core.linear import factorize
+from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim._core.priors import PosePrior, prior_expansion, prior_hessian
 from torchslam.optim._core.residuals import (
     Observations,
@@ -206,7 +206,7 @@ class PoseProblem:
 
     def step(self, model: PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
         # Elements without any weight stay solvable: their step is zero.
-        grow, floor = 1 + damping[:, None, None] * self.eye, torch.finfo(damping.dtype).tiny ** 0.5 * self.eye
+        grow, floor = 1 + damping[:, None, None] * self.eye, diagonal_floor(damping.dtype) * self.eye
         damped = (model.hessian + model.curvature_term) * grow + floor
         factor, failed = torch.linalg.cholesky_ex(damped)
         if failed.any():

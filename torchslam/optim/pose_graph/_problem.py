@@ -26,6 +26,7 @@ from torchslam.geometry.robust import Kernel, Robustified, robustify
 from torchslam.optim._core.batching import Tensors
 from torchslam.optim._core.implicit import Ndims
 from torchslam.optim._core.levenberg_marquardt import minimize_batch
+from torchslam.optim._core.linear import diagonal_floor
 from torchslam.optim._core.tangent import pull_back_sim3, push_sim3, retract_sim3
 from torchslam.optim.pose_graph._sparse_cholesky import (
     BlockStructure,
@@ -231,7 +232,7 @@ class PoseGraphProblem:
         nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
         eye = torch.eye(self.dims, dtype=S_cw.dtype, device=S_cw.device)
         # Where an edge lost all its weight, its nodes stay solvable: their step is zero.
-        floor = torch.where(moving[..., None], torch.finfo(S_cw.dtype).tiny ** 0.5, 1.0) * eye
+        floor = torch.where(moving[..., None], diagonal_floor(S_cw.dtype), 1.0) * eye
 
         linking = layout.linking
         both = (layout.moving[:, layout.i] & layout.moving[:, layout.j])[:, linking, None, None]

@@ -18,6 +18,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchslam.optim._core.linear import smallest_pivot
+
 # Parts this small are dense fronts: less work than the calls for splitting them further.
 _LEAF_NODES = 40
 # A separator leaves at least this share of a part on either side.
@@ -258,7 +260,7 @@ def factorize_sparse(
         factors.append((lower, below))
     if strict:
         pivots = torch.cat([lower.diagonal(dim1=-2, dim2=-1) for lower, _ in factors], dim=-1)
-        definite = definite & (pivots > torch.finfo(d.dtype).eps ** 0.4).all(-1)
+        definite = definite & (pivots > smallest_pivot(d.dtype)).all(-1)
     return SparseFactor(structure, scale.flatten(1), factors, definite)
 
 

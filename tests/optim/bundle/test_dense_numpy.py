@@ -1,4 +1,4 @@
-"""The NumPy local bundle adjustment against `bundle_adjust`."""
+"""The NumPy backend of the dense formulation against `bundle_adjust`: the sparse one, and its PyTorch backend."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from torch import Tensor
 
 from torchslam.geometry import se3_inverse, se3_log
 from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
-from torchslam.optim.bundle.local_numpy import LocalBundleSolution, adjust_local_bundle
+from torchslam.optim.bundle._dense import suits_dense
+from torchslam.optim.bundle._problem import sanitized, select_moving
+from torchslam.optim.bundle.dense_numpy import NumpyBundleSolution, bundle_adjust_numpy
 
 SCALE = 2.0  # of the kernel
 
 
 def both(
     problem: BundleProblem, iterations: int = 30, tolerance: float = 1e-10
-) -> tuple[LocalBundleSolution, BundleSolution]:
+) -> tuple[NumpyBundleSolution, BundleSolution]:
     wanted = bundle_adjust(
         problem, "huber", SCALE, backward="detached", iterations=iterations, tolerance=tolerance, check=False
     )
-    return adjust_local_bundle(problem, SCALE, iterations, tolerance), wanted
+    return bundle_adjust_numpy(problem, SCALE, iterations, tolerance), wanted
 
 
 def astray(problem: BundleProblem, every: int = 9) -> BundleProblem:
@@ -42,10 +44,33 @@ def weights_of(problem: BundleProblem, kind: str) -> Tensor | None:
     return root.mT @ root
 
 
-def assert_same(found: LocalBundleSolution, wanted: BundleSolution, atol: float = 1e-8) -> None:
+def assert_same(found: NumpyBundleSolution, wanted: BundleSolution, atol: float = 1e-8) -> None:
     torch.testing.assert_close(found.T_cw, wanted.T_cw, rtol=0, atol=atol)
     torch.testing.assert_close(found.points_w, wanted.points_w, rtol=0, atol=10 * atol)
     assert found.cost == pytest.approx(float(wanted.cost), rel=1e-6)
+
+
+@pytest.mark.parametrize("fixed", [(0, 1), (2, 0), (0,), ()])
+@pytest.mark.parametrize(("frames", "points"), [(3, 12), (6, 60), (12, 150)])
+@pytest.mark.parametrize("iterations", [2, 30])
+def test_both_backends_of_the_dense_formulation_agree(
+    bundle_scene, frames, points, fixed, iterations
+) -> None:
+    """A batch of two for PyTorch, one after the other for NumPy: after two steps, and at the minimum."""
+    first = astray(bundle_scene(frames, points, fixed_frames=fixed).problem)
+    first = replace(first, weights=weights_of(first, "numbers"))
+    noise = torch.randn(first.pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    problems = [first, replace(first, pixels=first.pixels + 0.3 * noise)]
+    names = ("T_cw", "points_w", "pixels")
+    batch = replace(first, **{name: torch.stack([getattr(p, name) for p in problems]) for name in names})
+    given = sanitized(batch, SCALE)
+    assert suits_dense(given, select_moving(given))
+    together = bundle_adjust(
+        batch, "huber", SCALE, backward="detached", iterations=iterations, tolerance=1e-12, check=False
+    )
+    for row, problem in enumerate(problems):
+        found = bundle_adjust_numpy(problem, SCALE, iterations, 1e-12)
+        assert_same(found, together.element(row, frames, points), atol=1e-9)
 
 
 @pytest.mark.parametrize("weights", ["none", "numbers", "matrices"])
@@ -138,14 +163,14 @@ def test_the_order_of_what_is_given_does_not_matter(bundle_scene) -> None:
         point_index=problem.point_index[order],
         pixels=problem.pixels[order],
     )
-    one, other = (adjust_local_bundle(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
+    one, other = (bundle_adjust_numpy(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
     torch.testing.assert_close(one.T_cw, other.T_cw, rtol=0, atol=1e-10)
     torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
 
 
 def test_exact_observations_leave_nothing(bundle_scene) -> None:
     scene = bundle_scene(noise=0.0)
-    found = adjust_local_bundle(scene.problem, SCALE, 20, 1e-8)
+    found = bundle_adjust_numpy(scene.problem, SCALE, 20, 1e-8)
     assert found.cost < 1e-12
     torch.testing.assert_close(found.T_cw, scene.T_cw, rtol=0, atol=1e-7)
 
@@ -157,7 +182,7 @@ def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong)
     index = getattr(problem, name).clone()
     index[3] = wrong
     with pytest.raises(ValueError, match=rf"{name} must lie in 0 \.\.\. {size - 1}"):
-        adjust_local_bundle(replace(problem, **{name: index}), SCALE, 1, 1e-6)
+        bundle_adjust_numpy(replace(problem, **{name: index}), SCALE, 1, 1e-6)
 
 
 @pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
@@ -170,9 +195,9 @@ def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
     else:
         problem = replace(problem, **{name: given[name]})
     with pytest.raises(
-        ValueError, match=r"a local bundle adjustment takes one problem without .*: use bundle_adjust"
+        ValueError, match=r"the NumPy backend takes one problem without .*: use bundle_adjust"
     ):
-        adjust_local_bundle(problem, SCALE, 1, 1e-6)
+        bundle_adjust_numpy(problem, SCALE, 1, 1e-6)
 
 
 def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
@@ -185,7 +210,7 @@ def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
         problem.camera.to(torch.float32).to(device),
         fixed_frames=torch.tensor([0, 1], device=device),
     )
-    found, exact = adjust_local_bundle(single, SCALE, 10, 1e-6), adjust_local_bundle(problem, SCALE, 10, 1e-6)
+    found, exact = bundle_adjust_numpy(single, SCALE, 10, 1e-6), bundle_adjust_numpy(problem, SCALE, 10, 1e-6)
     assert found.T_cw.dtype == found.points_w.dtype == torch.float32
     assert found.T_cw.device.type == device.type
     torch.testing.assert_close(found.T_cw.cpu().double(), exact.T_cw, rtol=0, atol=1e-4)

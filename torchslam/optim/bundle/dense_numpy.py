@@ -1,9 +1,14 @@
-"""Bundle adjustment of a few frames and their points by NumPy, for every keyframe of a run.
+"""The dense formulation of a bundle adjustment by NumPy: one problem, such as the local map of every keyframe.
 
-The NumPy backend of `bundle_adjust`, in half of its time: the same cost, kernel and steps, with the Schur complement on
-the points, but one dense matrix for the coupling of all frames with all points, since most of a local window of a dozen
-frames is filled. As in `pose.frame_pose`, errors are taken in undistorted coordinates and multiplied with the slope of
-the distortion at the keypoint. There are no gradients and no covariances.
+`_dense` is the same formulation by PyTorch, for batches and with gradients: frames move along the axes of the world,
+the free ones come first, and the Schur complement on the points is one dense matrix, since most of a local window of a
+dozen frames is filled. The backends share the constants of Levenberg-Marquardt, the floor of the damped diagonal and
+the inverse roots of the points' blocks; `tests/optim/bundle/test_dense_numpy.py` holds them to the same minima and the
+same steps to rounding. NumPy takes half of the time for one problem, and has neither gradients nor covariances.
+
+They differ in the residual of a distorted camera: as in `pose.frame_pose`, errors here are taken in undistorted
+coordinates and multiplied with the slope of the distortion at the keypoint, which is exact for pinhole cameras and to
+first order for others.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
 from torchslam.geometry.gating import whitening
-from torchslam.optim._core.linear import inverse_root_3x3
+from torchslam.optim._core.linear import LOWER_3X3, diagonal_floor, inverse_root_3x3
 from torchslam.optim._core.numpy_backend import (
     MIN_DEPTH,
     Array,
@@ -31,13 +36,8 @@ from torchslam.optim._core.numpy_backend import (
 )
 from torchslam.optim.bundle._problem import BundleProblem, as_mask, checked_rows
 
-# Keeps a frame solvable that lost all its observations: its step is zero.
-_TINY = float(np.finfo(np.float64).tiny) ** 0.5
-# The entries of a symmetric 3x3 matrix that are stored, in the order of `inverse_root_3x3`.
-_LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 
-
-class LocalBundleSolution(NamedTuple):
+class NumpyBundleSolution(NamedTuple):
     """Poses (F, 4, 4) and points (P, 3) of minimal robust cost, and that cost."""
 
     T_cw: Tensor
@@ -45,9 +45,9 @@ class LocalBundleSolution(NamedTuple):
     cost: float
 
 
-def adjust_local_bundle(
+def bundle_adjust_numpy(
     problem: BundleProblem, scale: float, iterations: int, tolerance: float
-) -> LocalBundleSolution:
+) -> NumpyBundleSolution:
     """Minimize Huber costs of reprojection errors over all points and the poses that are not fixed.
 
     Args:
@@ -59,19 +59,19 @@ def adjust_local_bundle(
     Raises:
         ValueError: an index is out of range, or the problem has a part that is not supported.
     """
-    window = _Window(problem, scale)
-    model = minimize_model(window.evaluate(window.start), window.evaluate, iterations, tolerance)
-    return window.solution(model)
+    bundle = _Bundle(problem, scale)
+    model = minimize_model(bundle.evaluate(bundle.start), bundle.evaluate, iterations, tolerance)
+    return bundle.solution(model)
 
 
-class _State(NamedTuple):
+class _Estimate(NamedTuple):
     """poses: (F, 3, 4) in order of slots; points: (3, P)"""
 
     poses: Array
     points: Array
 
 
-class _Window:
+class _Bundle:
     """A problem as arrays: frames in slots, the free ones first, and observations ordered by the slot of their frame.
 
     slot, point: (O,) frame slot and point of each observation
@@ -93,7 +93,7 @@ class _Window:
         self.anchors = np.flatnonzero(counts[self.num_free :] > 0) + self.num_free
         self.first = (np.cumsum(counts) - counts)[: self.num_free]  # observation of each free frame
         self.linked = int(counts[: self.num_free].sum())  # observations by free frames, which come first
-        self.start = _State(
+        self.start = _Estimate(
             to_numpy(problem.T_cw)[self.order, :3], np.ascontiguousarray(to_numpy(problem.points_w).T)
         )
         rows = torch.from_numpy(by_frame).to(problem.frame_index.device)
@@ -108,14 +108,14 @@ class _Window:
         cells: Array = (row[:, None] * (3 * size) + column[None]).reshape(-1)
         return cells
 
-    def evaluate(self, state: _State) -> _Model:
-        """The errors at a state."""
-        R_cw, t = state.poses[:, :, :3], state.poses[:, :, 3:]
+    def evaluate(self, estimate: _Estimate) -> _Model:
+        """The errors at an estimate."""
+        R_cw, t = estimate.poses[:, :, :3], estimate.poses[:, :, 3:]
         centers_w = -(R_cw.transpose(0, 2, 1) @ t)
         frames = np.concatenate((R_cw.reshape(-1, 9), centers_w[..., 0]), axis=1).T
         rows = np.ascontiguousarray(frames).take(self.slot, axis=1)
         R_cw = rows[:9].reshape(3, 3, -1)
-        rays_w = state.points.take(self.point, axis=1)
+        rays_w = estimate.points.take(self.point, axis=1)
         rays_w -= rows[9:]
         x, y, z = (R_cw * rays_w).sum(1)
         in_front = z > MIN_DEPTH
@@ -126,14 +126,14 @@ class _Window:
         squared = np.where(in_front, np.square(errors).sum(0), self.behind)
         rho, influence = huber(squared, self.scale)
         lin = _Linearization(R_cw, rays_w, image, inverse, errors, squared, in_front * influence)
-        return _Model(self, state, 0.5 * float(rho.sum()), lin)
+        return _Model(self, estimate, 0.5 * float(rho.sum()), lin)
 
-    def retract(self, state: _State, step: _Step) -> _State:
-        """The state after subtracting a step."""
-        poses = state.poses.copy()
+    def retract(self, estimate: _Estimate, step: _Step) -> _Estimate:
+        """The estimate after subtracting a step."""
+        poses = estimate.poses.copy()
         for slot, along_world in enumerate(step.frames.reshape(-1, 2, 3)):
             poses[slot] = retract_pose(poses[slot], -(along_world @ poses[slot, :, :3].T).reshape(6))
-        return _State(poses, state.points - step.points)
+        return _Estimate(poses, estimate.points - step.points)
 
     def gauge(self, poses: Array) -> Array | None:
         """(6 F', 1 or 7) gauge directions of the free frames, along the axes of the world: the scale where one frame is
@@ -153,21 +153,21 @@ class _Window:
         directions: Array = np.linalg.qr(motions.reshape(6 * self.num_free, -1))[0]
         return directions
 
-    def solution(self, model: _Model) -> LocalBundleSolution:
-        """The state of a model in the order and the dtype of the problem."""
+    def solution(self, model: _Model) -> NumpyBundleSolution:
+        """The estimate of a model in the order and the dtype of the problem."""
         T_cw = self.problem.T_cw.detach().clone()
-        T_cw[self.order[: self.num_free], :3] = torch.from_numpy(model.state.poses[: self.num_free]).to(T_cw)
-        points_w = torch.from_numpy(np.ascontiguousarray(model.state.points.T)).to(self.problem.points_w)
-        return LocalBundleSolution(T_cw, points_w, model.cost)
+        T_cw[self.order[: self.num_free], :3] = torch.from_numpy(model.estimate.poses[: self.num_free]).to(
+            T_cw
+        )
+        points_w = torch.from_numpy(np.ascontiguousarray(model.estimate.points.T)).to(self.problem.points_w)
+        return NumpyBundleSolution(T_cw, points_w, model.cost)
 
 
 def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
     """Frame and point of each observation, (O,) twice, and the mask (F,) of the fixed frames."""
     names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior")
     if problem.is_batch or any(getattr(problem, name) is not None for name in names):
-        raise ValueError(
-            f"a local bundle adjustment takes one problem without {', '.join(names)}: use bundle_adjust"
-        )
+        raise ValueError(f"the NumPy backend takes one problem without {', '.join(names)}: use bundle_adjust")
     shape = (1, len(problem.pixels))
     frame = checked_rows("frame_index", problem.frame_index, shape, len(problem.T_cw))
     point = checked_rows("point_index", problem.point_index, shape, len(problem.points_w))
@@ -176,7 +176,7 @@ def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
 
 
 def _observed(problem: BundleProblem, rows: Tensor) -> tuple[Array, Array, Array]:
-    """`xy`, `along` and `behind` of `_Window`, for observations in the order of rows (O,)."""
+    """`xy`, `along` and `behind` of `_Bundle`, for observations in the order of rows (O,)."""
     camera, pixels = problem.camera, problem.pixels[rows]
     undistorted = UndistortedKeypoints.of(pixels, camera)
     weights = torch.ones_like(pixels[:, 0]) if problem.weights is None else problem.weights[rows]
@@ -207,44 +207,44 @@ class _Linearization(NamedTuple):
 
 @dataclass(frozen=True)
 class _Model:
-    """The cost at a state; its equations are assembled for a step only."""
+    """The cost at an estimate; its equations are assembled for a step only."""
 
-    window: _Window
-    state: _State
+    bundle: _Bundle
+    estimate: _Estimate
     cost: float
     linearization: _Linearization
 
-    def step(self, damping: float, use_curvature: bool) -> tuple[_State, float] | None:
+    def step(self, damping: float, use_curvature: bool) -> tuple[_Estimate, float] | None:
         """As `LocalModel.step`."""
-        window = self.window
-        step = self._equations(use_curvature).step(damping, window.gauge(self.state.poses))
-        return None if step is None else (window.retract(self.state, step), step.predicted_reduction)
+        bundle = self.bundle
+        step = self._equations(use_curvature).step(damping, bundle.gauge(self.estimate.poses))
+        return None if step is None else (bundle.retract(self.estimate, step), step.predicted_reduction)
 
     def _equations(self, use_curvature: bool) -> _Equations:
         """Gauss-Newton normal equations, optionally with the kernel's curvature, as in
         `residuals.gauss_newton_expansion` and `bundle._sparse.assemble_sparse`."""
-        window, (R_cw, rays_w, image, inverse, errors, squared, weight) = self.window, self.linearization
+        bundle, (R_cw, rays_w, image, inverse, errors, squared, weight) = self.bundle, self.linearization
         in_image = (R_cw[:2] - image[:, None] * R_cw[2]) * inverse  # (2, 3, O)
-        J = window.along[0][:, None] * in_image[0] + window.along[1][:, None] * in_image[1]
+        J = bundle.along[0][:, None] * in_image[0] + bundle.along[1][:, None] * in_image[1]
         residual_gradient = J[0] * errors[0] + J[1] * errors[1]
         weighted = weight * J
-        hessian = [weighted[0, i] * J[0, j] + weighted[1, i] * J[1, j] for i, j in _LOWER]
+        hessian = [weighted[0, i] * J[0, j] + weighted[1, i] * J[1, j] for i, j in LOWER_3X3]
         if use_curvature:  # beyond the kernel's scale the cost is flat along the error
-            curvature = np.where(squared > window.scale**2, -weight / squared, 0.0) * residual_gradient
-            for entry, (i, j) in zip(hessian, _LOWER, strict=True):
+            curvature = np.where(squared > bundle.scale**2, -weight / squared, 0.0) * residual_gradient
+            for entry, (i, j) in zip(hessian, LOWER_3X3, strict=True):
                 entry += curvature[i] * residual_gradient[j]
-        slope, size = weight * residual_gradient, self.state.points.shape[1]
-        points = np.stack([np.bincount(window.point, row, size) for row in (*slope, *hessian)])
+        slope, size = weight * residual_gradient, self.estimate.points.shape[1]
+        points = np.stack([np.bincount(bundle.point, row, size) for row in (*slope, *hessian)])
 
-        linked = window.linked
+        linked = bundle.linked
         blocks, twice = np.empty((6, 4, linked)), np.empty((3, 3, linked))
-        for entry, (i, j) in zip(hessian, _LOWER, strict=True):
+        for entry, (i, j) in zip(hessian, LOWER_3X3, strict=True):
             blocks[i, j] = blocks[j, i] = entry[:linked]
         blocks[:3, 3] = slope[:, :linked]
         cross_columns(rays_w[:, :linked], blocks[:3], blocks[3:])
         cross_columns(rays_w[:, :linked], blocks[3:, :3].transpose(1, 0, 2), twice)
-        frames = np.empty((window.num_free, 6, 6))
-        sums, lower = (np.add.reduceat(x, window.first, axis=2) if linked else x for x in (blocks, twice))
+        frames = np.empty((bundle.num_free, 6, 6))
+        sums, lower = (np.add.reduceat(x, bundle.first, axis=2) if linked else x for x in (blocks, twice))
         frames[:, :, :3], frames[:, :3, 3:] = sums[:, :3].transpose(2, 0, 1), sums[3:, :3].transpose(2, 1, 0)
         frames[:, 3:, 3:] = lower.transpose(2, 0, 1)
         return _Equations(
@@ -253,8 +253,8 @@ class _Model:
             points[3:],
             points[:3],
             blocks[:, :3],
-            window.point[:linked],
-            window.cells,
+            bundle.point[:linked],
+            bundle.cells,
         )
 
 
@@ -270,9 +270,9 @@ class _Step(NamedTuple):
 class _Equations:
     """Normal equations of frames that move along the axes of the world, as in `bundle._sparse`, and of points.
 
-    frames: (F', 6, 6), frames_gradient: (F', 6); points: (6, P) as `_LOWER`, points_gradient: (3, P)
+    frames: (F', 6, 6), frames_gradient: (F', 6); points: (6, P) as `LOWER_3X3`, points_gradient: (3, P)
     blocks: (6, 3, O') of observations by free frames, frame against point; point: (O',) of each
-    cells:  (18 O',) as `_Window.cells`
+    cells:  (18 O',) as `_Bundle.cells`
     """
 
     frames: Array
@@ -298,7 +298,7 @@ class _Equations:
         reduced = -(coupling @ coupling.T)
         damped = self.frames.copy()
         damped.reshape(-1, 36)[:, ::7] *= 1 + damping
-        damped.reshape(-1, 36)[:, ::7] += _TINY
+        damped.reshape(-1, 36)[:, ::7] += diagonal_floor(torch.float64)
         slots = np.arange(num_free)
         reduced.reshape(-1, 6, num_free, 6)[slots, :, slots] += damped
         if gauge is not None:
