@@ -405,6 +405,7 @@ def test_points_behind_a_camera_do_not_count() -> None:
     assert float(best_in_front(level, *sideways)[2]) == pytest.approx(100, abs=1e-6)
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_options_are_named() -> None:
     scene = two_views(0)
     with pytest.raises(ValueError, match="unknown model 'plane'; known are auto, essential"):

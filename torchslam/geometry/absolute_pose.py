@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -49,25 +50,25 @@ class AbsolutePose:
     """Absolute poses of B cameras.
 
     Attributes:
-        T_cw: (B, 4, 4) world to camera; the identity where no pose was found.
-        inliers: (B, N) points within the threshold of their pixel, in front of the camera.
-        success: (B,) whether the inliers are significant and not all on one line.
-        score: (B,) sum over the points of 1 - min((error / threshold)^2, 1).
+        T_cw: world to camera; the identity where no pose was found.
+        inliers: points within the threshold of their pixel, in front of the camera.
+        success: whether the inliers are significant and not all on one line.
+        score: sum over the points of 1 - min((error / threshold)^2, 1).
     """
 
-    T_cw: Tensor
-    inliers: Tensor
-    success: Tensor
-    score: Tensor
+    T_cw: Float[Tensor, "B 4 4"]
+    inliers: Bool[Tensor, "B N"]
+    success: Bool[Tensor, " B"]
+    score: Float[Tensor, " B"]
 
 
 @full_precision
 def estimate_absolute_pose(
-    points_w: Tensor,
-    pixels: Tensor,
+    points_w: Float[Tensor, "B N 3"],
+    pixels: Float[Tensor, "B N 2"],
     camera: Camera,
     threshold: float = 2.0,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     confidence: float = 0.9999,
     max_samples: int = 3000,
@@ -80,11 +81,11 @@ def estimate_absolute_pose(
     for P3P see `p3p`.
 
     Args:
-        points_w: (B, N, 3) points.
-        pixels: (B, N, 2) where they are seen.
+        points_w: points.
+        pixels: where they are seen.
         camera: one for all, or a batch of B.
         threshold: reprojection error of an inlier, pixels.
-        mask: (B, N) rows in use; rows with NaN are never used.
+        mask: rows in use; rows with NaN are never used.
         seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per camera.
@@ -125,21 +126,21 @@ def estimate_absolute_pose(
 @full_precision
 @torch.no_grad()
 def start_pose(
-    points_w: Tensor,
+    points_w: Float[Tensor, "N 3"],
     undistorted: UndistortedKeypoints,
     size: tuple[int, int],
     threshold: float,
     seed: int = 0,
     confidence: float = 0.9999,
     max_samples: int = 3000,
-) -> Tensor | None:
+) -> Float[Tensor, "4 4"] | None:
     """Estimate the pose of one camera by RANSAC over P3P, as a start for a refinement.
 
     The same search as `estimate_absolute_pose`, in fewer calls for a single problem without a mask. Errors are those of
     undistorted coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
 
     Args:
-        points_w: (N, 3) finite points.
+        points_w: finite points.
         undistorted: of the N keypoints that see them.
         size: (width, height) of the image.
         threshold: reprojection error of an inlier, pixels.
@@ -148,8 +149,8 @@ def start_pose(
         max_samples: largest number of samples.
 
     Returns:
-        T_cw (4, 4), locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are
-        on a line.
+        T_cw, locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are on a
+        line.
     """
     if len(points_w) < 4:
         return None
@@ -176,17 +177,16 @@ class _Search:
 
     Points are relative to their mean, so that float32 is enough for scores.
 
-    points, rays: (B, N, 3); homogeneous: (B, 4, N); xy: (B, N, 2); scale: (B, N, 1 or 2) thresholds per unit of xy
-    mask:      (B, N)
+    scale:     thresholds per unit of xy, of one direction or of both
     is_single: one problem in which all rows count: samples and scores take fewer calls
     """
 
-    points: Tensor
-    rays: Tensor
-    homogeneous: Tensor
-    xy: Tensor
-    scale: Tensor
-    mask: Tensor
+    points: Float[Tensor, "B N 3"]
+    rays: Float[Tensor, "B N 3"]
+    homogeneous: Float[Tensor, "B 4 N"]
+    xy: Float[Tensor, "B N 2"]
+    scale: Float[Tensor, "B N _"]
+    mask: Bool[Tensor, "B N"]
     is_single: bool
 
     @classmethod
@@ -202,8 +202,8 @@ class _Search:
         chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
         return replace(self, **chosen)
 
-    def best_pose(self, seed: int, confidence: float, max_samples: int) -> Tensor:
-        """(B, 3, 4) the pose of each problem with most support."""
+    def best_pose(self, seed: int, confidence: float, max_samples: int) -> Float[Tensor, "B 3 4"]:
+        """The pose of each problem with most support."""
         generator = torch.Generator().manual_seed(seed)
         (P,) = search(
             lambda rows, count: self.select(rows).propose(count, generator),
@@ -230,8 +230,8 @@ class _Search:
         near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
-    def _candidates(self, count: int, generator: torch.Generator) -> Tensor:
-        """(B, K, 3, 4) the poses of best score from `count` minimal samples."""
+    def _candidates(self, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 4"]:
+        """The poses of best score from `count` minimal samples."""
         sample = sample_minimal(self.mask, 3, count, generator)
         R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
@@ -241,8 +241,8 @@ class _Search:
         best = best_models(self.score, P, valid.gather(1, first), self.mask, count, generator)
         return gather_rows(P, best).unflatten(-1, (3, 4))
 
-    def _candidates_of_one(self, count: int, generator: torch.Generator) -> Tensor:
-        """`_candidates` of one problem in which all rows count, scored on all of them: (1, K, 3, 4)."""
+    def _candidates_of_one(self, count: int, generator: torch.Generator) -> Float[Tensor, "1 K 3 4"]:
+        """`_candidates` of one problem in which all rows count, scored on all of them."""
         rows = sample_minimal_of_all(self.points.shape[1], 3, count, generator).to(self.points.device)
         R, t, valid = p3p(self.rays[0][rows], self.points[0][rows])
         P = torch.cat((R, t[..., None]), dim=-1)[valid]
@@ -252,8 +252,8 @@ class _Search:
         costs = squared[0].clamp_max_(1.0).nan_to_num_(1.0).sum(1)
         return P[costs.topk(min(CANDIDATES, len(P)), largest=False).indices][None]
 
-    def score(self, P: Tensor, rows: Tensor | None) -> Tensor:
-        """Truncated scores of many poses on some of the points, or all, in float32. (B, M, 12) -> (B, M)."""
+    def score(self, P: Float[Tensor, "B K 12"], rows: Int[Tensor, "B n"] | None) -> Float[Tensor, "B K"]:
+        """Truncated scores of many poses on some of the points, or all, in float32."""
         homogeneous, xy, scale, mask = self.homogeneous.mT, self.xy, self.scale, self.mask
         if rows is not None:
             homogeneous, xy, scale = (gather_rows(values, rows) for values in (homogeneous, xy, scale))
@@ -261,15 +261,17 @@ class _Search:
         P = P.float().unflatten(-1, (3, 4))
         return score_projections(P, homogeneous.mT.float(), xy.float(), scale, mask)
 
-    def fit(self, P: Tensor, iterations: int, width: float = 1.0) -> tuple[Tensor, Tensor]:
-        """Poses (B, K, 3, 4) of least truncated error, and their costs (B, K); width: of the kernel, in thresholds."""
+    def fit(
+        self, P: Float[Tensor, "B K 3 4"], iterations: int, width: float = 1.0
+    ) -> tuple[Float[Tensor, "B K 3 4"], Float[Tensor, "B K"]]:
+        """Poses of least truncated error, and their costs; width: of the kernel, in thresholds."""
         tangent = pose_tangent(P.dtype, P.device)
         return fit_projections(
             P, tangent, self.homogeneous, self.xy, self.scale, self.mask, iterations, width
         )
 
-    def squared_errors(self, P: Tensor) -> Tensor:
-        """(B, N) squared errors in thresholds of one pose per problem; infinite behind the camera."""
+    def squared_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
+        """Squared errors in thresholds of one pose per problem; infinite behind the camera."""
         squared = squared_projections(P[:, None], self.homogeneous, self.xy, self.scale)
         return squared[:, 0].nan_to_num(torch.inf)
 
@@ -278,14 +280,14 @@ class _Search:
 class _Problem:
     """Poses of B cameras, whose distortion counts.
 
-    data: the search in undistorted coordinates; pixels: (B, N, 2); center: (B, 3) mean of the points
+    data: the search in undistorted coordinates; center: mean of the points
     """
 
     data: _Search
-    pixels: Tensor
+    pixels: Float[Tensor, "B N 2"]
     camera: Camera
     threshold: float
-    center: Tensor
+    center: Float[Tensor, "B 3"]
 
     @staticmethod
     def of(points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor) -> _Problem:
@@ -297,8 +299,10 @@ class _Problem:
         data = _Search.of(points, xy, camera.pixel_scale(xy) / threshold, mask)
         return _Problem(data, pixels, camera, threshold, center)
 
-    def solve(self, seed: int, confidence: float, max_samples: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+    def solve(
+        self, seed: int, confidence: float, max_samples: int
+    ) -> tuple[Float[Tensor, "B 4 4"], Bool[Tensor, " B"], Float[Tensor, "B N"], Float[Tensor, " B"]]:
+        """T_cw, success, squared errors in thresholds and score."""
         mask = self.data.mask
         P = self.refine(self.data.best_pose(seed, confidence, max_samples))
         squared = self.squared_errors(P)
@@ -309,7 +313,7 @@ class _Problem:
         eye = torch.eye(4, dtype=P.dtype, device=P.device)
         return torch.where(success[:, None, None], T_cw, eye), success, squared, score
 
-    def squared_errors(self, P: Tensor) -> Tensor:
+    def squared_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
         """Those of `_Search` through the distortion, and infinite also beyond its monotone part."""
         if self.camera.model == "pinhole":
             return self.data.squared_errors(P)
@@ -317,8 +321,8 @@ class _Problem:
         squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
         return squared.masked_fill(~valid, torch.inf)
 
-    def refine(self, P: Tensor) -> Tensor:
-        """The poses (B, 3, 4) of least truncated squared reprojection error."""
+    def refine(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B 3 4"]:
+        """The poses of least truncated squared reprojection error."""
         P = self.data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
         if self.camera.model == "pinhole":
             return P  # whose undistorted coordinates are pixels up to their scale
@@ -338,18 +342,22 @@ class _Problem:
         return P
 
 
-def unit_rays(normalized: Tensor) -> Tensor:
-    """Directions (..., N, 3) of unit length of undistorted coordinates (..., N, 2)."""
+def unit_rays(normalized: Float[Tensor, "*batch N 2"]) -> Float[Tensor, "*batch N 3"]:
+    """Directions of unit length of undistorted coordinates."""
     rays = torch.nn.functional.pad(normalized, (0, 1), value=1.0)
     return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
 
 
 def is_success(
-    inliers: Tensor, mask: Tensor, points: Tensor, size: tuple[int, int], threshold: float
-) -> Tensor:
-    """Test whether inliers (B, N) of rows (B, N) are significant and fix the pose: four or more, not on one line. (B,).
+    inliers: Bool[Tensor, "B N"],
+    mask: Bool[Tensor, "B N"],
+    points: Float[Tensor, "B N 3"],
+    size: tuple[int, int],
+    threshold: float,
+) -> Bool[Tensor, " B"]:
+    """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on one line.
 
-    points: (B, N, 3) about their mean; size: of the image; threshold: of an inlier, pixels
+    points: about their mean; size: of the image; threshold: of an inlier, pixels
     """
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
@@ -361,7 +369,12 @@ def is_success(
 
 
 def find_absolute_pose(
-    points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor, *effort: Any
+    points_w: Float[Tensor, "B N 3"],
+    pixels: Float[Tensor, "B N 2"],
+    camera: Camera,
+    threshold: float,
+    mask: Bool[Tensor, "B N"],
+    *effort: Any,
 ) -> tuple[Tensor, ...]:
     """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
 
@@ -373,9 +386,13 @@ def find_absolute_pose(
 
 
 def attach_absolute_pose(
-    T_cw: Tensor, points_w: Tensor, pixels: Tensor, camera: Camera, used: Tensor
-) -> Tensor:
-    """Attach to the poses the gradient of the minimizer of the squared error over the rows (B, N) in use."""
+    T_cw: Float[Tensor, "B 4 4"],
+    points_w: Float[Tensor, "B N 3"],
+    pixels: Float[Tensor, "B N 2"],
+    camera: Camera,
+    used: Bool[Tensor, "B N"],
+) -> Float[Tensor, "B 4 4"]:
+    """Attach to the poses the gradient of the minimizer of the squared error over the rows in use."""
 
     def objective(xi: Tensor) -> Tensor:
         projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))

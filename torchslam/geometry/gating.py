@@ -11,37 +11,38 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 
 
-def triangle(A: Tensor) -> Tensor:
-    """(..., 3) xx, xy, yy of matrices (..., 2, 2), of which the symmetric part counts."""
+def triangle(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 3"]:
+    """The entries xx, xy, yy of the symmetric part of matrices."""
     return torch.stack((A[..., 0, 0], 0.5 * (A[..., 0, 1] + A[..., 1, 0]), A[..., 1, 1]), dim=-1)
 
 
-def from_triangle(values: Tensor) -> Tensor:
-    """(..., 2, 2) symmetric matrices of xx, xy, yy (..., 3)."""
+def from_triangle(values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 2"]:
+    """Symmetric matrices from their entries xx, xy, yy."""
     xx, xy, yy = values.unbind(-1)
     return torch.stack((xx, xy, xy, yy), dim=-1).unflatten(-1, (2, 2))
 
 
-def is_definite(A: Tensor) -> Tensor:
-    """(...) whether matrices (..., 2, 2) are positive definite; false for what is not finite."""
+def is_definite(A: Float[Tensor, "*batch 2 2"]) -> Bool[Tensor, "*batch"]:
+    """Test whether matrices are positive definite; False where they are not finite."""
     xx, xy, yy = triangle(A).unbind(-1)
     return (xx > 0) & (xx * yy - xy * xy > 0)
 
 
-def inverse_2x2(A: Tensor) -> Tensor:
-    """(..., 2, 2) inverses of definite matrices."""
+def inverse_2x2(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """Inverses of definite matrices."""
     xx, xy, yy = triangle(A).unbind(-1)
     return from_triangle(torch.stack((yy, -xy, xx), dim=-1)) / (xx * yy - xy * xy)[..., None, None]
 
 
-def whitening(A: Tensor) -> Tensor:
-    """W (..., 2, 2), upper triangular, with W^T W = A; zero, with gradient zero, where A is not positive definite."""
+def whitening(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """W, upper triangular, with W^T W = A; zero, with gradient zero, where A is not positive definite."""
     xx, xy, yy = torch.where(is_definite(A)[..., None], triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
     p = xx.sqrt()
     q = xy / p
@@ -49,7 +50,9 @@ def whitening(A: Tensor) -> Tensor:
     return torch.where(is_definite(A)[..., None, None], W, 0.0)
 
 
-def times(weights: Tensor, factors: Tensor) -> Tensor:
+def times(
+    weights: Float[Tensor, "*batch N *matrix"], factors: Float[Tensor, "*batch N"]
+) -> Float[Tensor, "*batch N *matrix"]:
     """Weights (..., N) or (..., N, 2, 2) times factors (..., N)."""
     return weights * factors.view(*factors.shape, *(1,) * (weights.ndim - factors.ndim))
 
@@ -65,24 +68,24 @@ errors of its own. Scales, where no information is provided, include that factor
 
 @dataclass(frozen=True)
 class KeypointNoise:
-    """The errors of keypoints (...).
+    """The errors of keypoints.
 
     Attributes:
-        scales: (...) pixels, the sizes of their pyramid levels.
-        information: (..., I) px^-2, as a front end provides it. I = 0: none, the standard deviation in each direction
-            is the scale; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse covariance.
+        scales: pixels, the sizes of their pyramid levels.
+        information: px^-2, as a front end provides it. I = 0: none, the standard deviation in each direction is the
+            scale; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse covariance.
     """
 
-    scales: Tensor
-    information: Tensor
+    scales: Float[Tensor, "*batch"]
+    information: Float[Tensor, "*batch I"]
 
     @classmethod
-    def of(cls, scales: Tensor, information: Tensor | None) -> KeypointNoise:
+    def of(cls, scales: Float[Tensor, "*batch"], information: Float[Tensor, "..."] | None) -> KeypointNoise:
         """Pack information (...) or (..., 2, 2), as in `Features`, or none. Differentiable."""
         return cls(scales, packed_information(information, scales))
 
     @property
-    def weights(self) -> Tensor:
+    def weights(self) -> Float[Tensor, "..."]:
         """Weights in least squares: (...) inverse variances or (..., 2, 2) inverse covariances."""
         size = self.information.shape[-1]
         if size == 0:
@@ -90,14 +93,14 @@ class KeypointNoise:
         return self.information[..., 0] if size == 1 else from_triangle(self.information)
 
     @property
-    def sigma_or_covariance(self) -> Tensor:
+    def sigma_or_covariance(self) -> Float[Tensor, "..."]:
         """(...) standard deviations in pixels, or (..., 2, 2) covariances."""
         size = self.information.shape[-1]
         return inverse_2x2(self.weights) if size == 3 else self.sigmas
 
     @property
-    def sigmas(self) -> Tensor:
-        """(...) standard deviations in pixels; for a covariance, that of the circle of equal area."""
+    def sigmas(self) -> Float[Tensor, "*batch"]:
+        """Standard deviations in pixels; for a covariance, that of the circle of equal area."""
         size = self.information.shape[-1]
         if size == 0:
             return self.scales
@@ -113,8 +116,8 @@ class KeypointNoise:
             return self
         return KeypointNoise(self.scales, GATE_FACTOR**2 * self.scales[..., None] ** -2)
 
-    def scaled(self, factors: Tensor) -> KeypointNoise:
-        """The noise with its information multiplied by factors (...)."""
+    def scaled(self, factors: Float[Tensor, "*batch"]) -> KeypointNoise:
+        """The noise with its information multiplied by factors."""
         return KeypointNoise(self.scales, self.information * factors[..., None])
 
     def pairwise_max(self, other: KeypointNoise) -> KeypointNoise:
@@ -131,72 +134,70 @@ class KeypointNoise:
         return 1.0 if self.information.shape[-1] == 0 else GATE_FACTOR
 
     @property
-    def gate_sigma(self) -> Tensor:
-        """(...) px, the standard deviations used by gates: `gate_factor` times `sigmas`."""
+    def gate_sigma(self) -> Float[Tensor, "*batch"]:
+        """The standard deviations used by gates, px: `gate_factor` times `sigmas`."""
         return self.sigmas if self.information.shape[-1] == 0 else GATE_FACTOR * self.sigmas
 
-    def squared(self, errors: Tensor) -> Tensor:
-        """Squared errors in units of the gate's noise, for `passes_gate`. (..., 2) px -> (...)."""
+    def squared(self, errors: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Squares of errors in pixels, in units of the gate's noise, for `passes_gate`."""
         if self.information.shape[-1] < 3:
             return self._squared(errors.square().sum(-1))
         return (errors[..., None, :] @ self.weights @ errors[..., None])[..., 0, 0] / GATE_FACTOR**2
 
-    def squared_reprojection(self, points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-        """(...) `squared` of the reprojections of points_c (..., 3) at pixels (..., 2); infinite behind the camera."""
+    def squared_reprojection(
+        self, points_c: Float[Tensor, "*#batch 3"], pixels: Float[Tensor, "*#batch 2"], camera: Camera
+    ) -> Float[Tensor, "*#batch"]:
+        """`squared` of the reprojections of points seen at pixels; infinite behind the camera."""
         if self.information.shape[-1] < 3:
             return self._squared(squared_reprojection_errors(points_c, pixels, camera))
         projected, valid = camera.project(points_c)
         return self.squared(projected - pixels).where(valid, torch.inf)
 
-    def _squared(self, squared_px: Tensor) -> Tensor:
+    def _squared(self, squared_px: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         return squared_px / self.gate_sigma**2
 
 
-def packed_information(information: Tensor | None, like: Tensor) -> Tensor:
-    """Pack information (...) or (..., 2, 2) of keypoints, or none, as in `KeypointNoise`; like: (...)."""
+def packed_information(
+    information: Float[Tensor, "..."] | None, like: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch I"]:
+    """Pack information (...) or (..., 2, 2) of keypoints (...), or none, as in `KeypointNoise`."""
     if information is None:
         return like.new_zeros(*like.shape, 0)
     return information[..., None] if information.ndim == like.ndim else triangle(information)
 
 
-def unpacked_information(information: Tensor) -> Tensor | None:
+def unpacked_information(information: Float[Tensor, "*batch I"]) -> Float[Tensor, "..."] | None:
     """The inverse of `packed_information`: (...), (..., 2, 2) or None."""
     size = information.shape[-1]
     return None if size == 0 else information[..., 0] if size == 1 else from_triangle(information)
 
 
 @full_precision
-def squared_reprojection_errors(points_c: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-    """Squared reprojection errors (...) in px^2.
-
-    Args:
-        points_c: (..., 3) points in the camera frame.
-        pixels: (..., 2) where they are seen.
-        camera: its model.
-
-    Returns:
-        (...) squared distances, infinite behind the camera.
-    """
+def squared_reprojection_errors(
+    points_c: Float[Tensor, "*#batch 3"], pixels: Float[Tensor, "*#batch 2"], camera: Camera
+) -> Float[Tensor, "*#batch"]:
+    """Squared distances in px^2 of projected points from the pixels where they are seen; infinite behind the camera."""
     projected, valid = camera.project(points_c)
     return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
 
 
-def passes_gate(squared: Tensor, chi_square: float = CHI_SQUARE_95) -> Tensor:
-    """Test squared errors (...) in units of `KeypointNoise` against a quantile of chi-square: (...) bool."""
+def passes_gate(
+    squared: Float[Tensor, "*batch"], chi_square: float = CHI_SQUARE_95
+) -> Bool[Tensor, "*batch"]:
+    """Test squared errors in units of `KeypointNoise` against a quantile of chi-square."""
     return squared < chi_square
 
 
 @full_precision
-def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Tensor:
-    """Covariances S = R + J Sigma J^T of measured minus predicted pixels.
+def innovation_covariances(
+    J: Float[Tensor, "*#batch 2 D"], covariances: Float[Tensor, "*#batch D D"], sigmas: Float[Tensor, "..."]
+) -> Float[Tensor, "*#batch 2 2"]:
+    """Covariances S = R + J Sigma J^T of measured minus predicted pixels, px^2.
 
     Args:
-        J: (..., 2, D) derivatives of the predictions with respect to their parameters.
-        covariances: (..., D, D) of those parameters.
+        J: derivatives of the predictions with respect to their parameters.
+        covariances: of those parameters.
         sigmas: (...) standard deviations of the measured pixels, R = sigma^2 I, or (..., 2, 2) their covariances R.
-
-    Returns:
-        (..., 2, 2) covariances, px^2.
     """
     if sigmas.ndim == J.ndim:
         return sigmas + J @ covariances @ J.mT
@@ -205,6 +206,8 @@ def innovation_covariances(J: Tensor, covariances: Tensor, sigmas: Tensor) -> Te
 
 
 @full_precision
-def mahalanobis_squared(errors: Tensor, covariances: Tensor) -> Tensor:
-    """e^T S^-1 e of errors (..., D) with covariances (..., D, D), positive definite. (...)."""
+def mahalanobis_squared(
+    errors: Float[Tensor, "*#batch D"], covariances: Float[Tensor, "*#batch D D"]
+) -> Float[Tensor, "*#batch"]:
+    """e^T S^-1 e of errors with positive definite covariances."""
     return (errors * torch.linalg.solve(covariances, errors)).sum(-1)

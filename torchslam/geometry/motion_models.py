@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.homography import decompose_homography
@@ -55,13 +56,21 @@ _EXACT = 1 / 16  # units of the noise; only exact matches are far below, and wha
 
 @dataclass(frozen=True)
 class Fits:
-    """The best fit of each model. R, t: (B, ...) of the essential matrix; H; R_only; squared: (3, B, N) errors."""
+    """The best fit of each model.
 
-    R: Tensor
-    t: Tensor
-    H: Tensor
-    R_only: Tensor
-    squared: Tensor
+    Attributes:
+        R: rotation of the essential matrix.
+        t: direction of translation of the essential matrix.
+        H: homography.
+        R_only: pure rotation.
+        squared: squared errors of the three models, thresholds.
+    """
+
+    R: Float[Tensor, "B 3 3"]
+    t: Float[Tensor, "B 3"]
+    H: Float[Tensor, "B 3 3"]
+    R_only: Float[Tensor, "B 3 3"]
+    squared: Float[Tensor, "3 B N"]
 
     def with_mappings(self, views: TwoViews) -> Fits:
         """Update the errors of homography and rotation."""
@@ -76,9 +85,13 @@ class Fits:
 
 
 def fit_models(
-    views: TwoViews, R: Tensor, t: Tensor, generator: torch.Generator, by_noise: bool = False
+    views: TwoViews,
+    R: Float[Tensor, "B 3 3"],
+    t: Float[Tensor, "B 3"],
+    generator: torch.Generator,
+    by_noise: bool = False,
 ) -> Fits:
-    """A homography and a pure rotation for matches that R (B, 3, 3), t (B, 3) explain.
+    """A homography and a pure rotation for matches that R, t explain.
 
     by_noise: samples that most matches contradict, as those of a scene with depth, are not worth a fit
     """
@@ -109,8 +122,10 @@ def fit_models(
     return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
 
 
-def choose(views: TwoViews, fits: Fits, chance: Tensor, by_noise: bool = False) -> tuple[Tensor, Tensor]:
-    """The index of the simplest model that no significant number of matches contradicts, and if a plane is one. (B,)
+def choose(
+    views: TwoViews, fits: Fits, chance: Float[Tensor, " B"], by_noise: bool = False
+) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
+    """The index of the simplest model that no significant number of matches contradicts, and if a plane is one.
 
     by_noise: nor all matches together, by where beside it they lie. The noise of keypoints has a long tail, and most of
     those off a pure rotation are so by a few pixels: had it moved them in any direction, some would be on their lines.
@@ -124,7 +139,7 @@ def choose(views: TwoViews, fits: Fits, chance: Tensor, by_noise: bool = False) 
     explained = (torch.minimum(essential, homography) < noise) & mask
     chance = chance * noise[:, 0].sqrt()
 
-    def contradicted(simple: Tensor, rich: Tensor) -> Tensor:
+    def contradicted(simple: Float[Tensor, "B N"], rich: Float[Tensor, "B N"]) -> Bool[Tensor, " B"]:
         off = (simple > _CLEARLY_OFF**2 * noise) & mask
         against, count = (off & (rich < noise)).sum(-1), off.sum(-1)
         if by_noise:
@@ -146,14 +161,16 @@ def choose(views: TwoViews, fits: Fits, chance: Tensor, by_noise: bool = False) 
     return torch.where(still, ROTATION, torch.where(plane, HOMOGRAPHY, ESSENTIAL)), plane
 
 
-def _leans(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
-    """(2, B) whether the matches lie off homography and rotation along their epipolar lines, rather than anywhere.
+def _leans(
+    squared: Float[Tensor, "3 B N"], mask: Bool[Tensor, "B N"], variance: Float[Tensor, " B"]
+) -> Bool[Tensor, "2 B"]:
+    """Whether the matches lie off homography and rotation along their epipolar lines, rather than anywhere.
 
     Little parallax is spread over all matches, none of which is clearly off. Noise, of whatever size and tail, has no
     direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
     their squared distance, which tells most where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
 
-    squared: (3, B, N) as of `Fits`; variance: (B,) of the noise by the essential matrix
+    squared: as of `Fits`; variance: of the noise by the essential matrix
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     across, both = squared[ESSENTIAL], squared[1:] * TRANSFER_WIDTH**2
@@ -166,13 +183,13 @@ def _leans(squared: Tensor, mask: Tensor, variance: Tensor) -> Tensor:
     return (lean > _NOTABLE * weight.sum(-1)) & (lean > _CERTAIN * deviation)
 
 
-def goes_both_ways(views: TwoViews, fits: Fits, variance: Tensor) -> Tensor:
-    """(B,) whether a rotation explains most matches, and what parallax the essential matrix makes of them is noise.
+def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
+    """Test whether a rotation explains most matches, and what parallax the essential matrix makes of them is noise.
 
     The noise of keypoints on edges lies along lines, and where many edges are parallel, along epipolar lines: parallax
     by its size. But it puts as many matches behind the cameras as before them.
 
-    variance: (B,) of the noise by the essential matrix
+    variance: of the noise by the essential matrix
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     near = views.mask & (fits.squared[ESSENTIAL] < _FARTHEST**2 * variance)
@@ -187,19 +204,25 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Tensor) -> Tensor:
 
 
 class PlaneMotions(NamedTuple):
-    """Motions in front of the plane of a homography: R (B, 4, 3, 3), direction (B, 4, 3), normal (B, 4, 3) of
-    the plane in units of the distance that the camera moved, squared Sampson errors (B, 4, N) in thresholds, and
-    whether the plane is in front of the cameras (B, 4).
+    """Motions in front of the plane of a homography, four for each.
+
+    Attributes:
+        R: rotations.
+        direction: of the translation.
+        normal: of the plane, in units of the distance that the camera moved.
+        squared: squared Sampson errors, thresholds.
+        possible: whether the plane is in front of the cameras.
     """
 
-    R: Tensor
-    direction: Tensor
-    normal: Tensor
-    squared: Tensor
-    possible: Tensor
+    R: Float[Tensor, "B 4 3 3"]
+    direction: Float[Tensor, "B 4 3"]
+    normal: Float[Tensor, "B 4 3"]
+    squared: Float[Tensor, "B 4 N"]
+    possible: Bool[Tensor, "B 4"]
 
     @staticmethod
     def of(views: TwoViews, fits: Fits) -> PlaneMotions:
+        """Decompose the homographies."""
         R, t, normals = decompose_homography(fits.H)
         # All of the plane must be in front of the first camera, and then is in front of the second.
         plane = views.mask & (fits.squared[HOMOGRAPHY] < 1)
@@ -211,8 +234,8 @@ class PlaneMotions(NamedTuple):
         return PlaneMotions(R, direction, normals * length, squared, share > _IN_FRONT)
 
 
-def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
-    """(B,) whether a motion before the plane explains the matches about as well as the essential matrix does.
+def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Bool[Tensor, " B"]:
+    """Test whether a motion before the plane explains the matches about as well as the essential matrix does.
 
     Few matches, most of which lie near some plane, show their depth by too few others to be no accident. But as motions
     of a scene with depth the two can be compared by all matches, each up to three deviations: what the plane's leaves
@@ -227,7 +250,7 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
     variance = variance.clamp_min(_EXACT**2)[:, None]
     near = (torch.minimum(*fits.squared[:2]) < _FARTHEST**2 * variance) & views.mask
 
-    def cost(squared: Tensor) -> Tensor:
+    def cost(squared: Float[Tensor, "B K N"]) -> Float[Tensor, "B K"]:
         whitened = (squared / variance[..., None]).nan_to_num(torch.inf).clamp_max(_FARTHEST**2)
         return torch.where(views.mask[:, None], whitened, 0.0).sum(-1)
 
@@ -237,9 +260,9 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Tensor:
 
 
 def pose_of(
-    views: TwoViews, fits: Fits, model: Tensor, plane: PlaneMotions, by_noise: bool = False
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """R (B, 3, 3), t (B, 3), plane normal (B, 3), and whether a plane leaves two motions (B,).
+    views: TwoViews, fits: Fits, model: Int[Tensor, " B"], plane: PlaneMotions, by_noise: bool = False
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
+    """R, t and the normal of the plane, and whether a plane leaves two motions.
 
     by_noise: also where noise may be why one of them explains the matches better
     """
@@ -264,8 +287,8 @@ def pose_of(
     return R, t, normal[index, best], flat & ambiguous & apart
 
 
-def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
-    """Test whether the inliers leave a line in both images, by some thresholds. (B,)"""
+def is_spread(views: TwoViews, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
+    """Test whether the inliers leave a line in both images, by some thresholds."""
     weights = inliers[..., None].to(views.x_1.dtype)
     weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
     spread = torch.ones_like(inliers[:, 0])
@@ -278,14 +301,25 @@ def is_spread(views: TwoViews, inliers: Tensor) -> Tensor:
 
 
 def is_no_accident(
-    views: TwoViews, squared: Tensor, model: Tensor, noise: Tensor, chance: Tensor, by_noise: bool
-) -> Tensor:
-    """(B,) whether so many matches, spread as they are, are within the threshold by no accident; or, `by_noise`, within
-    what the noise explains, which often is much less. That both are tried, the test allows for.
+    views: TwoViews,
+    squared: Float[Tensor, "B N"],
+    model: Int[Tensor, " B"],
+    noise: Float[Tensor, " B"],
+    chance: Float[Tensor, " B"],
+    by_noise: bool,
+) -> Bool[Tensor, " B"]:
+    """Test whether so many matches, spread as they are, are within the threshold by no accident.
 
-    views, squared: in units of the noise (B,), thresholds; squared (B, N) of the model (B,); chance: (B,) that a wrong
-    match is within the threshold of an epipolar line. `by_noise`, a rotation is known by two matches, not five, and a
-    wrong one is as near by less than the square of that chance
+    With `by_noise`, the range that the noise explains, often much less than the threshold, is tried as well; a
+    rotation is determined by two matches, not five, and a wrong match is as near with less than the squared chance.
+
+    Args:
+        views: in units of the noise.
+        squared: errors of the chosen model in units of the noise.
+        model: index of the chosen model.
+        noise: thresholds.
+        chance: probability that a wrong match is within the threshold of an epipolar line.
+        by_noise: whether the noise is estimated.
     """
     still = (model == ROTATION) & by_noise
     in_thresholds = views.in_units(1 / noise[:, None])
@@ -302,8 +336,10 @@ def is_no_accident(
     return found
 
 
-def in_front(views: TwoViews, R: Tensor, t: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose with most inliers in front of both cameras among the four of an essential matrix, R (B, 3, 3), t (B, 3).
+def in_front(
+    views: TwoViews, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], inliers: Bool[Tensor, "B N"]
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
+    """The pose with most inliers in front of both cameras among the four of an essential matrix.
 
     A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
     """

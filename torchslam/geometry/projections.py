@@ -1,8 +1,7 @@
 """Scores and fits of what maps homogeneous points to image coordinates: poses, homographies, pure rotations.
 
-All map homogeneous (B, D, N) points by P (3, D) to x (B, N, 2): D = 4 for scene points, D = 3 for image points.
-Errors are in thresholds, of which `scale` (B, N, 1 or 2) go into one unit of x; rows outside
-`mask` (B, N) do not count.
+All map homogeneous points by P (3, D) to x: D = 4 for scene points, D = 3 for image points. Errors are in thresholds,
+of which `scale` go into one unit of x, in each direction or in both; rows outside `mask` do not count.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, generators
@@ -24,18 +24,26 @@ from torchslam.geometry.ransac import (
 )
 
 
-def score_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor, mask: Tensor) -> Tensor:
-    """Truncated scores of many mappings, in the dtype of P. (B, M, 3, D) -> (B, M).
-
-    A negative depth counts as an outlier.
-    """
+def score_projections(
+    P: Float[Tensor, "B K 3 D"],
+    homogeneous: Float[Tensor, "B D N"],
+    x: Float[Tensor, "B N 2"],
+    scale: Float[Tensor, "B N _"],
+    mask: Bool[Tensor, "B N"],
+) -> Float[Tensor, "B K"]:
+    """Truncated scores of many mappings, in the dtype of P; a negative depth counts as an outlier."""
     return truncated_score(squared_projections(P, homogeneous, x, scale), mask)
 
 
-def squared_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor) -> Tensor:
-    """Squared errors of many mappings, infinite or NaN where the depth is negative. (B, M, 3, D) -> (B, M, N)."""
-    M = P.shape[1]
-    u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, M)).unbind(1)
+def squared_projections(
+    P: Float[Tensor, "B K 3 D"],
+    homogeneous: Float[Tensor, "B D N"],
+    x: Float[Tensor, "B N 2"],
+    scale: Float[Tensor, "B N _"],
+) -> Float[Tensor, "B K N"]:
+    """Squared errors of many mappings, infinite or NaN where the depth is negative."""
+    K = P.shape[1]
+    u, v, w = (P.transpose(1, 2).flatten(1, 2) @ homogeneous).unflatten(1, (3, K)).unbind(1)
     du = torch.addcmul(u, x[:, None, :, 0], w, value=-1)
     dv = torch.addcmul(v, x[:, None, :, 1], w, value=-1)
     inverse, scale = w.clamp_min_(0.0).reciprocal_(), scale.to(w.dtype)[:, None]
@@ -47,13 +55,13 @@ def squared_projections(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor
 class Tangent:
     """Derivatives and retraction of a mapping P (3, D) with T local parameters.
 
-    constant, linear: (3 (T + 1) D,), (3 D, 3 (T + 1) D): the entries of T derivatives of P and of itself, as an affine
-    function of the entries of P
+    constant, linear: the 3 (T + 1) D entries of T derivatives of P and of itself, as an affine function of the entries
+    of P
     retract: (P,), step (problems, T) -> (P,)
     """
 
-    constant: Tensor
-    linear: Tensor
+    constant: Float[Tensor, " entries"]
+    linear: Float[Tensor, "_ entries"]
     retract: Callable[[ModelState, Tensor], ModelState]
 
     @staticmethod
@@ -66,7 +74,7 @@ class Tangent:
     ) -> Tangent:
         """From the derivatives, an affine function of P: (3, D) -> (T, 3, D)."""
 
-        def entries(P: Tensor) -> Tensor:
+        def entries(P: Float[Tensor, "3 D"]) -> Float[Tensor, " entries"]:
             return torch.cat((derivatives(P), P[None])).flatten()
 
         constant = entries(torch.zeros(3, columns, dtype=dtype, device=device))
@@ -101,19 +109,16 @@ def homography_tangent(dtype: torch.dtype, device: torch.device) -> Tangent:
 
 
 def fit_projections(
-    P: Tensor,
+    P: Float[Tensor, "B K 3 D"],
     tangent: Tangent,
-    homogeneous: Tensor,
-    x: Tensor,
-    scale: Tensor,
-    mask: Tensor,
+    homogeneous: Float[Tensor, "B D N"],
+    x: Float[Tensor, "B N 2"],
+    scale: Float[Tensor, "B N _"],
+    mask: Bool[Tensor, "B N"],
     iterations: int,
     width: float = 1.0,
-) -> tuple[Tensor, Tensor]:
-    """Mappings (B, K, 3, D) of least truncated squared error near the given ones, and their costs (B, K).
-
-    width: in thresholds, where the error is truncated.
-    """
+) -> tuple[Float[Tensor, "B K 3 D"], Float[Tensor, "B K"]]:
+    """Mappings of least squared error near the given ones, truncated at `width` thresholds, and their costs."""
     T, N = len(tangent.constant) // (3 * P.shape[-1]) - 1, x.shape[1]
 
     def fit(*part: Tensor) -> tuple[Tensor, Tensor]:
@@ -127,11 +132,11 @@ def _fit_part(
     tangent: Tangent,
     iterations: int,
     width: float,
-    P: Tensor,
-    homogeneous: Tensor,
-    x: Tensor,
-    scale: Tensor,
-) -> tuple[Tensor, Tensor]:
+    P: Float[Tensor, "B K 3 D"],
+    homogeneous: Float[Tensor, "B D N"],
+    x: Float[Tensor, "B N 2"],
+    scale: Float[Tensor, "B N _"],
+) -> tuple[Float[Tensor, "B K 3 D"], Float[Tensor, "B K"]]:
     """`fit_projections` of a few problems, with a scale of zero for rows outside the mask."""
     B, K, _, D = P.shape
     T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, identity
@@ -25,14 +26,19 @@ def levenberg_marquardt(
     evaluate: Callable[..., tuple[Tensor, Tensor]],
     retract: Callable[[ModelState, Tensor], ModelState],
     iterations: int,
-) -> tuple[ModelState, Tensor]:
+) -> tuple[ModelState, Float[Tensor, " B"]]:
     """Minimize many small problems at once, each with its own damping.
 
-    state:    tensors with one leading dimension (P), the problems
-    evaluate: state -> (A, cost): A (P, D + 1, D + 1) is [J r]^T W [J r], and cost (P,) what must not grow
-    retract:  state, step (P, D) -> state
-    Stops once no problem can gain more than 1e-11 of its cost. Returns the state and its cost; problems that become
-    singular or NaN keep their last good state.
+    Stops once no problem can gain more than 1e-11 of its cost.
+
+    Args:
+        state: tensors with one leading dimension (B), the problems.
+        evaluate: state -> (A, cost): A (B, D + 1, D + 1) is [J r]^T W [J r], and cost (B,) what must not grow.
+        retract: state, step (B, D) -> state.
+        iterations: largest number.
+
+    Returns:
+        The state and its cost; problems that become singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
     damping = torch.full_like(cost, 1e-4)[:, None, None]
@@ -54,7 +60,7 @@ def levenberg_marquardt(
 
 
 def in_chunks(
-    function: Callable[..., tuple[Tensor, ...]], numbers: int, *tensors: Tensor
+    function: Callable[..., tuple[Tensor, ...]], numbers: int, *tensors: Shaped[Tensor, "B ..."]
 ) -> tuple[Tensor, ...]:
     """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
 
@@ -67,22 +73,22 @@ def in_chunks(
     return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
 
-def best_of(state: ModelState, cost: Tensor) -> tuple[ModelState, Tensor]:
-    """The candidate of least cost of each problem. (B, K, ...), (B, K) -> (B, ...), (B,)."""
+def best_of(state: ModelState, cost: Float[Tensor, "B K"]) -> tuple[ModelState, Float[Tensor, " B"]]:
+    """The candidate of least cost of each problem, and that cost; state: tensors (B, K, ...)."""
     cost, best = cost.nan_to_num(torch.inf).min(dim=1)
     index = torch.arange(len(best), device=best.device)
     return tuple(x[index, best] for x in state), cost
 
 
-def _select(condition: Tensor, new: ModelState, old: ModelState) -> ModelState:
+def _select(condition: Bool[Tensor, " B"], new: ModelState, old: ModelState) -> ModelState:
     """New values where the condition holds. All batched over the first dimension."""
     return tuple(
         torch.where(condition.view(-1, *(1,) * (x.dim() - 1)), x, y) for x, y in zip(new, old, strict=True)
     )
 
 
-def retract_pose(pose: ModelState, step: Tensor) -> ModelState:
-    """Perturb [R t] by [rho, omega] from the left. (P, 3, 4), (P, 6) -> (P, 3, 4)."""
+def retract_pose(pose: ModelState, step: Float[Tensor, "B 6"]) -> ModelState:
+    """Perturb [R t], (B, 3, 4), by [rho, omega] from the left."""
     turn = cayley_rotation(step[:, 3:])
     return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, pose[0]),)
 
@@ -94,12 +100,14 @@ _SAMPLES_AT_ONCE = 1024
 _PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 
 
-def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Random minimal samples without repeated rows, from the rows inside the mask.
+def sample_minimal(
+    mask: Bool[Tensor, "B N"], size: int, count: int, generator: torch.Generator
+) -> Int[Tensor, "B {count} {size}"]:
+    """Row numbers of random minimal samples without repeated rows, from the rows inside the mask.
 
-    mask: (B, N). Returns (B, count, size) int64 row numbers. Problems with fewer than `size` rows get repeated
-    ones. Random permutations are cut into disjoint samples, which also spreads the samples over all rows. The
-    random numbers come from the CPU, so that every device draws the same ones.
+    Problems with fewer than `size` rows get repeated ones. Random permutations are cut into disjoint samples, which
+    also spreads the samples over all rows. The random numbers come from the CPU, so that every device draws the same
+    ones.
     """
     B, N = mask.shape
     available = mask.sum(-1)
@@ -116,8 +124,10 @@ def sample_minimal(mask: Tensor, size: int, count: int, generator: torch.Generat
     return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
 
 
-def sample_minimal_of_all(rows: int, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """(count, size): the samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
+def sample_minimal_of_all(
+    rows: int, size: int, count: int, generator: torch.Generator
+) -> Int[Tensor, "{count} {size}"]:
+    """The samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
     each = rows // size
     order = torch.rand(math.ceil(count / each), rows, generator=generator).argsort(1)
     return order[:, : size * each].reshape(-1, size)[:count]
@@ -125,15 +135,15 @@ def sample_minimal_of_all(rows: int, size: int, count: int, generator: torch.Gen
 
 def best_models(
     score: Callable[[Tensor, Tensor | None], Tensor],
-    models: Tensor,
-    valid: Tensor,
-    mask: Tensor,
+    models: Float[Tensor, "B K D"],
+    valid: Bool[Tensor, "B K"],
+    mask: Bool[Tensor, "B N"],
     count: int,
     generator: torch.Generator,
-) -> Tensor:
-    """Indices (B, count) of the best of many models, which first have to do well on a random part of the rows.
+) -> Int[Tensor, "B {count}"]:
+    """Indices of the best of many models, which first have to do well on a random part of the rows.
 
-    score: (models (B, M, D), row numbers (B, n) or None for all) -> (B, M); valid: (B, M); mask: (B, N).
+    score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
     """
     few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
     if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
@@ -144,8 +154,10 @@ def best_models(
     return preview.gather(1, final.topk(count, dim=1).indices)
 
 
-def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: float) -> Tensor:
-    """Number of samples that contain, with the given confidence, one without outliers. (B,), (B,) -> (B,) float64.
+def samples_needed(
+    inliers: Int[Tensor, " B"], available: Int[Tensor, " B"], size: int, confidence: float
+) -> Float[Tensor, " B"]:
+    """Number of samples that contain, with the given confidence, one without outliers.
 
     Computed on the host, where a number costs less than a call.
     """
@@ -155,32 +167,36 @@ def samples_needed(inliers: Tensor, available: Tensor, size: int, confidence: fl
     return torch.tensor(needed, dtype=torch.float64)
 
 
-def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
-    """Rows of a batch. (B, N, D), (B, ...) int64 -> (B, ..., D)."""
+def gather_rows(
+    values: Shaped[Tensor, "B N D"], indices: Int[Tensor, "B *rows"]
+) -> Shaped[Tensor, "B *rows D"]:
+    """Rows of each element of a batch."""
     flat = indices.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
     return values.gather(1, flat).unflatten(1, indices.shape[1:])
 
 
-def truncated_score(squared: Tensor, mask: Tensor) -> Tensor:
+def truncated_score(squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B K"]:
     """Sum of 1 - min(r^2, 1) over the rows in use (MSAC); `squared` is overwritten.
 
-    squared: (B, M, N) squared residuals in units of the threshold, NaN counted as outliers; mask: (B, N). Returns
-    (B, M); higher is better. Source: Torr and Zisserman, "MLESAC", 2000.
+    squared: squared residuals in units of the threshold, NaN counted as outliers. Higher is better. Source: Torr and
+    Zisserman, "MLESAC", 2000.
     """
     weights = mask.to(squared.dtype)[..., None]
     cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
     return (weights.sum(1, keepdim=True) - cost).squeeze(-1)
 
 
-def truncated_rows(squared: Tensor, mask: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """Rows in use, (B, K, N), and the truncated cost, (B, K), of squared residuals (B, K, N)."""
+def truncated_rows(
+    squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"], width: float
+) -> tuple[Bool[Tensor, "B K N"], Float[Tensor, "B K"]]:
+    """Rows in use, and the truncated cost, of squared residuals."""
     cost = torch.where(mask[:, None], squared.clamp_max(width * width), 0.0).sum(-1)
     return (squared < width * width) & mask[:, None], cost
 
 
 def search(
     propose: Callable[[Tensor, int], tuple[ModelState, Tensor, Tensor]],
-    available: Tensor,
+    available: Int[Tensor, " B"],
     size: int,
     confidence: float,
     first_round: int,
@@ -189,13 +205,18 @@ def search(
 ) -> ModelState:
     """The best model of each problem over rounds of samples, until its support calls for no more of them.
 
-    propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores (R,)
-    the higher the better, and support (R,), the number of rows within SUPPORT_WIDTH thresholds; available: (B,)
-    rows in use per problem; size: of a minimal sample. Every round draws twice as many samples as the one before, or,
-    `as_needed`, no more than the support calls for, but as many as the first one.
+    Args:
+        propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores
+            (R,), the higher the better, and support (R,), the number of rows within SUPPORT_WIDTH thresholds.
+        available: rows in use per problem.
+        size: of a minimal sample.
+        confidence: probability that some sample has no outlier.
+        first_round: samples of the first round; every round draws twice as many as the one before.
+        max_samples: largest number of samples per problem.
+        as_needed: draw no more than the support calls for, but at least as many as in the first round.
     """
 
-    def propose_in_chunks(rows: Tensor, count: int) -> tuple[ModelState, Tensor, Tensor]:
+    def propose_in_chunks(rows: Int[Tensor, " R"], count: int) -> tuple[ModelState, Tensor, Tensor]:
         """Few problems at a time, so that what they compute stays in the cache."""
         if len(rows) * count <= _SAMPLES_AT_ONCE:
             return propose(rows, count)
@@ -224,11 +245,17 @@ def search(
     return models
 
 
-def is_significant(inliers: Tensor, available: Tensor, size: int, chance: Tensor, solutions: int) -> Tensor:
+def is_significant(
+    inliers: Int[Tensor, " B"],
+    available: Int[Tensor, " B"],
+    size: int,
+    chance: Float[Tensor, " B"],
+    solutions: int,
+) -> Bool[Tensor, " B"]:
     """Test whether inliers are significant: fewer than 0.001 false alarms expected among wrong matches.
 
-    inliers, available: (B,) counts; chance: (B,) probability that a wrong row fits a model; solutions: models per
-    minimal sample of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
+    inliers, available: counts; chance: probability that a wrong row fits a model; solutions: models per minimal sample
+    of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
     matches between two images", 2004, eq. for the number of false alarms.
     """
     problems = zip(inliers.tolist(), available.tolist(), chance.tolist(), strict=True)
@@ -247,7 +274,9 @@ def _log_false_alarms(inliers: int, available: int, size: int, chance: float, so
     return alarms + math.log(solutions * max(available - size, 1))
 
 
-def is_unlikely(count: Tensor, available: Tensor, size: int, chance: Tensor) -> Tensor:
+def is_unlikely(
+    count: Int[Tensor, " B"], available: Int[Tensor, " B"], size: int, chance: Float[Tensor, " B"]
+) -> Bool[Tensor, " B"]:
     """Test whether rows support a richer model against a simpler one: fewer than 0.1 false alarms expected.
 
     As `is_significant`, for chances that need not be small: the tail of the binomial distribution over the rows
@@ -271,17 +300,18 @@ def _log_tail_alarms(count: int, available: int, size: int, chance: float) -> fl
     return math.log(math.comb(available, size)) - rest * divergence
 
 
-def valid_first(valid: Tensor) -> Tensor:
-    """Row numbers with the valid rows first, cut to the largest count in the batch. (B, M) -> (B, M')."""
+def valid_first(valid: Bool[Tensor, "B N"]) -> Int[Tensor, "B R"]:
+    """Row numbers with the valid rows first, cut to the largest count in the batch."""
     count = max(1, int(valid.sum(-1).max()))
     return valid.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, :count]
 
 
-def pad_groups(values: Tensor, group: Tensor, groups: int, least: int) -> tuple[Tensor, Tensor]:
-    """Values in ascending order of their group, as rows of a padded tensor with a mask.
+def pad_groups(
+    values: Float[Tensor, "R D"], group: Int[Tensor, " R"], groups: int, least: int
+) -> tuple[Float[Tensor, "{groups} K D"], Bool[Tensor, "{groups} K"]]:
+    """Values in ascending order of their group, as rows of a padded tensor, zero where padded, with a mask.
 
-    values: (R, D); group: (R,) ascending. Returns (groups, M, D), zero where padded, and (groups, M), with M the
-    size of the largest group, but at least `least`.
+    The size of a group is that of the largest one, but at least `least`.
     """
     counts = torch.bincount(group, minlength=groups)
     size = max(least, int(counts.max()))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -32,53 +33,53 @@ class RelativePose:
     """Relative poses of B pairs of views.
 
     Attributes:
-        T_21: (B, 4, 4) from camera 1 to camera 2, translation of length one, or zero for "rotation". The most
+        T_21: from camera 1 to camera 2, translation of length one, or zero for "rotation". The most
             likely pose even without `success`; the identity for fewer than six matches.
-        inliers: (B, N) matches within the threshold of the chosen model.
-        success: (B,) whether rotation and direction are determined: the inliers are significant, the motion is no
+        inliers: matches within the threshold of the chosen model.
+        success: whether rotation and direction are determined: the inliers are significant, the motion is no
             pure rotation, and the plane, if any, is not ambiguous.
         model: B strings, "essential", "homography" (as far as the matches tell, the scene is a plane) or
             "rotation".
-        model_index: (B,) int64 indices of these models, in this order.
-        ambiguous: (B,) whether the matches lie on a plane and two motions explain them; T_21 is the more likely
-            one.
-        score_essential: (B,) sum over the matches of 1 - min((error / threshold)^2, 1); zero if not requested.
-        score_homography: (B,) as `score_essential`.
-        score_rotation: (B,) as `score_essential`.
-        T_21_essential: (B, 4, 4) the pose of the essential matrix, whatever was chosen, without gradient: a guess
+        model_index: indices of these models, in this order.
+        ambiguous: whether the matches lie on a plane and two motions explain them; T_21 is the more likely one.
+        score_essential: sum over the matches of 1 - min((error / threshold)^2, 1); zero if not requested.
+        score_homography: as `score_essential`.
+        score_rotation: as `score_essential`.
+        T_21_essential: the pose of the essential matrix, whatever was chosen, without gradient: a guess
             where there is no `success`.
     """
 
-    T_21: Tensor
-    inliers: Tensor
-    success: Tensor
-    model_index: Tensor
-    ambiguous: Tensor
-    score_essential: Tensor
-    score_homography: Tensor
-    score_rotation: Tensor
-    T_21_essential: Tensor
+    T_21: Float[Tensor, "B 4 4"]
+    inliers: Bool[Tensor, "B N"]
+    success: Bool[Tensor, " B"]
+    model_index: Int[Tensor, " B"]
+    ambiguous: Bool[Tensor, " B"]
+    score_essential: Float[Tensor, " B"]
+    score_homography: Float[Tensor, " B"]
+    score_rotation: Float[Tensor, " B"]
+    T_21_essential: Float[Tensor, "B 4 4"]
 
     @property
     def model(self) -> tuple[str, ...]:
+        """Names of the models, one for each pair."""
         return tuple(MODELS[index] for index in self.model_index.tolist())
 
 
 @full_precision
 def estimate_relative_pose(
-    pixels_1: Tensor,
-    pixels_2: Tensor,
+    pixels_1: Float[Tensor, "B N 2"],
+    pixels_2: Float[Tensor, "B N 2"],
     camera_1: Camera,
     camera_2: Camera,
     threshold: float = 1.0,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     confidence: float = 0.9999,
     max_samples: int = 4000,
     *,
     model: Model = "auto",
     kernel: Kernel = "cauchy",
-    weights: Tensor | None = None,
+    weights: Float[Tensor, "B N"] | None = None,
     min_samples: int = 512,
 ) -> RelativePose:
     """Estimate relative poses of B pairs of views by RANSAC over five-point essential matrices, with model selection.
@@ -100,12 +101,12 @@ def estimate_relative_pose(
     optimized RANSAC", 2003; Torr, "An assessment of information criteria for motion model selection", 1997.
 
     Args:
-        pixels_1: (B, N, 2) matches in the first view.
-        pixels_2: (B, N, 2) matches in the second view.
+        pixels_1: matches in the first view.
+        pixels_2: matches in the second view.
         camera_1: of the first view, one or B.
         camera_2: of the second view, one or B.
         threshold: pixels, about the noise of one coordinate or somewhat more, for matches of weight one.
-        mask: (B, N) matches in use; those with NaN are never used.
+        mask: matches in use; those with NaN are never used.
         seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples of five matches.
@@ -114,7 +115,7 @@ def estimate_relative_pose(
             selection and the search use the noise level estimated from the matches, the threshold only separates
             wrong matches, and the search counts matches behind a camera as wrong. With "truncated" the threshold
             sets all of that.
-        weights: (B, N) information of the matches; the threshold of a match is `threshold / sqrt(weight)`. A weight
+        weights: information of the matches; the threshold of a match is `threshold / sqrt(weight)`. A weight
             of zero, infinity or NaN excludes the match.
         min_samples: smallest number of samples of five matches.
 
@@ -145,8 +146,8 @@ def estimate_relative_pose(
     return _answer(T_21, found)
 
 
-def _answer(T_21: Tensor, found: FoundPose) -> RelativePose:
-    """The result, with a pose (B, 4, 4) that may carry a gradient."""
+def _answer(T_21: Float[Tensor, "B 4 4"], found: FoundPose) -> RelativePose:
+    """The result, with a pose that may carry a gradient."""
     return RelativePose(
         T_21,
         found.inliers,
@@ -160,8 +161,13 @@ def _answer(T_21: Tensor, found: FoundPose) -> RelativePose:
     )
 
 
-def _usable(pixels_1: Tensor, pixels_2: Tensor, mask: Tensor | None, weights: Tensor | None) -> Tensor:
-    """(B, N) matches inside the mask that are finite and have a weight."""
+def _usable(
+    pixels_1: Float[Tensor, "B N 2"],
+    pixels_2: Float[Tensor, "B N 2"],
+    mask: Bool[Tensor, "B N"] | None,
+    weights: Float[Tensor, "B N"] | None,
+) -> Bool[Tensor, "B N"]:
+    """Matches inside the mask that are finite and have a weight."""
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
     return finite if mask is None else mask & finite
@@ -178,7 +184,7 @@ def _check(pixels_1: Tensor, pixels_2: Tensor, weights: Tensor | None, model: st
             raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
 
 
-def _nothing(pixels: Tensor) -> RelativePose:
+def _nothing(pixels: Float[Tensor, "B N 2"]) -> RelativePose:
     """The answer where there is nothing to sample from."""
     B, N = pixels.shape[:2]
     T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).expand(B, 4, 4)
@@ -188,7 +194,7 @@ def _nothing(pixels: Tensor) -> RelativePose:
     return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21)
 
 
-def attach_relative_pose(found: FoundPose, views: TwoViews, kernel: Kernel) -> Tensor:
+def attach_relative_pose(found: FoundPose, views: TwoViews, kernel: Kernel) -> Float[Tensor, "B 4 4"]:
     """The poses found, with the gradient of the minimizer of the chosen model's errors over the rows in use."""
     T_21, normal, model, used = found.T_21, found.normal, found.model, found.used
     views = views.in_units(found.noise[:, None])

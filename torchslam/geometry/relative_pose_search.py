@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -55,28 +56,37 @@ class _Effort(NamedTuple):
 
 
 class FoundPose(NamedTuple):
-    """T_21 (B, 4, 4) of the chosen model (B,), `normal` (B, 3) of its plane, and what it rests on.
+    """The pose of the chosen model, and what it is based on.
 
-    noise: (B,) thresholds, the unit of the fits; significant: (B,) no accident; used: (B, N) matches that the final
-    fit saw; scores: (3, B); T_essential: (B, 4, 4)
+    Attributes:
+        T_21: from camera 1 to camera 2.
+        normal: of the plane of a homography.
+        model: index of the chosen model.
+        noise: thresholds, the unit of the fits.
+        significant: whether the inliers are no accident.
+        ambiguous: whether a plane leaves two motions.
+        inliers: matches within the threshold.
+        used: matches of the final fit.
+        scores: of the three models.
+        T_essential: the pose of the essential matrix.
     """
 
-    T_21: Tensor
-    normal: Tensor
-    model: Tensor
-    noise: Tensor
-    significant: Tensor
-    ambiguous: Tensor
-    inliers: Tensor
-    used: Tensor
-    scores: Tensor
-    T_essential: Tensor
+    T_21: Float[Tensor, "B 4 4"]
+    normal: Float[Tensor, "B 3"]
+    model: Int[Tensor, " B"]
+    noise: Float[Tensor, " B"]
+    significant: Bool[Tensor, " B"]
+    ambiguous: Bool[Tensor, " B"]
+    inliers: Bool[Tensor, "B N"]
+    used: Bool[Tensor, "B N"]
+    scores: Float[Tensor, "3 B"]
+    T_essential: Float[Tensor, "B 4 4"]
 
 
 def find_relative_pose(
     views: TwoViews,
-    weights: Tensor | None,
-    mask: Tensor,
+    weights: Float[Tensor, "B N"] | None,
+    mask: Bool[Tensor, "B N"],
     camera_2: Camera,
     threshold: float,
     kernel: Kernel,
@@ -92,22 +102,24 @@ def find_relative_pose(
 
 
 class _Chosen(NamedTuple):
-    """R (B, 3, 3), t (B, 3) of the chosen model (B,), and `normal` (B, 3) of its plane, which leaves two motions where
-    it is `ambiguous` (B,); R_E, t_E of the essential matrix; squared: (M, B, N) errors of the models, in units of the
-    noise
+    """R, t of the chosen model, and `normal` of its plane, which leaves two motions where it is `ambiguous`.
+
+    R_E, t_E: of the essential matrix; squared: errors of the three models, or of the first, in units of the noise
     """
 
-    R: Tensor
-    t: Tensor
-    normal: Tensor
-    model: Tensor
-    ambiguous: Tensor
-    R_E: Tensor
-    t_E: Tensor
-    squared: Tensor
+    R: Float[Tensor, "B 3 3"]
+    t: Float[Tensor, "B 3"]
+    normal: Float[Tensor, "B 3"]
+    model: Int[Tensor, " B"]
+    ambiguous: Bool[Tensor, " B"]
+    R_E: Float[Tensor, "B 3 3"]
+    t_E: Float[Tensor, "B 3"]
+    squared: Float[Tensor, "_ B N"]
 
 
-def _search(views: TwoViews, chance: Tensor, wanted: Model, kernel: Kernel, effort: _Effort) -> FoundPose:
+def _search(
+    views: TwoViews, chance: Float[Tensor, " B"], wanted: Model, kernel: Kernel, effort: _Effort
+) -> FoundPose:
     """Fit all models, choose one per pair, and take the pose from it."""
     generator = torch.Generator().manual_seed(effort.seed)
     R, t, noise, near = _fit_motion(views, kernel, effort, generator)
@@ -143,7 +155,7 @@ def _width(by_noise: bool) -> float:
     return NOISE_WIDTH if by_noise else FINAL_WIDTH
 
 
-def _essential(views: TwoViews, R: Tensor, t: Tensor) -> _Chosen:
+def _essential(views: TwoViews, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]) -> _Chosen:
     """Nothing but the essential matrix."""
     squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1)
     R, t = in_front(views, R, t, views.mask & (squared[ESSENTIAL] < FINAL_WIDTH**2))
@@ -151,8 +163,10 @@ def _essential(views: TwoViews, R: Tensor, t: Tensor) -> _Chosen:
     return _Chosen(R, t, torch.zeros_like(t), no.to(torch.int64), no, R, t, squared)
 
 
-def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise: bool) -> _Chosen:
-    """The model that the matches call for, and its pose. views: in units of the noise (B,), thresholds"""
+def _choose(
+    views: TwoViews, fits: Fits, noise: Float[Tensor, " B"], chance: Float[Tensor, " B"], by_noise: bool
+) -> _Chosen:
+    """The model that the matches call for, and its pose. views: in units of the noise, thresholds"""
     mask = views.mask
     R_E, t_E = in_front(views, fits.R, fits.t, mask & (fits.squared[ESSENTIAL] < FINAL_WIDTH**2))
     facing = replace(fits, R=R_E, t=t_E) if by_noise else fits
@@ -165,7 +179,7 @@ def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise
             # As alone, whoever else is in the batch.
             fits = replace(fits, squared=torch.where(simple[:, None], fits.squared, rough))
 
-            def is_certain(model: Tensor) -> Tensor:
+            def is_certain(model: Int[Tensor, " B"]) -> Bool[Tensor, " B"]:
                 of_model = fits.squared[model, torch.arange(len(mask), device=mask.device)]
                 return is_no_accident(views, of_model, model, noise, chance, by_noise)
 
@@ -190,8 +204,8 @@ def _choose(views: TwoViews, fits: Fits, noise: Tensor, chance: Tensor, by_noise
 
 def _fit_motion(
     views: TwoViews, kernel: Kernel, effort: _Effort, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """R (B, 3, 3) and t (B, 3) of essential matrices, their unit (B,), thresholds, and the matches (B, N) fitted."""
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, " B"], Bool[Tensor, "B N"]]:
+    """R and t of essential matrices, their unit in thresholds, and the matches of the fit."""
     R, t = search(
         lambda rows, count: propose_essential(views.select(rows), count, generator, kernel != "truncated"),
         views.mask.sum(-1),
@@ -215,9 +229,11 @@ def _fit_motion(
     return R[:, 0], t[:, 0], noise, near
 
 
-def _rotations(R: Tensor) -> Tensor:
-    """The rotations that matrices (B, 3, 3) nearly are: those of an E whose root was not found exactly are some by a
-    ten thousandth only, which no turn mends. The others stay to the bit."""
+def _rotations(R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
+    """The rotations closest to matrices.
+
+    Where the root of E was not found exactly, R is a rotation only to a ten thousandth; the others stay to the bit.
+    """
     eye, rounding = torch.eye(3, dtype=R.dtype, device=R.device), torch.finfo(R.dtype).eps ** 0.6
     good = ((R.mT @ R - eye).abs() < rounding).all(-1).all(-1)
     if good.all():
@@ -225,8 +241,10 @@ def _rotations(R: Tensor) -> Tensor:
     return torch.where(good[:, None, None], R, matrix_from_quaternion(quaternion_from_matrix(R)))
 
 
-def _mean_width(mask: Tensor, weights: Tensor | None, dtype: torch.dtype) -> Tensor:
-    """(B,) the mean of the matches' thresholds, in units of that of weight one."""
+def _mean_width(
+    mask: Bool[Tensor, "B N"], weights: Float[Tensor, "B N"] | None, dtype: torch.dtype
+) -> Float[Tensor, " B"]:
+    """The mean of the matches' thresholds, in units of that of weight one."""
     if weights is None:
         return torch.ones_like(mask[:, 0], dtype=dtype)
     widths = torch.where(mask, torch.where(mask, weights, 1.0).rsqrt(), 0.0)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -44,27 +45,31 @@ TRANSFER_WIDTH = 1.5
 class TwoViews:
     """Matches of B pairs of views.
 
-    x_1, x_2: (B, N, 2) undistorted image coordinates
-    scale_1, scale_2: (B, N) thresholds per unit of them
-    mask:     (B, N)
+    Attributes:
+        x_1: undistorted image coordinates in view 1.
+        x_2: undistorted image coordinates in view 2.
+        scale_1: thresholds per unit of `x_1`.
+        scale_2: thresholds per unit of `x_2`.
+        mask: matches in use.
     """
 
-    x_1: Tensor
-    x_2: Tensor
-    scale_1: Tensor
-    scale_2: Tensor
-    mask: Tensor
+    x_1: Float[Tensor, "B N 2"]
+    x_2: Float[Tensor, "B N 2"]
+    scale_1: Float[Tensor, "B N"]
+    scale_2: Float[Tensor, "B N"]
+    mask: Bool[Tensor, "B N"]
 
     @staticmethod
     def of(
-        pixels_1: Tensor,
-        pixels_2: Tensor,
+        pixels_1: Float[Tensor, "B N 2"],
+        pixels_2: Float[Tensor, "B N 2"],
         camera_1: Camera,
         camera_2: Camera,
         threshold: float,
-        mask: Tensor,
-        weights: Tensor | None,
+        mask: Bool[Tensor, "B N"],
+        weights: Float[Tensor, "B N"] | None,
     ) -> TwoViews:
+        """Undistort pixels; the threshold of a match is `threshold / sqrt(weight)` pixels."""
         x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
         scale_1, scale_2 = (
             camera.pixel_scale(x).prod(-1).sqrt() / threshold
@@ -73,34 +78,34 @@ class TwoViews:
         views = TwoViews(x_1, x_2, scale_1, scale_2, mask)
         return views if weights is None else views.in_units(torch.where(mask, weights, 1.0).rsqrt())
 
-    def in_units(self, thresholds: Tensor) -> TwoViews:
-        """The matches with thresholds scaled by factors. (B, N) or (B, 1)."""
+    def in_units(self, thresholds: Float[Tensor, "B #N"]) -> TwoViews:
+        """The matches with thresholds scaled by factors."""
         return replace(self, scale_1=self.scale_1 / thresholds, scale_2=self.scale_2 / thresholds)
 
-    def select(self, rows: Tensor) -> TwoViews:
+    def select(self, rows: Int[Tensor, " R"]) -> TwoViews:
         """Some of the problems."""
         if len(rows) == len(self.mask):
             return self
         return TwoViews(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
-    def rows(self, rows: Tensor) -> TwoViews:
-        """Some of the matches of each problem. (B, n) row numbers."""
+    def rows(self, rows: Int[Tensor, "B n"]) -> TwoViews:
+        """Some of the matches of each problem, by row number."""
         x_1, x_2 = gather_rows(self.x_1, rows), gather_rows(self.x_2, rows)
         return TwoViews(x_1, x_2, *(x.gather(1, rows) for x in (self.scale_1, self.scale_2, self.mask)))
 
     @cached_property
-    def h_1(self) -> Tensor:
-        """(B, N, 3) homogeneous x_1."""
+    def h_1(self) -> Float[Tensor, "B N 3"]:
+        """Homogeneous x_1."""
         return torch.cat((self.x_1, torch.ones_like(self.x_1[..., :1])), dim=-1)
 
     @cached_property
-    def h_2(self) -> Tensor:
-        """(B, N, 3) homogeneous x_2."""
+    def h_2(self) -> Float[Tensor, "B N 3"]:
+        """Homogeneous x_2."""
         return torch.cat((self.x_2, torch.ones_like(self.x_2[..., :1])), dim=-1)
 
     @cached_property
-    def epipolar(self) -> tuple[Tensor, Tensor]:
-        """Terms in which the Sampson error is linear: (B, 9, N) for the constraint, (B, 18, N) for its variance.
+    def epipolar(self) -> tuple[Float[Tensor, "B 9 N"], Float[Tensor, "B 18 N"]]:
+        """Terms in which the Sampson error is linear, for the constraint and for its variance.
 
         The constraint is E times h_2 h_1^T; its variance (E E^T and E^T E without the last row and column) times
         h_1 h_1^T and h_2 h_2^T, over the squared scale of the other image.
@@ -112,14 +117,14 @@ class TwoViews:
         return constraint, torch.cat((outer_1, outer_2), dim=1).flatten(1, 2)
 
     @cached_property
-    def epipolar_float(self) -> tuple[Tensor, Tensor]:
+    def epipolar_float(self) -> tuple[Float[Tensor, "B 9 N"], Float[Tensor, "B 18 N"]]:
         """`epipolar` in float32, for scores."""
         constraint, variance = self.epipolar
         return constraint.float(), variance.float()
 
     @cached_property
-    def transfer_scale(self) -> Tensor:
-        """(B, N) thresholds per unit of a difference H(x_1) - x_2, which has the noise of both images.
+    def transfer_scale(self) -> Float[Tensor, "B N"]:
+        """Thresholds per unit of a difference H(x_1) - x_2, which has the noise of both images.
 
         Two-dimensional errors get a threshold of their own, see `TRANSFER_WIDTH`.
         """
@@ -138,27 +143,31 @@ _SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
 NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 
 
-def sampson_squared(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
-    """Squared Sampson errors in thresholds of poses. (B, K, 3, 3), (B, K, 3) -> (B, K, N)."""
+def sampson_squared(
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], t: Float[Tensor, "B K 3"]
+) -> Float[Tensor, "B K N"]:
+    """Squared Sampson errors in thresholds of poses."""
     E = essential_from_pose(R, t)
     constraint, variance = views.epipolar
     squared = (E.flatten(-2) @ constraint).square()
     return squared / (_variance_form(E) @ variance).clamp_min(torch.finfo(R.dtype).tiny)
 
 
-def _variance_form(E: Tensor) -> Tensor:
-    """The coefficients of the variance of the constraint. (..., 3, 3) -> (..., 18)."""
+def _variance_form(E: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 18"]:
+    """The coefficients of the variance of the constraint."""
     rows, columns = E[..., :2, :].mT @ E[..., :2, :], E[..., :2] @ E[..., :2].mT
     return torch.cat((rows, columns), dim=-2).flatten(-2)
 
 
 @lru_cache(maxsize=16)
-def _essential_tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+def _essential_tables(
+    dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "9 54"], Float[Tensor, "9 162"]]:
     """Two linear maps that make E, its derivatives and those of its variance matrix products.
 
-    (9, 54): from the frame of the direction (t, a, b, as rows) to the left factors of the derivatives of E = L R
-    by the rotation (three) and by turning the frame about its b and a, and to L itself; (9, 162): from E to the (9, 18)
-    matrix that takes dE to half the derivative of `_variance_form`.
+    The first goes from the frame of the direction (t, a, b, as rows) to the left factors of the derivatives of E = L R
+    by the rotation (three) and by turning the frame about its b and a, and to L itself; the second from E to the
+    (9, 18) matrix that takes dE to half the derivative of `_variance_form`.
     """
     axes = generators(dtype, device)
     units = torch.eye(9, dtype=dtype, device=device).unflatten(-1, (3, 3))
@@ -168,8 +177,8 @@ def _essential_tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor,
     return left.flatten(1), 0.5 * torch.stack([torch.stack(row) for row in bilinear]).flatten(1)
 
 
-def tangent_basis(t: Tensor) -> Tensor:
-    """Two unit vectors perpendicular to t and to each other. (..., 3) -> (..., 2, 3)."""
+def tangent_basis(t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+    """Two unit vectors perpendicular to t and to each other."""
     axis = torch.nn.functional.one_hot(t.abs().argmin(-1), 3).to(t.dtype)
     a = torch.linalg.cross(t, axis, dim=-1)
     a = a / a.norm(dim=-1, keepdim=True)
@@ -185,16 +194,13 @@ def _retract_essential(state: ModelState, step: Tensor) -> ModelState:
 
 def fit_essential(
     views: TwoViews,
-    R: Tensor,
-    t: Tensor,
+    R: Float[Tensor, "B K 3 3"],
+    t: Float[Tensor, "B K 3"],
     iterations: int,
-    scales: Tensor,
+    scales: Float[Tensor, " B"],
     kernel: Kernel = "truncated",
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Optimizes poses (B, K, 3, 3), (B, K, 3), |t| = 1; also returns their robust costs (B, K).
-
-    scales: (B,) of the kernel, in thresholds
-    """
+) -> tuple[Float[Tensor, "B K 3 3"], Float[Tensor, "B K 3"], Float[Tensor, "B K"]]:
+    """Optimize poses with |t| = 1; also return their robust costs. scales: of the kernel, in thresholds."""
 
     def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _fit_essential_part(iterations, kernel, *part)
@@ -207,13 +213,14 @@ def fit_essential(
 def _fit_essential_part(
     iterations: int,
     kernel: Kernel,
-    R: Tensor,
-    t: Tensor,
-    constraint: Tensor,
-    variance: Tensor,
-    mask: Tensor,
-    scales: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+    R: Float[Tensor, "B K 3 3"],
+    t: Float[Tensor, "B K 3"],
+    constraint: Float[Tensor, "B 9 N"],
+    variance: Float[Tensor, "B 18 N"],
+    mask: Bool[Tensor, "B N"],
+    scales: Float[Tensor, " B"],
+) -> tuple[Float[Tensor, "B K 3 3"], Float[Tensor, "B K 3"], Float[Tensor, "B K"]]:
+    """`fit_essential` of a few problems."""
     B, K = t.shape[:2]
     left_table, variance_table = _essential_tables(R.dtype, R.device)
     frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
@@ -241,14 +248,14 @@ def _fit_essential_part(
     return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
 
 
-def noise_variance(squared: Tensor, mask: Tensor) -> Tensor:
-    """(B,) variance of the noise, in squared thresholds, by the squared Sampson errors (B, N) of a pose."""
+def noise_variance(squared: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
+    """Variance of the noise, in squared thresholds, by the squared Sampson errors of a pose."""
     near = (squared < NOISE_WIDTH**2) & mask
     return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / 0.6745**2
 
 
-def score_essential(views: TwoViews, E: Tensor, soft: bool = False) -> Tensor:
-    """Scores of many essential matrices, in float32. (B, M, 3, 3) -> (B, M).
+def score_essential(views: TwoViews, E: Float[Tensor, "B K 3 3"], soft: bool = False) -> Float[Tensor, "B K"]:
+    """Scores of many essential matrices, in float32.
 
     soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of `truncated_score`
     """
@@ -292,8 +299,10 @@ def propose_essential(
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
 
 
-def _optimized(views: TwoViews, R: Tensor, t: Tensor, by_noise: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The best of candidates (B, K), the first of which scored best, locally optimized: R, t, cost (B,)."""
+def _optimized(
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], t: Float[Tensor, "B K 3"], by_noise: bool
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, " B"]]:
+    """The best of candidates, the first of which scored best, locally optimized: R, t, cost."""
     if not by_noise:
         R, t, cost = fit_essential(views, R, t, _ITERATIONS, t.new_ones(len(t)))
         (R, t), cost = best_of((R, t), cost)
@@ -312,14 +321,18 @@ def _optimized(views: TwoViews, R: Tensor, t: Tensor, by_noise: bool) -> tuple[T
     return R, t, cost[:, 0]
 
 
-def twisted(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The four poses of one essential matrix. (B, 3, 3), (B, 3) -> (B, 4, 3, 3), (B, 4, 3)."""
+def twisted(
+    R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]
+) -> tuple[Float[Tensor, "B 4 3 3"], Float[Tensor, "B 4 3"]]:
+    """The four poses of each essential matrix, from one of them."""
     turn = 2 * t[..., :, None] * t[..., None, :] - torch.eye(3, dtype=t.dtype, device=t.device)
     return torch.stack((R, R, turn @ R, turn @ R), dim=1), torch.stack((t, -t, t, -t), dim=1)
 
 
-def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Matches in front of both cameras, and their parallax in thresholds. Poses (B, K) -> (B, K, N) twice."""
+def ahead_and_parallax(
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], t: Float[Tensor, "B K 3"]
+) -> tuple[Bool[Tensor, "B K N"], Float[Tensor, "B K N"]]:
+    """Matches in front of both cameras of each pose, and their parallax in thresholds."""
     ray_1 = views.h_1[:, None] @ R.mT
     ray_2 = views.h_2[:, None].expand_as(ray_1)
     normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
@@ -330,8 +343,10 @@ def ahead_and_parallax(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, T
     return (depth_1 > 0) & (depth_2 > 0), parallax
 
 
-def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The pose of least cost among the four of each essential matrix (B, K), and that cost (B, K).
+def best_in_front(
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], t: Float[Tensor, "B K 3"]
+) -> tuple[Float[Tensor, "B K 3 3"], Float[Tensor, "B K 3"], Float[Tensor, "B K"]]:
+    """The pose of least cost among the four of each essential matrix, and that cost.
 
     The cost of a match is r^2 / (1 + r^2), by Geman and McClure. Matches behind a camera count as wrong, but where
     their parallax is within the threshold.
@@ -344,8 +359,10 @@ def best_in_front(views: TwoViews, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor
     return R.unflatten(-1, (3, 3)), t, views.mask.sum(-1, keepdim=True) - score
 
 
-def possible_matches(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
-    """(B, K, 4, N): by which of the `twisted` poses of (B, K) matches lie before both cameras, or too far to tell.
+def possible_matches(
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], t: Float[Tensor, "B K 3"]
+) -> Bool[Tensor, "B K 4 N"]:
+    """Matches that by each of the `twisted` poses lie in front of both cameras, or too far to tell.
 
     As `ahead_and_parallax`, but from the products of the rays r_1, r_2 and t alone, which the four poses share.
     """
@@ -364,25 +381,25 @@ def possible_matches(views: TwoViews, R: Tensor, t: Tensor) -> Tensor:
 _MAPPING_CANDIDATES = 2  # of all samples, that are worth a fit
 
 
-def transfer_squared(views: TwoViews, H: Tensor) -> Tensor:
-    """Squared transfer errors in thresholds of homographies or rotations. (B, K, 3, 3) -> (B, K, N)."""
+def transfer_squared(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B K N"]:
+    """Squared transfer errors in thresholds of homographies or rotations."""
     difference = transfer_errors(H, views.x_1[:, None], views.x_2[:, None])
     return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
 def fit_homography(
-    views: TwoViews, H: Tensor, iterations: int, width: float = 1.0
-) -> tuple[ModelState, Tensor]:
-    """Optimizes homographies (B, K, 3, 3) with H_33 = 1; also returns their truncated costs (B, K)."""
+    views: TwoViews, H: Float[Tensor, "B K 3 3"], iterations: int, width: float = 1.0
+) -> tuple[ModelState, Float[Tensor, "B K"]]:
+    """Optimize homographies with H_33 = 1; also return their truncated costs."""
     tangent = homography_tangent(H.dtype, H.device)
     H, cost = fit_projections(H, tangent, *_transfer(views), iterations, width)
     return (H,), cost
 
 
 def fit_rotation(
-    views: TwoViews, R: Tensor, iterations: int, width: float = 1.0
-) -> tuple[ModelState, Tensor]:
-    """Optimizes pure rotations (B, K, 3, 3); also returns their truncated costs (B, K)."""
+    views: TwoViews, R: Float[Tensor, "B K 3 3"], iterations: int, width: float = 1.0
+) -> tuple[ModelState, Float[Tensor, "B K"]]:
+    """Optimize pure rotations; also return their truncated costs."""
     tangent = rotation_tangent(R.dtype, R.device)
     R, cost = fit_projections(R, tangent, *_transfer(views), iterations, width)
     return (R,), cost
@@ -393,8 +410,8 @@ def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return views.h_1.mT, views.x_2, views.transfer_scale[..., None], views.mask
 
 
-def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
-    """Truncated scores of homographies or rotations, in float32. (B, M, 3, 3) -> (B, M)."""
+def score_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B K"]:
+    """Truncated scores of homographies or rotations, in float32."""
     h_1, x_2, scale, mask = _transfer(views)
 
     def score(*part: Tensor) -> tuple[Tensor]:
@@ -406,16 +423,16 @@ def score_mappings(views: TwoViews, H: Tensor) -> Tensor:
     return scores
 
 
-def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
-    """The best homographies (B, K, 3, 3) of `count` samples of four matches."""
+def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 3"]:
+    """The best homographies of `count` samples of four matches."""
     sample = sample_minimal(views.mask, 4, count, generator)
     H = homography_from_matches(gather_rows(views.x_1, sample), gather_rows(views.x_2, sample))
     best = score_mappings(views, H).topk(_MAPPING_CANDIDATES, dim=1).indices
     return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
 
 
-def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> Tensor:
-    """The best pure rotations (B, K, 3, 3) of `count` samples of two matches."""
+def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 3"]:
+    """The best pure rotations of `count` samples of two matches."""
     sample = sample_minimal(views.mask, 2, count, generator)
     R = rotation_from_matches(gather_rows(views.h_1, sample), gather_rows(views.h_2, sample))
     regular = torch.isfinite(R).all((-2, -1))[..., None, None]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -18,19 +19,19 @@ _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some tho
 
 @dataclass(frozen=True)
 class UndistortedKeypoints:
-    """Keypoints (N,) of one camera, undistorted once; coordinates come first in memory.
+    """Keypoints of one camera, undistorted once; coordinates come first in memory.
 
     Attributes:
-        xy: (2, N) undistorted image coordinates, x/z and y/z.
-        slope: (2, 2, N) d pixel / d xy there: slope[j, i] is that of pixel coordinate i in xy[j].
+        xy: undistorted image coordinates, x/z and y/z.
+        slope: d pixel / d xy there: slope[j, i] is that of pixel coordinate i in xy[j].
     """
 
-    xy: Tensor
-    slope: Tensor
+    xy: Float[Tensor, "2 N"]
+    slope: Float[Tensor, "2 2 N"]
 
     @classmethod
-    def of(cls, pixels: Tensor, camera: Camera) -> UndistortedKeypoints:
-        """Undistort pixels (N, 2) of one camera exactly."""
+    def of(cls, pixels: Float[Tensor, "N 2"], camera: Camera) -> UndistortedKeypoints:
+        """Undistort pixels of one camera exactly."""
         xy = camera.normalize(pixels)
         if camera.model == "pinhole":
             slope = torch.diag(camera.params[:2])[..., None].expand(2, 2, len(pixels))
@@ -39,18 +40,18 @@ class UndistortedKeypoints:
             slope = J[..., :2].permute(2, 1, 0)
         return cls(xy.mT.contiguous(), slope.contiguous())
 
-    def __getitem__(self, rows: Tensor) -> UndistortedKeypoints:
-        """Some of the keypoints, by index (n,)."""
+    def __getitem__(self, rows: Int[Tensor, " R"]) -> UndistortedKeypoints:
+        """Some of the keypoints, by index."""
         return UndistortedKeypoints(self.xy.index_select(1, rows), self.slope.index_select(2, rows))
 
     @property
-    def pixel_scale(self) -> Tensor:
-        """(N,) pixels per unit of xy, the mean over all directions."""
+    def pixel_scale(self) -> Float[Tensor, " N"]:
+        """Pixels per unit of xy, the mean over all directions."""
         (a, b), (c, d) = self.slope[0].unbind(0), self.slope[1].unbind(0)
         return torch.addcmul(a * d, b, c, value=-1).abs_().sqrt_()
 
-    def whitened(self, noise: KeypointNoise) -> Tensor:
-        """Slopes (2, 2, N) in units of the noise (N,) of the keypoints.
+    def whitened(self, noise: KeypointNoise) -> Float[Tensor, "2 2 N"]:
+        """Slopes in units of the noise of the keypoints.
 
         Times an error in xy they are, to first order, an error of covariance one. Noise whose inverse covariance is
         not definite gives zero.
@@ -70,8 +71,8 @@ class Undistortion:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
 
-    def __call__(self, pixels: Tensor) -> UndistortedKeypoints:
-        """Undistort pixels (N, 2)."""
+    def __call__(self, pixels: Float[Tensor, "N 2"]) -> UndistortedKeypoints:
+        """Undistort pixels."""
         if self.camera.model == "pinhole":
             return UndistortedKeypoints.of(pixels, self.camera)
         last = self._size - 1
@@ -86,26 +87,26 @@ class Undistortion:
         if self.camera.model != "pinhole":
             _ = self._table
 
-    def normalize(self, pixels: Tensor) -> Tensor:
-        """As `Camera.normalize`, from the table. (..., 2) -> (..., 2)."""
+    def normalize(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+        """As `Camera.normalize`, from the table."""
         if self.camera.model == "pinhole":
             return self.camera.normalize(pixels)
         return self(pixels.reshape(-1, 2)).xy.mT.reshape(pixels.shape)
 
     @cached_property
-    def _step(self) -> Tensor:
-        """() pixels from node to node, along x and y."""
+    def _step(self) -> Float[Tensor, ""]:
+        """Pixels from node to node, along x and y."""
         width, height = self.camera.size
         return self.camera.params.new_tensor(max(_LEAST_STEP, math.sqrt(width * height / _NODES)))
 
     @cached_property
-    def _size(self) -> Tensor:
-        """(2, 1) columns and rows of nodes."""
+    def _size(self) -> Float[Tensor, "2 1"]:
+        """Columns and rows of nodes."""
         return (self.camera.params.new_tensor(self.camera.size)[:, None] / self._step).ceil() + 1
 
     @cached_property
-    def _table(self) -> Tensor:
-        """(n, 10) of the nodes, row by row: xy, slope and its inverse, d xy / d pixel."""
+    def _table(self) -> Float[Tensor, "nodes 10"]:
+        """Of the nodes, row by row: xy, slope and its inverse, d xy / d pixel."""
         columns, rows = (torch.arange(int(count), device=self._step.device) for count in self._size)
         nodes = torch.cartesian_prod(rows, columns).flip(1) * self._step
         exact = UndistortedKeypoints.of(nodes, self.camera)
