@@ -78,12 +78,14 @@ GivenCamera = Camera | Calibration | FocalGuess | Preset | FromExif
 def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
     """Parse a `--camera` argument for images of `size` (width, height).
 
-    text:    `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w` (widths
-             of the image) or `f=500` (pixels), `fov=65` (horizontal, degrees), a preset such as `tum-fr1`, `exif`,
-             `auto` (nothing is known), or a file (`read_calibration`)
-    example: an image file, for `exif`
+    Args:
+        text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w`
+            (widths of the image) or `f=500` (pixels), `fov=65` (horizontal, degrees), a preset such as
+            `tum-fr1`, `exif`, `auto` (unknown), or a file (`read_calibration`)
+        example: an image file, for `exif`
 
-    Raises CalibrationError.
+    Raises:
+        CalibrationError: if the text or the file is invalid
     """
     return fit_camera(parse_calibration(text), size, "--camera", example)
 
@@ -114,7 +116,8 @@ def parse_calibration(text: str, source: str = "--camera") -> Calibration | Foca
 def fit_camera(camera: GivenCamera, size: Size, where: str, example: Path | None = None) -> Camera:
     """Return the camera for images of `size`. Raises CalibrationError at `where` for a camera of another size.
 
-    example: an image file of the sequence, for its EXIF block
+    Args:
+        example: an image file of the sequence, for its EXIF block
     """
     if isinstance(camera, FromExif) and example is not None:
         return read_focal(example).camera(size)

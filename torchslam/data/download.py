@@ -60,9 +60,11 @@ def download(
     A transfer that breaks off is taken up where it stopped, in this call or the next one; a sequence that is there
     already is not fetched again. The folder appears whole or not at all.
 
-    sha256: of the archive, as 64 hexadecimal digits; another archive is deleted
+    Args:
+        sha256: of the archive, as 64 hexadecimal digits; another archive is deleted
 
-    Raises DownloadError.
+    Raises:
+        DownloadError: if the archive cannot be fetched, verified or unpacked
     """
     if sha256 is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", sha256):
         raise DownloadError(f"a SHA-256 has 64 hexadecimal digits, this is `{sha256}`")

@@ -15,12 +15,26 @@ from torchslam.data.camera_argument import GivenCamera, parse_calibration
 from torchslam.data.download import unpack
 from torchslam.data.formats.frame_names import folder_kind, other_kind, subfolder
 from torchslam.data.formats.image_file import SUFFIXES
-from torchslam.data.readers.registry import READERS, bag, find_reader, live, video
-from torchslam.data.sequence import Sequence
-from torchslam.data.synthetic import sequence as synthetic
+from torchslam.data.readers import bag, video
+from torchslam.data.readers.bag import BAG
+from torchslam.data.readers.euroc import EUROC
+from torchslam.data.readers.image_sequence import FOLDER
+from torchslam.data.readers.kitti import KITTI, KITTI_RAW
+from torchslam.data.readers.live import LIVE, is_live
+from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
+from torchslam.data.readers.video import VIDEO
+from torchslam.data.sequence import Reader, Sequence
+from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
 from torchslam.data.transforms import Masked, cut, resize, thin
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.geometry.camera import Camera
+
+# The first match is used: readers of specific layouts precede those of plain images.
+READERS = (
+    *(SYNTHETIC, LIVE, VIDEO, BAG),
+    *(ICL_NUIM, TUM, KITTI, KITTI_RAW, EUROC, SEVEN_SCENES, TARTANAIR),
+    FOLDER,
+)
 
 
 def open_sequence(
@@ -72,7 +86,12 @@ def open_sequence(
 def full_name(path: str | Path) -> str:
     """Return a path that opens the sequence from any working directory."""
     path = str(path)
-    return path if synthetic.matches(path) or live.matches(path) else str(Path(path).absolute())
+    return path if is_synthetic(path) or is_live(path) else str(Path(path).absolute())
+
+
+def find_reader(path: str) -> Reader | None:
+    """Return the reader for a path; None if there is none."""
+    return next((reader for reader in READERS if reader.matches(path)), None)
 
 
 def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
@@ -144,7 +163,7 @@ def _why_no_folder(folder: Path) -> str:
     below = [entry for entry in inner if find_reader(str(entry))]
     files = [entry for entry in entries if entry.is_file() and find_reader(str(entry))]
     files += [entry for entry in entries if _is_archive(str(entry))]
-    looked = "; ".join(reader.LOOKS_FOR for reader in READERS[2:])
+    looked = "; ".join(reader.looks_for for reader in READERS[2:])
     if kinds:
         wrong = (
             f"there are no frames, only {' and '.join(f'{count} {kind}' for kind, count in kinds.items())}"

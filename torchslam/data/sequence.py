@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,9 @@ from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
+
+if TYPE_CHECKING:
+    from torchslam.data.camera_argument import GivenCamera
 
 GROUNDTRUTH_TOLERANCE = 0.02
 """Maximum time in seconds between an image and its ground-truth pose."""
@@ -321,3 +324,18 @@ class Transformed(Sequence):
 
     def _at(self, index: int) -> int:
         return index if self._indices is None else self._indices[index]
+
+
+class Reader(NamedTuple):
+    """A kind of sequence: how it is recognized and opened.
+
+    Attributes:
+        looks_for: the files by which it is recognized, for messages.
+        matches: whether a path is of this kind.
+        open: opens a path; the arguments are the path, the camera that overrides its own, and the frame rate for kinds
+            without timestamps. Raises SequenceError, CalibrationError or TrajectoryError, naming file and line.
+    """
+
+    looks_for: str
+    matches: Callable[[str], bool]
+    open: Callable[[str, GivenCamera | None, float | None], Sequence]

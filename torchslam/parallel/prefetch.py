@@ -42,9 +42,10 @@ class FeaturePrefetcher:
     The workers run while this is entered. Frames are read in this process until a worker has started, and after one
     was killed.
 
-    camera:    whose size frames must have
-    clock:     records as "features" how long features were waited for
-    processes: number of workers
+    Args:
+        camera: frames must have its size
+        clock: records the time spent waiting for features as "features"
+        processes: number of workers
     """
 
     def __init__(
@@ -100,8 +101,9 @@ class LivePrefetcher(WithWorker):
 
     The worker runs while this is entered. Frames whose features it did not extract come without.
 
-    camera: whose size frames must have
-    clock:  records as "features" how long features were waited for
+    Args:
+        camera: frames must have its size
+        clock: records the time spent waiting for features as "features"
     """
 
     def __init__(self, sequence: Sequence, camera: Camera, config: Config, clock: Stopwatch) -> None:

@@ -39,7 +39,8 @@ def starts_at_once() -> bool:
 class Worker:
     """A process that does `work` at the other end of a pipe, once it is READY and was sent its task.
 
-    work: (connection, *task) -> None, until the pipe is closed
+    Args:
+        work: (connection, *task) -> None, which returns when the pipe is closed
     """
 
     def __init__(self, work: Callable[..., None]) -> None:
@@ -164,7 +165,8 @@ def send_result(connection: Connection, answer: object) -> None:
 def try_call(what: str, answer: Callable[..., object], *question: object) -> Any:
     """Call a function in inference mode, and return its result or its exception, for `unwrap` to raise.
 
-    what: the process does, added as a note to exceptions that are not torchslam's own
+    Args:
+        what: description of the task, added as a note to exceptions from outside of torchslam
     """
     try:
         with torch.inference_mode():
@@ -186,7 +188,8 @@ def unwrap(answer: Any) -> Any:
 def _without_interrupts(is_copied: bool) -> Iterator[None]:
     """Start processes that ignore Ctrl-C, which this process handles; no signal is lost.
 
-    is_copied: SIGTERM has to wait as well, until a copy no longer has this process's handler for it
+    Args:
+        is_copied: the process is a fork: block SIGTERM too, until the copy has removed the inherited handler
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -45,8 +45,10 @@ def best_number(sequence: Sequence, start: int) -> int:
 def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
     """The frames of a sequence from `start` on, for a run that uses workers while this is entered.
 
-    processes: their number, this one included; None: the best one. With 2 there is a prefetch worker, or a bundle
-               worker if frames cannot be prefetched; with more one bundle worker, and the others prefetch.
+    Args:
+        processes: number of processes, this one included; None: chosen automatically. With 2 there is a
+            prefetch worker, or a bundle worker if frames cannot be prefetched; with more there is one bundle
+            worker, and the others prefetch
     """
     wanted = best_number(sequence, start) if processes is None else processes
     slam.warm_up()

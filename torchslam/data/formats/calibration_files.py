@@ -77,7 +77,11 @@ def checked(
 ) -> Calibration:
     """A calibration with a distortion model by one of its many names.
 
-    intrinsics: fx fy cx cy. Raises CalibrationError for models and coefficients that torchslam does not have.
+    Args:
+        intrinsics: fx fy cx cy.
+
+    Raises:
+        CalibrationError: for models and coefficients that torchslam does not have.
     """
     name = distortion.lower()
     if name in FISHEYES:

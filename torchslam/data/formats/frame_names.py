@@ -38,8 +38,9 @@ OTHER_KINDS = {
 class Found:
     """The images of a folder.
 
-    frames:   in natural order of their names
-    left_out: how many of each other kind there are
+    Attributes:
+        frames: in natural order of their names
+        left_out: number of files left out, by kind
     """
 
     frames: list[Path]

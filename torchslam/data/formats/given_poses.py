@@ -45,12 +45,13 @@ _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 class GivenPoses:
     """N poses, each of an image known by its time or by its name.
 
-    kind:        "tum", "colmap" or "nerfstudio"
-    path:        the file, of COLMAP the folder
-    T_cw:        (N, 4, 4) world to camera, camera axes x right, y down, z forward
-    timestamps:  (N,) seconds, where images are known by their times
-    names:       N names of image files, where they are known by these
-    calibration: of the images, if known
+    Attributes:
+        kind: "tum", "colmap" or "nerfstudio"
+        path: the file, or the folder of a COLMAP model
+        T_cw: (N, 4, 4) world to camera, camera axes x right, y down, z forward
+        timestamps: (N,) seconds, if the file identifies images by times
+        names: N names of image files, if the file identifies images by names
+        calibration: of the images, if known
     """
 
     kind: str

@@ -34,9 +34,11 @@ MAX_PIXELS = 1 << 26
 def read_gray(path: str | Path, where: str, bits: int = 8) -> Tensor:
     """An image file as (1, 1, H, W) float32 gray in [0, 1].
 
-    bits: how many carry something in files of 16 bits (`bit_depth`)
+    Args:
+        bits: number of significant bits in files of 16 bits (`bit_depth`)
 
-    Raises FrameError at `where` for a file that is missing, truncated, too large or not an image.
+    Raises:
+        FrameError: at `where` for a file that is missing, truncated, too large or not an image.
     """
     return gray_to_tensor(read_pixels(path, where), bits)
 
@@ -163,9 +165,11 @@ CHANNELS = {
 def image_tensor(image: np.ndarray, channels: str = "rgb") -> Tensor:
     """An array (H, W) or (H, W, C), uint8, or floats in [0, 1] -> (1, 1, H, W) float32 gray in [0, 1].
 
-    channels: the order of the C channels, one of CHANNELS; an image with a single one is gray whatever is said
+    Args:
+        channels: order of the C channels, one of CHANNELS; ignored for an image with one channel
 
-    Raises FrameError for another shape or type, and for floats that are not in [0, 1].
+    Raises:
+        FrameError: for another shape or type, and for floats that are not in [0, 1].
     """
     array = np.asarray(image)
     if channels not in CHANNELS:

@@ -21,7 +21,8 @@ MAX_LINE = 1 << 16
 def read_text(path: str | Path, error: type[TorchslamError], limit: int | None = None) -> str:
     """Read a text file. Raises `error` if it is missing, not text or too large.
 
-    limit: bytes; None: MAX_BYTES
+    Args:
+        limit: bytes; None: MAX_BYTES
     """
     try:
         return files.read_text(path, MAX_BYTES if limit is None else limit, "a text that is read")

@@ -1,1 +1,1 @@
-"""One module per kind of sequence: it recognizes its layout and opens it."""
+"""Kinds of sequences: each `Reader` recognizes its layout and opens it."""

@@ -22,7 +22,7 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.calibration_files import checked
 from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
-LOOKS_FOR = "a ROS bag (.bag, .mcap, or a folder with metadata.yaml)"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
@@ -66,7 +65,8 @@ COLORS = {
 class Topic:
     """An image topic and its recorded calibration.
 
-    times: seconds since 1970, by the images' own stamps, or by when they were recorded where they have none
+    Attributes:
+        times: seconds since 1970: the stamps of the images, or the times of recording for images without one
     """
 
     connection: Connection
@@ -182,13 +182,13 @@ def to_gray(message: Any, where: str) -> np.ndarray:
     return cv2.cvtColor(image, COLORS[encoding][1])
 
 
-def matches(path: str) -> bool:
+def _is_bag(path: str) -> bool:
     """True for a bag file or the folder of a ROS 2 recording."""
     source = Path(path.partition("?topic=")[0])
     return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
+def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
     """Open the images of a recording; without `camera`, its camera_info is used.
 
     Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
@@ -262,9 +262,10 @@ def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
 
 
 def from_camera_info(message: Any, source: str, rectified: bool) -> Calibration | None:
-    """The calibration in a sensor_msgs/CameraInfo; None where it is all zero, as drivers without one send it.
+    """The calibration in a sensor_msgs/CameraInfo; None if it is all zero, as drivers without a calibration send it.
 
-    rectified: whether the images are, so that the projection P holds and no distortion
+    Args:
+        rectified: the images are rectified, so the projection P applies, without distortion
     """
     # ROS 1 has upper-case names.
     K, D, P = (getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDP")
@@ -288,3 +289,6 @@ def _errors(where: str) -> Iterator[None]:
         raise SequenceError(f"{where}: the recording ends before it") from None
     except Exception as cause:  # rosbags and the decompressors below it have no common error
         raise SequenceError(f"{where}: cannot be read: {type(cause).__name__}: {cause}") from cause
+
+
+BAG = Reader("a ROS bag (.bag, .mcap, or a folder with metadata.yaml)", _is_bag, _open_bag)

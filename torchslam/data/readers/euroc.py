@@ -15,22 +15,22 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.sequence import Reader
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
-LOOKS_FOR = "mav0/cam0/data.csv (EuRoC)"
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
-def matches(path: str) -> bool:
+def _is_euroc(path: str) -> bool:
     """Whether the folder, or its `mav0`, has a camera in this layout."""
     return (_root(Path(path)) / "cam0" / "data.csv").is_file()
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a EuRoC recording; `camera` overrides `sensor.yaml`.
 
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
@@ -116,3 +116,6 @@ def _bracketed(text: str, where: str, key: str, count: int) -> list[float]:
     if len(numbers) != count:
         raise CalibrationError(f"{where}: expected `{key}: [{count} numbers]`, got {len(numbers)}")
     return numbers
+
+
+EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)

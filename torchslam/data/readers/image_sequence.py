@@ -1,4 +1,4 @@
-"""Sequence of image files, used by the readers of datasets and plain folders."""
+"""Sequences of image files: plain folders of images and patterns, and the base of the readers of datasets."""
 
 from __future__ import annotations
 
@@ -14,14 +14,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.data.calibration import size_text
+from torchslam.data.calibration import Calibration, size_text
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.formats.frame_names import (
+    FOLDERS,
+    Found,
+    find_frames,
+    folder_kind,
+    is_pattern,
+    match_pattern,
+    subfolder,
+)
 from torchslam.data.formats.image_file import bit_depth, read_color, read_gray, read_pixels
 from torchslam.data.formats.text_file import check_later
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 
+DEFAULT_RATE = 30.0
+"""Frame rate of images without timestamps."""
+CALIBRATION_FILES = ("calibration.txt", "calib.txt")
 SAMPLES = 20
 """Number of images in which the brightest pixel of a 16-bit sequence is searched."""
 ATTEMPTS = 20
@@ -32,9 +45,10 @@ ATTEMPTS = 20
 class ImageEntry:
     """One image of a list.
 
-    timestamp: seconds
-    path:      of the image file
-    where:     the list's file and line that name it, or the image itself, for messages
+    Attributes:
+        timestamp: seconds
+        path: of the image file
+        where: the list's file and line that name it, or the image itself, for messages
     """
 
     timestamp: float
@@ -122,3 +136,49 @@ def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
         with contextlib.suppress(FrameError):  # said when the frame is read
             bits = max(bits, bit_depth([read_pixels(entry.path, entry.where)]))
     return Counter(sizes).most_common(1)[0][0], bits
+
+
+def find_calibration(path: Path) -> Calibration | None:
+    """The calibration file of a folder, if it has one."""
+    for name in CALIBRATION_FILES:
+        if (path / name).is_file():
+            return read_calibration(path / name)
+    return None
+
+
+def _is_folder(path: str) -> bool:
+    """Whether there are frames, in a folder or one of `FOLDERS` in it, or for a pattern such as `left-*.png`."""
+    if is_pattern(path):
+        return bool(match_pattern(path).frames)
+    folder = Path(path)
+    if not folder.is_dir() or folder_kind(folder):
+        return False
+    return bool(subfolder(folder) or find_frames(folder).frames)
+
+
+def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """Images in natural order (`9.png` before `10.png`), `rate` a second.
+
+    `camera` overrides a calibration.txt with them or above them. Raises SequenceError or CalibrationError.
+    """
+    base = Path(path).parent if is_pattern(path) else Path(path)
+    found, folder = _find(path, base)
+    camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, found.notes)
+
+
+def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
+    """Build entries for frames without timestamps, `rate` per second."""
+    return [ImageEntry(index / rate, image, str(image)) for index, image in enumerate(frames)]
+
+
+def _find(path: str, base: Path) -> tuple[Found, Path]:
+    if is_pattern(path):
+        return match_pattern(path), base
+    found = find_frames(base)
+    inner = None if found.frames else subfolder(base)
+    return (found, base) if inner is None else (find_frames(inner), inner)
+
+
+FOLDER = Reader(f"images, or a folder {'/, '.join(FOLDERS)}/ with images", _is_folder, _open_folder)

@@ -1,10 +1,15 @@
-"""Folders of the KITTI odometry benchmark: `image_0/`, `times.txt`, `calib.txt`, poses next to the sequences.
+"""Folders of KITTI: sequences of the odometry benchmark, and drives of the raw data.
 
-Source: the development kit of https://www.cvlibs.net/datasets/kitti/eval_odometry.php
+Sources: the development kit of https://www.cvlibs.net/datasets/kitti/eval_odometry.php;
+https://www.cvlibs.net/datasets/kitti/raw_data.php and dataformat.txt of its development kit; A. Geiger et al.,
+Vision meets Robotics: The KITTI Dataset, IJRR 2013 (coordinate systems, Mercator projection).
 """
 
 from __future__ import annotations
 
+import datetime
+import math
+import re
 from pathlib import Path
 
 import torch
@@ -13,23 +18,28 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.text_file import numbered_lines, parse_floats
+from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
+from torchslam.data.sequence import Reader
 from torchslam.data.trajectories import checked_poses
-from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
+from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
+from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
 
-LOOKS_FOR = "image_0/ or image_2/ with times.txt (KITTI odometry)"
 CAMERAS = ("image_0", "image_2")
+RAW_CAMERAS = ("image_00", "image_02")
 """The left cameras, gray and color."""
+CALIBRATION = "calib_cam_to_cam.txt"
+EARTH_RADIUS = 6378137.0  # meters
+TIME = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?")
 
 
-def matches(path: str) -> bool:
+def _is_kitti(path: str) -> bool:
     """True for a sequence of the odometry benchmark."""
     return (Path(path) / "times.txt").is_file() and any((Path(path) / name).is_dir() for name in CAMERAS)
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A KITTI odometry sequence, left gray images before left color ones; `camera` overrides `calib.txt`.
 
     Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` next to `sequences/NN`.
@@ -37,7 +47,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
     """
     base = Path(path)
     folder = next(base / name for name in CAMERAS if (base / name).is_dir())
-    times = _read_rows(base / "times.txt", 1, SequenceError)[:, 0]
+    times = _read_table(base / "times.txt", 1, SequenceError)[:, 0]
     found = find_frames(folder)
     images = found.frames
     if len(images) != len(times):
@@ -51,7 +61,7 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequ
     offset_x = 0.0
     if camera is None:
         camera, offset_x = _read_projection(base / "calib.txt", f"P{folder.name[-1]}")
-    groundtruth = _read_poses(base, times, offset_x)
+    groundtruth = _read_odometry_poses(base, times, offset_x)
     kind = f"KITTI odometry, {folder.name}"
     return ImageSequence(base.name, kind, entries, camera, groundtruth, found.notes)
 
@@ -70,14 +80,14 @@ def _read_projection(path: Path, label: str) -> tuple[Calibration, float]:
     raise CalibrationError(f"{path}: no line `{label}: ...`")
 
 
-def _read_poses(path: Path, times: Tensor, offset_x: float) -> Trajectory | None:
+def _read_odometry_poses(path: Path, times: Tensor, offset_x: float) -> Trajectory | None:
     """The poses of camera 0, shifted to the camera that took the images."""
     resolved = path.resolve()
     candidates = (path / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
         return None
-    rows = _read_rows(found, 12, TrajectoryError)
+    rows = _read_table(found, 12, TrajectoryError)
     if len(rows) != len(times):
         raise TrajectoryError(f"{found}: {len(rows)} poses for {len(times)} times")
     T_w0 = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
@@ -87,7 +97,7 @@ def _read_poses(path: Path, times: Tensor, offset_x: float) -> Trajectory | None
     return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
 
-def _read_rows(path: Path, columns: int, error: type[SequenceError] | type[TrajectoryError]) -> Tensor:
+def _read_table(path: Path, columns: int, error: type[SequenceError] | type[TrajectoryError]) -> Tensor:
     """(N, columns) numbers, one row a line."""
     rows = []
     for number, line in numbered_lines(path, error):
@@ -98,3 +108,151 @@ def _read_rows(path: Path, columns: int, error: type[SequenceError] | type[Traje
     if not rows:
         raise error(f"{path}: is empty")
     return torch.tensor(rows, dtype=torch.float64)
+
+
+def _is_kitti_raw(path: str) -> bool:
+    """Whether the folder is a drive (`2011_09_26_drive_0001_sync`)."""
+    return _raw_camera(Path(path)) is not None
+
+
+def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """The left camera of a drive, gray before color; times are seconds since the day began, UTC.
+
+    The calibration is read from the drive or the folder of its day: the rectified one, or for a drive `..._extract`
+    that of the raw images. The ground truth is that of `oxts/`, if both calib_velo_to_cam.txt and calib_imu_to_velo.txt
+    exist.
+    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
+    """
+    drive = Path(path)
+    folder = _raw_camera(drive) or drive / RAW_CAMERAS[0]
+    times = _read_times(folder / "timestamps.txt", SequenceError)
+    found = find_frames(folder / "data")
+    entries = []
+    for file in found.frames:
+        number = int(file.stem) if file.stem.isdecimal() else -1
+        if not 0 <= number < len(times):
+            raise SequenceError(f"{file}: timestamps.txt has no line for it among its {len(times)}")
+        entries.append(ImageEntry(times[number], file, f"{folder / 'timestamps.txt'}:{number + 1}"))
+    calibration = _find_file(drive, CALIBRATION)
+    if camera is None and calibration is not None:
+        camera = _read_raw_camera(calibration, folder.name[-2:], drive.resolve().name.endswith("_extract"))
+    truth = _read_truth(drive, folder.name[-2:], calibration)
+    return ImageSequence(drive.name, f"KITTI raw, {folder.name}", entries, camera, truth, found.notes)
+
+
+def _raw_camera(drive: Path) -> Path | None:
+    for name in RAW_CAMERAS:
+        if (drive / name / "data").is_dir() and (drive / name / "timestamps.txt").is_file():
+            return drive / name
+    return None
+
+
+def _find_file(drive: Path, name: str) -> Path | None:
+    """Return a file of the drive or of its recording day."""
+    return next((path for path in (drive / name, drive.resolve().parent / name) if path.is_file()), None)
+
+
+def _read_times(path: Path, error: type[TorchslamError]) -> list[float]:
+    """Lines `2011-09-26 13:02:25.964389445`, as seconds since the beginning of the first one's day."""
+    times: list[float] = []
+    midnight: datetime.datetime | None = None
+    for number, line in numbered_lines(path, error):
+        found = TIME.fullmatch(line)
+        try:
+            moment = datetime.datetime.fromisoformat(found[1]) if found else None
+        except ValueError:
+            moment = None
+        if found is None or moment is None:
+            raise error(f"{path}:{number}: expected `2011-09-26 13:02:25.964389445`, got `{line}`")
+        midnight = midnight or moment.replace(hour=0, minute=0, second=0)
+        times.append((moment - midnight).total_seconds() + float(found[2] or 0))
+    return times
+
+
+def _read_rows(path: Path) -> dict[str, list[float]]:
+    """Lines `name: numbers`; those of dates are left out."""
+    rows: dict[str, list[float]] = {}
+    for number, line in numbered_lines(path, CalibrationError):
+        name, _, numbers = line.partition(":")
+        if name not in ("calib_time", "corner_dist"):
+            rows[name] = parse_floats(numbers, f"{path}:{number}", CalibrationError)
+    return rows
+
+
+def _row(rows: dict[str, list[float]], name: str, count: int, path: Path) -> list[float]:
+    if len(rows.get(name, [])) != count:
+        raise CalibrationError(f"{path}: expected a line `{name}:` of {count} numbers")
+    return rows[name]
+
+
+def _read_raw_camera(path: Path, number: str, as_taken: bool) -> Calibration:
+    rows = _read_rows(path)
+    if as_taken:
+        K, D = _row(rows, f"K_{number}", 9, path), _row(rows, f"D_{number}", 5, path)
+        return Calibration.from_numbers([K[0], K[4], K[2], K[5], *D], str(path))
+    P = _row(rows, f"P_rect_{number}", 12, path)
+    return Calibration.from_numbers([P[0], P[5], P[2], P[6]], str(path))
+
+
+def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajectory | None:
+    """The camera's poses from those of the GPS/INS; None where a file for it is missing."""
+    velo_to_cam, imu_to_velo = (
+        _find_file(drive, "calib_velo_to_cam.txt"),
+        _find_file(drive, "calib_imu_to_velo.txt"),
+    )
+    packets = drive / "oxts" / "data"
+    if calibration is None or velo_to_cam is None or imu_to_velo is None or not packets.is_dir():
+        return None
+    rows = _read_rows(calibration)
+    P = _row(rows, f"P_rect_{number}", 12, calibration)
+    T_rect = torch.eye(4, dtype=torch.float64)
+    T_rect[:3, :3] = torch.tensor(_row(rows, "R_rect_00", 9, calibration), dtype=torch.float64).view(3, 3)
+    T_rect[0, 3] = P[3] / P[0]  # meters from camera 0 to this one
+    T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
+    times = _read_times(drive / "oxts" / "timestamps.txt", TrajectoryError)
+    T_wi, kept = _read_packets(packets, times)
+    T_wc = checked_poses(T_wi @ se3_inverse(T_ci), packets)
+    return Trajectory(torch.tensor(kept, dtype=torch.float64), T_wc)
+
+
+def _read_rigid(path: Path) -> Tensor:
+    rows = _read_rows(path)
+    R, t = (
+        torch.tensor(_row(rows, name, count, path), dtype=torch.float64)
+        for name, count in (("R", 9), ("T", 3))
+    )
+    return rigid(R.view(3, 3), t)
+
+
+def _read_packets(folder: Path, times: list[float]) -> tuple[Tensor, list[float]]:
+    """(N, 4, 4) T_wi of the GPS/INS and their times: east, north, up, by a Mercator projection, from the first one."""
+    rows: list[list[float]] = []
+    kept: list[float] = []
+    for file in sorted(folder.glob("*.txt")):
+        line = next((line for _, line in numbered_lines(file, TrajectoryError)), "")
+        row = parse_floats(line, str(file), TrajectoryError)
+        index = int(file.stem) if file.stem.isdecimal() else len(times)
+        if len(row) < 6 or index >= len(times) or not abs(row[0]) < 90:
+            raise TrajectoryError(
+                f"{file}: expected a line of latitude, longitude, altitude, roll, pitch, yaw, ..."
+            )
+        if kept:
+            check_later(times[index], kept[-1], str(file), TrajectoryError)
+        rows.append(row[:6])
+        kept.append(times[index])
+    if not rows:
+        raise TrajectoryError(f"{folder}: no packets")
+    table = torch.tensor(rows, dtype=torch.float64)
+    latitude, longitude = table[:, 0].deg2rad(), table[:, 1].deg2rad()
+    scale = EARTH_RADIUS * math.cos(latitude[0])
+    north = scale * (math.pi / 4 + latitude / 2).tan().log()
+    positions = torch.stack((scale * longitude, north, table[:, 2]), dim=-1)
+    roll, pitch, yaw = (
+        so3_exp(angle[:, None] * axis)
+        for angle, axis in zip(table[:, 3:].unbind(-1), torch.eye(3, dtype=torch.float64), strict=True)
+    )
+    return rigid(yaw @ pitch @ roll, positions - positions[0]), kept
+
+
+KITTI = Reader("image_0/ or image_2/ with times.txt (KITTI odometry)", _is_kitti, _open_kitti)
+KITTI_RAW = Reader("image_00/data/ with timestamps.txt (KITTI raw)", _is_kitti_raw, _open_kitti_raw)

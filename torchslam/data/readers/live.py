@@ -18,10 +18,9 @@ from torch import Tensor
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES
-from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 
-LOOKS_FOR = "a camera's number, or an rtsp:// or http:// address"
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
 """Seconds without a frame after which a stream has ended."""
@@ -223,7 +222,7 @@ class CaptureClock:
         return self._last
 
 
-def matches(path: str) -> bool:
+def is_live(path: str) -> bool:
     """Whether this is an address, or the number of a camera and no file."""
     if ADDRESS.fullmatch(path):
         return (
@@ -232,7 +231,7 @@ def matches(path: str) -> bool:
     return re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
+def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
     shown = re.sub(r"//[^/@]*@", "//", path)  # without a password
@@ -240,3 +239,6 @@ def open(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSeque
     if not capture.isOpened():
         raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
     return LiveSequence(f"camera {path}" if number else shown, capture, camera)
+
+
+LIVE = Reader("a camera's number, or an rtsp:// or http:// address", is_live, _open_live)

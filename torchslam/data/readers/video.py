@@ -19,14 +19,13 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
-LOOKS_FOR = f"a video ({', '.join(sorted(SUFFIXES))})"
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_BYTES = 1 << 40
 MAX_FRAMES = 2_000_000
@@ -130,12 +129,12 @@ class VideoSequence(Sequence):
         return image if decoded else None
 
 
-def matches(path: str) -> bool:
+def _is_video(path: str) -> bool:
     """True for a file with a video suffix."""
     return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequence:
+def _open_video(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequence:
     """A video file; its times are its own. Raises SequenceError or CalibrationError."""
     return VideoSequence(Path(path), camera)
 
@@ -182,7 +181,9 @@ def _boxes(
 ) -> Iterator[tuple[bytes, int, int]]:
     """Name, and where the content begins and ends, of every box; those in containers too.
 
-    left: how many more; depth: how many containers in each other
+    Args:
+        left: one counter: number of boxes that may still be read
+        depth: maximum depth of nesting
     """
     while start + HEADER <= end and left[0] > 0:
         left[0] -= 1
@@ -215,3 +216,6 @@ def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
         samples += sum(run for run, _ in struct.iter_unpack(">II", some[: len(some) // 8 * 8]))
         runs -= RUNS_AT_ONCE
     return samples
+
+
+VIDEO = Reader(f"a video ({', '.join(sorted(SUFFIXES))})", _is_video, _open_video)

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from torchslam.data.synthetic.sequence import SyntheticSequence, open_synthetic
+from torchslam.data.synthetic.sequence import SyntheticSequence, is_synthetic, open_synthetic
 
-__all__ = ["SyntheticSequence", "open_synthetic"]
+__all__ = ["SyntheticSequence", "is_synthetic", "open_synthetic"]

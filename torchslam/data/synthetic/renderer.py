@@ -119,7 +119,9 @@ class Renderer:
     def _sample(self, tile: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Bilinear lookup of the atlas, (H, W) float32.
 
-        tile: (H, W) row of `_tiles`; u, v: (H, W) texels of level 0 from the texture's corner.
+        Args:
+            tile: (H, W) row of `_tiles`
+            u, v: (H, W) texels of level 0 from the texture's corner
         """
         shrink, x, y = (column[tile] for column in self._tiles)
         return cv2.remap(self._atlas, u * shrink + x, v * shrink + y, cv2.INTER_LINEAR).astype(np.float32)

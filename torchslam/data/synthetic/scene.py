@@ -28,9 +28,14 @@ def surface(
 ) -> np.ndarray:
     """A painted surface: shapes of every size from a third of it down to two centimeters, over smooth noise.
 
-    size: (width, height) meters; texel: meters, at most; multiple: of which rows and columns are to be
-    coverage: the part of the surface that the largest shapes cover
-    Returns (rows, columns) uint8.
+    Args:
+        size: (width, height) meters
+        texel: maximum size, meters
+        multiple: divides the numbers of rows and columns
+        coverage: fraction of the surface that the largest shapes cover
+
+    Returns:
+        (rows, columns) uint8.
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
     image = _noise(rng, rows, columns, texel)
@@ -118,10 +123,11 @@ MIP_LEVELS = 6
 class Rectangle:
     """A textured rectangle in the world, meters.
 
-    origin: (3,) the corner where the texture starts
-    axis_u, axis_v: (3,) unit vectors along the texture's columns and rows
-    size:   (along u, along v)
-    texture: (rows, columns) uint8
+    Attributes:
+        origin: (3,) the corner where the texture starts
+        axis_u, axis_v: (3,) unit vectors along the texture's columns and rows
+        size: (along u, along v)
+        texture: (rows, columns) uint8
     """
 
     origin: np.ndarray
@@ -135,9 +141,10 @@ class Rectangle:
 class Painter:
     """Builds rectangles with individual textures, lit from above and slightly from the front.
 
-    rng:   of the textures
-    texel: meters, at most
-    coverage: the part of a surface that the largest shapes cover
+    Attributes:
+        rng: source of the textures
+        texel: maximum size, meters
+        coverage: fraction of a surface that the largest shapes cover
     """
 
     rng: np.random.Generator

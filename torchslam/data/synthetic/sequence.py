@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.sequence import Calibrated, Sequence
+from torchslam.data.sequence import Calibrated, Reader, Sequence
 from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.building import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
@@ -25,7 +25,6 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Trajectory
 
-LOOKS_FOR = "synthetic:room"
 FRAME_RATE = 20.0
 SIZE = (640, 480)
 FOCAL = 500.0
@@ -35,10 +34,11 @@ FOCAL = 500.0
 class Scene:
     """What is seen and how the camera moves.
 
-    build:            rectangles from a seed
-    path:             T_wc from the phase of each frame
-    frames_per_round: frames in a phase of 2 pi
-    frames:           default number of frames
+    Attributes:
+        build: rectangles from a seed
+        path: T_wc from the phase of each frame
+        frames_per_round: frames in a phase of 2 pi
+        frames: default number of frames
     """
 
     build: Callable[[int], list[Rectangle]]
@@ -63,14 +63,15 @@ SCENES = {
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What follows the `?` of a synthetic sequence's name.
+    """Options after the `?` in the name of a synthetic sequence.
 
-    frames:   how many; a path goes on round after round, with another sway. Without it, the scene's own number
-    seed:     of textures and noise
-    noise:    standard deviation, gray levels of 255
-    blur:     standard deviation of a Gaussian, pixels
-    exposure: amplitude of a slow change of brightness, 0 to 1
-    blank:    1 for gray images instead of rendered ones, where only the poses matter
+    Attributes:
+        frames: number of frames; None: that of the scene. A longer path repeats with another sway
+        seed: of textures and noise
+        noise: standard deviation, gray levels of 255
+        blur: standard deviation of a Gaussian, pixels
+        exposure: amplitude of a slow change of brightness, 0 to 1
+        blank: 1: gray images instead of rendered ones, if only the poses are used
     """
 
     frames: int
@@ -112,12 +113,12 @@ class SyntheticSequence(Sequence):
         return f"synthetic:{self.name}#{index}"
 
 
-def matches(path: str) -> bool:
+def is_synthetic(path: str) -> bool:
     """Whether this is the name of a rendered sequence."""
     return path.startswith("synthetic:")
 
 
-def open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
+def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
     """A rendered sequence, with its own camera or a guess, as if that were not known.
 
     Raises SequenceError, and CalibrationError for a camera that claims to be right.
@@ -157,3 +158,6 @@ def _renderer(build: Callable[[int], list[Rectangle]], seed: int) -> Renderer:
     """Textures take seconds to make, so that the last scenes are kept."""
     K = np.array(((FOCAL, 0, (SIZE[0] - 1) / 2), (0, FOCAL, (SIZE[1] - 1) / 2), (0, 0, 1)))
     return Renderer(build(seed), K, SIZE)
+
+
+SYNTHETIC = Reader("synthetic:room", is_synthetic, _open)

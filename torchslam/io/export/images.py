@@ -85,7 +85,8 @@ WITHOUT = "use --sequence for its new location, or --no-images"
 class Images:
     """Color images by frame, optionally undistorted.
 
-    rows: which frame of the sequence each frame of the run is
+    Args:
+        rows: index in the sequence of each frame of the run
     """
 
     def __init__(

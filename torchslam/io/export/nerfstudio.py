@@ -41,7 +41,8 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
 def write_nerfstudio(folder: Path, scene: Scene, R_up: Tensor) -> None:
     """Write transforms.json and the point cloud into a folder that is made if need be.
 
-    R_up: (3, 3) from the map's world to the upright one, see `conventions.upright_rotation`
+    Args:
+        R_up: (3, 3) from the map's world to the upright one, see `geometry.transforms.upright_rotation`
     """
     folder.mkdir(parents=True, exist_ok=True)
     upright = scene.turned(R_up)

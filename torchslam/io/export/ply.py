@@ -52,10 +52,12 @@ def write_ply(
 ) -> None:
     """Write points and camera centers as one cloud.
 
-    points_w:         (L, 3); colors: (L, 3) uint8 red, green, blue
-    centers_w:        (K, 3) camera centers, red, with 0 observations
-    normals_w:        (L, 3); the normal of a point looks back to the cameras that saw it. Zero if None
-    observations:     (L,) in how many keyframes a point was seen. 0 if None
+    Args:
+        points_w: (L, 3)
+        colors: (L, 3) uint8 red, green, blue
+        centers_w: (K, 3) camera centers, red, with 0 observations
+        normals_w: (L, 3) direction from each point to the cameras that observed it; None: zero
+        observations: (L,) number of keyframes that observe each point; None: 0
     """
     vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
     points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]

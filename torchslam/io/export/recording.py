@@ -109,8 +109,9 @@ def write_recording(path: Path, scene: Scene, R_up: Tensor, images: Images | Non
     `world/camera` has the pose of every frame, `world/keyframe` pose, image and observed keypoints of those that are
     one; a pinhole camera is all that rerun knows, so the scene must be undistorted.
 
-    R_up:   (3, 3) from the map's world to the upright one
-    images: of the keyframes, undistorted like the scene; none where None
+    Args:
+        R_up: (3, 3) from the map's world to the upright one
+        images: undistorted images of the keyframes; None: no images
     """
     upright = scene.turned(R_up)
     recording = import_rerun().RecordingStream(APPLICATION)

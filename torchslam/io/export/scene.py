@@ -16,12 +16,15 @@ from torchslam.map.atlas import Submap
 class Scene:
     """F posed frames in order of time, P points and O observations, ordered by frame; on the CPU.
 
-    frame_ids:   (F,) in the sequence; timestamps: (F,) seconds
-    is_keyframe: (F,) bool
-    T_cw:        (F, 4, 4)
-    points_w:    (P, 3), each seen by two frames or more; colors: (P, 3) uint8 red, green, blue
-    frame_index, point_index: (O,)
-    pixels:      (O, 2) of the observed keypoints
+    Attributes:
+        frame_ids: (F,) in the sequence
+        timestamps: (F,) seconds
+        is_keyframe: (F,) bool
+        T_cw: (F, 4, 4)
+        points_w: (P, 3), each seen by two frames or more
+        colors: (P, 3) uint8 red, green, blue
+        frame_index, point_index: (O,)
+        pixels: (O, 2) of the observed keypoints
     """
 
     camera: Camera

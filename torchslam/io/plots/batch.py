@@ -24,10 +24,12 @@ def plot_batch(
     errors: Sequence[float | None],
     title: str = "",
 ) -> Figure:
-    """Posed share and relative error, of each sequence by name, or sorted where there are more than `NAMED`.
+    """Plot posed fraction and relative error per sequence: by name, or sorted if there are more than `NAMED`.
 
-    statuses: "done", or what is written where there is nothing to draw
-    posed:    share of the frames that have a pose, 0 to 1; errors: ATE as a share of the path; None: there is none
+    Args:
+        statuses: "done", or the text to show instead of a bar
+        posed: fraction of the frames that have a pose
+        errors: ATE as a fraction of the path; None: unknown
     """
     with style.house_style():
         few = len(names) <= NAMED

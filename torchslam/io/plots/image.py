@@ -20,11 +20,12 @@ def plot_features(
 ) -> Figure:
     """Keypoints on an image: map points as dots with a tail to where they were before, the others as rings.
 
-    image:     (H, W) in [0, 1]
-    keypoints: (N, 2) pixels
-    matched:   (N,) bool, those that are map points
-    previous:  (N, 2) pixels of the same map points in an earlier frame, NaN where it did not see them
-    lengths:   (N,) in how many keyframes the point was seen, for the color
+    Args:
+        image: (H, W) in [0, 1]
+        keypoints: (N, 2) pixels
+        matched: (N,) bool, keypoints of map points
+        previous: (N, 2) pixels of the same map points in an earlier frame, NaN if it did not observe them
+        lengths: (N,) number of keyframes that observe the point, for the color
     """
     from matplotlib.ticker import MaxNLocator
 

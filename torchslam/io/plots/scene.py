@@ -51,10 +51,11 @@ def plot_scene(
 ) -> Figure:
     """The path, the map and the camera axes from two sides, equal scales on all axes.
 
-    trajectory: every posed frame, already aligned to the ground truth where there is one
-    points_w:   (L, 3) in the same frame
-    keyframes:  whose axes are drawn: red x, green y, blue z (the viewing direction); by default all frames'
-    unit:       of length; "" where the scale is unknown
+    Args:
+        trajectory: every posed frame, aligned to the ground truth if there is one
+        points_w: (L, 3) in the same frame
+        keyframes: frames to draw axes for: red x, green y, blue z (the viewing direction); default: all
+        unit: unit of length; "" if the scale is unknown
     """
     scene = _scene(trajectory, points_w, groundtruth, keyframes)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
@@ -83,8 +84,10 @@ def plot_top_view(
 ) -> Figure:
     """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
 
-    keyframe_covariances_w, point_covariances_w: (K, 3, 3) and (L, 3, 3) of the positions, drawn as ellipses of three
-        standard deviations, those of keyframes magnified by the power of ten in the legend; none where they are zero
+    Args:
+        keyframe_covariances_w, point_covariances_w: (K, 3, 3) and (L, 3, 3) of the positions, drawn as
+            ellipses of three standard deviations, those of keyframes magnified by the power of ten in the
+            legend; none where they are zero
     """
     scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
@@ -279,9 +282,11 @@ def draw_ellipses(
     linewidth: float = 0.9,
     zorder: float = 5,
 ) -> None:
-    """Draw covariances (L, 2, 2) around centers (L, 2), say in the legend what they are; none where all are zero.
+    """Draw covariances (L, 2, 2) around centers (L, 2), with an entry in the legend; skip those that are zero.
 
-    magnified_in: the width of the picture, in which to magnify by the power of ten that keeps ellipses small; 0: not
+    Args:
+        magnified_in: width of the plot. Ellipses are magnified by the largest power of ten that keeps them
+            small in it; 0: not magnified
     """
     from matplotlib.collections import EllipseCollection
 

@@ -32,10 +32,11 @@ def plot_errors(
 ) -> Figure:
     """The error of every posed frame over time, colored by its size; spans without a pose shaded.
 
-    timestamps: (N,) seconds of the posed frames that have ground truth
-    errors_m:   (N,) meters between the aligned and the true camera center
-    errors_rad: (N,) radians between the aligned and the true orientation
-    results:    of all frames, for the shading
+    Args:
+        timestamps: (N,) seconds of the posed frames that have ground truth
+        errors_m: (N,) meters between the aligned and the true camera center
+        errors_rad: (N,) radians between the aligned and the true orientation
+        results: of all frames, for the shading
     """
     seconds = style.to_numpy(timestamps)
     origin = _origin(seconds, results)

@@ -43,8 +43,10 @@ FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 class FrameSnapshot:
     """One frame and its tracking result.
 
-    image:     (H, W) uint8 gray
-    keypoints: (N, 2) all that were found; tracked: (m, 2) those whose map points hold the pose, where it is believed
+    Attributes:
+        image: (H, W) uint8 gray
+        keypoints: (N, 2) all keypoints
+        tracked: (m, 2) keypoints of the map points that support a reliable pose
     """
 
     result: StepResult
@@ -66,7 +68,9 @@ class FrameViewer(Protocol):
 class FrameViewers:
     """Passes every processed frame on to the viewers.
 
-    sequence: wrapper to run instead of the original one; it keeps the last image, so that none is read twice
+    Args:
+        sequence: wrapper to run instead of the original sequence; it keeps the last image, so no image is
+            read twice
     """
 
     def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:

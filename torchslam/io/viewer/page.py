@@ -122,13 +122,19 @@ def decoded(packed: dict[str, str]) -> np.ndarray:
 def _submap(
     submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
-    """A submap as it is shown: upright, around the middle of its box; aligned and in meters with ground truth.
+    """Return the data of a submap: upright, centered on its box; aligned and in meters with ground truth.
 
-    S_shown_map: (4, 4) similarity from the map to what is shown
-    frame, keyframe: (F,), (K,) rows of `frames`; poses, keyframe_poses: (F, 3, 4), (K, 3, 4) camera to world
-    errors:      (F,) meters, NaN where unknown; breaks: rows before which the path is broken
-    truth:       (M, 3); points, colors: (P, 3), no colors where no image was seen; points_total: before thinning
-    box:         (2, 3) lowest and highest corner around what matters; radius: half its diagonal
+    Returns:
+        S_shown_map: (4, 4) similarity from the map to the view
+        frame, keyframe: (F,), (K,) rows of `frames`
+        poses, keyframe_poses: (F, 3, 4), (K, 3, 4) camera to world
+        errors: (F,) meters, NaN if unknown
+        breaks: rows before which the path is interrupted
+        truth: (M, 3) true positions
+        points, colors: (P, 3); points without an observed image have no color
+        points_total: number of points before thinning
+        box: (2, 3) lowest and highest corner around the scene
+        radius: half the diagonal of the box
     """
     evaluation = _evaluation(path, results)
     S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()

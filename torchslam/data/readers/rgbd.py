@@ -1,0 +1,212 @@
+"""Folders of RGB-D benchmarks, of which the color images are read: ETH3D-SLAM, TUM, ICL-NUIM, 7-Scenes, TartanAir.
+
+ETH3D, TUM   `rgb.txt`, `groundtruth.txt`, `calibration.txt`: https://www.eth3d.net/slam_documentation,
+             https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+ICL-NUIM     the TUM-compatible form: `rgb/`, `*.gt.freiburg`: https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html
+7-Scenes     `frame-000000.color.png` and `.pose.txt` side by side:
+             https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
+TartanAir    `image_left/` and `pose_left.txt`, in version 2 with `lcam_front` in place of `left`; poses are camera to
+             world, x forward, y right, z down: https://github.com/castacks/tartanair_tools/blob/master/data_type.md
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchslam.data.calibration import PRESETS
+from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.formats.frame_names import find_frames, match_pattern
+from torchslam.data.formats.text_file import numbered_lines, parse_count, parse_floats
+from torchslam.data.readers.image_sequence import (
+    DEFAULT_RATE,
+    ImageEntry,
+    ImageSequence,
+    at_rate,
+    find_calibration,
+)
+from torchslam.data.sequence import Reader
+from torchslam.data.trajectories import checked_poses, read_trajectory
+from torchslam.errors import SequenceError, TrajectoryError
+from torchslam.geometry.lie import matrix_from_quaternion, rigid
+from torchslam.types import Trajectory
+
+FREIBURG = re.compile(r"freiburg([123])(?!\d)")
+ICL_TRUTH = "*.gt.freiburg"
+ICL_MIRROR = (1.0, -1.0, 1.0, 1.0)
+"""Frames are numbered, in place of times. The published camera has a negative fy, since its y axis points up; here it
+points down, so that camera and world are mirrored."""
+SEVEN_SCENES_COLOR = "frame-*.color.png"
+ORTHOGONAL = 0.05
+"""How far R R^T of a pose may be from the identity; fused poses are printed with few digits."""
+TARTANAIR_CAMERAS = ("left", "lcam_front")
+TARTANAIR_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+"""The axes of our cameras, right, down, forward, as columns in the dataset's: forward, right, down."""
+
+
+def _is_tum(path: str) -> bool:
+    """Whether the folder has a list of images in this layout."""
+    return (Path(path) / "rgb.txt").is_file()
+
+
+def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
+
+    The archives of TUM contain no calibration; their name identifies the published camera.
+    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
+    """
+    folder = Path(path)
+    entries = read_image_list(folder / "rgb.txt")
+    camera = camera if camera is not None else find_calibration(folder)
+    robot = FREIBURG.search(folder.resolve().name)
+    if camera is None and robot is not None:
+        camera = PRESETS[f"tum-fr{robot[1]}"]
+    truth = folder / "groundtruth.txt"
+    groundtruth = read_trajectory(truth) if truth.is_file() else None
+    return ImageSequence(folder.name, "ETH3D or TUM folder", entries, camera, groundtruth)
+
+
+def read_image_list(path: Path) -> list[ImageEntry]:
+    """The lines `timestamp file` of a list. Raises SequenceError naming file and line."""
+    entries = []
+    for number, line in numbered_lines(path, SequenceError):
+        where = f"{path}:{number}"
+        words = line.split(maxsplit=1)
+        try:
+            timestamp = float(words[0])
+        except ValueError:
+            timestamp = math.nan
+        if len(words) != 2 or not math.isfinite(timestamp):
+            raise SequenceError(f"{where}: expected `timestamp file`, got `{line}`")
+        entries.append(ImageEntry(timestamp, path.parent / words[1], where))
+    if not entries:
+        raise SequenceError(f"{path}: no images are listed")
+    return entries
+
+
+def _is_icl_nuim(path: str) -> bool:
+    """Whether the folder has a trajectory under this dataset's name, and images."""
+    return (Path(path) / "rgb").is_dir() and next(Path(path).glob(ICL_TRUTH), None) is not None
+
+
+def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """A trajectory of the living room or the office.
+
+    Raises SequenceError, CalibrationError or TrajectoryError naming the file.
+    """
+    folder = Path(path)
+    rate = rate or DEFAULT_RATE
+    found = find_frames(folder / "rgb")
+    unnumbered = [file for file in found.frames if parse_count(file.stem) is None]
+    if unnumbered:
+        raise SequenceError(f"{unnumbered[0]}: frames of ICL-NUIM are named by their number")
+    entries = [ImageEntry(int(file.stem) / rate, file, str(file)) for file in found.frames]
+    numbered = read_trajectory(sorted(folder.glob(ICL_TRUTH))[0])
+    mirror = torch.diag(torch.tensor(ICL_MIRROR, dtype=torch.float64))
+    groundtruth = Trajectory(numbered.timestamps / rate, mirror @ numbered.T_wc @ mirror)
+    camera = PRESETS["icl"] if camera is None else camera
+    return ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
+
+
+def _is_seven_scenes(path: str) -> bool:
+    """Whether the folder has color frames of this dataset's names."""
+    return Path(path).is_dir() and next(Path(path).glob(SEVEN_SCENES_COLOR), None) is not None
+
+
+def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """One sequence (`seq-01`), at the Kinect's 30 frames per second, with the poses of its depth camera.
+
+    The dataset gives no calibration of the color camera; without `camera` its nominal focal length is a guess.
+    Raises SequenceError, CalibrationError or TrajectoryError naming the file.
+    """
+    folder = Path(path)
+    found = match_pattern(str(folder / SEVEN_SCENES_COLOR))
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    times: list[float] = []
+    poses: list[Tensor] = []
+    for entry in entries:
+        pose = entry.path.with_name(entry.path.name.replace(".color.png", ".pose.txt"))
+        T_wc = _read_pose(pose) if pose.is_file() else None
+        if T_wc is not None:
+            times.append(entry.timestamp)
+            poses.append(T_wc)
+    groundtruth = None
+    if poses:
+        groundtruth = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(poses))
+    camera = PRESETS["7-scenes"] if camera is None else camera
+    name = f"{folder.resolve().parent.name}/{folder.name}" if folder.name.startswith("seq-") else folder.name
+    return ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
+
+
+def _read_pose(path: Path) -> Tensor | None:
+    """(4, 4) T_wc; None where tracking had failed: the dataset then writes numbers that are no rotation."""
+    rows = []
+    for number, line in numbered_lines(path, TrajectoryError):
+        if "nan" in line.lower() or "inf" in line.lower():
+            return None
+        rows.append(parse_floats(line, f"{path}:{number}", TrajectoryError))
+    if [len(row) for row in rows] != [4, 4, 4, 4]:
+        raise TrajectoryError(f"{path}: expected four lines of four numbers")
+    T_wc = torch.tensor(rows, dtype=torch.float64)
+    R = T_wc[:3, :3]
+    if (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().max() > ORTHOGONAL:
+        return None
+    # The nearest rotation: poses are printed with few digits.
+    U, _, Vh = torch.linalg.svd(R)
+    T_wc[:3, :3] = U @ Vh
+    return checked_poses(T_wc, path)
+
+
+def _is_tartanair(path: str) -> bool:
+    """Whether the folder is a trajectory (`P000`) of the dataset."""
+    return _tartanair_camera(Path(path)) is not None
+
+
+def _open_tartanair(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
+    """The left camera of a trajectory; the dataset has no times, so that `rate` or 30 frames per second are taken.
+
+    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
+    """
+    folder = Path(path)
+    name = _tartanair_camera(folder) or TARTANAIR_CAMERAS[0]
+    found = find_frames(folder / f"image_{name}")
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    truth = _read_tartanair_poses(folder / f"pose_{name}.txt", [entry.timestamp for entry in entries])
+    camera = PRESETS["tartanair"] if camera is None else camera
+    return ImageSequence(folder.name, "TartanAir folder", entries, camera, truth, found.notes)
+
+
+def _tartanair_camera(folder: Path) -> str | None:
+    for name in TARTANAIR_CAMERAS:
+        if (folder / f"image_{name}").is_dir() and (folder / f"pose_{name}.txt").is_file():
+            return name
+    return None
+
+
+def _read_tartanair_poses(path: Path, times: list[float]) -> Trajectory:
+    """One line `tx ty tz qx qy qz qw` per frame."""
+    rows = []
+    for number, line in numbered_lines(path, TrajectoryError):
+        row = parse_floats(line, f"{path}:{number}", TrajectoryError)
+        if len(row) != 7 or abs(sum(value * value for value in row[3:]) - 1.0) > 0.1:
+            raise TrajectoryError(
+                f"{path}:{number}: expected `tx ty tz qx qy qz qw` of unit length, got `{line}`"
+            )
+        rows.append(row)
+    if len(rows) != len(times):
+        raise TrajectoryError(f"{path}: {len(rows)} poses for {len(times)} images")
+    table = torch.tensor(rows, dtype=torch.float64)
+    quaternions = table[:, 3:] / table[:, 3:].norm(dim=-1, keepdim=True)
+    R = matrix_from_quaternion(quaternions) @ torch.tensor(TARTANAIR_AXES, dtype=torch.float64)
+    T_wc = checked_poses(rigid(R, table[:, :3]), path)
+    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)
+
+
+TUM = Reader("rgb.txt (ETH3D, TUM)", _is_tum, _open_tum)
+ICL_NUIM = Reader("rgb/ with *.gt.freiburg (ICL-NUIM)", _is_icl_nuim, _open_icl_nuim)
+SEVEN_SCENES = Reader("frame-*.color.png (7-Scenes)", _is_seven_scenes, _open_seven_scenes)
+TARTANAIR = Reader("image_left/ with pose_left.txt (TartanAir)", _is_tartanair, _open_tartanair)
