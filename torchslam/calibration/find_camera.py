@@ -82,7 +82,9 @@ def find_camera(
 def camera_remark(finished: Run, found: str) -> str:
     """Describe the camera of a run: how it was found, and whether the run contradicts its focal length.
 
-    found: description by `find_camera`, empty for a given camera. Only a complete first session can contradict it.
+    Args:
+        found: description by `find_camera`, empty for a given camera. Only a complete first session can
+            contradict it.
     """
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
@@ -134,7 +136,8 @@ def describe_camera(calibrated: CalibrationResult) -> str:
 def contradiction(given: Camera, estimate: IntrinsicsEstimate) -> str:
     """Describe how the images contradict a given focal length; empty if they do not.
 
-    estimate: with only the focal length free
+    Args:
+        estimate: with only the focal length free
     """
     was, focal = float(given.focal), float(estimate.camera.focal)
     off = abs(math.log(focal / was))

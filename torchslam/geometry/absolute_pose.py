@@ -357,7 +357,10 @@ def is_success(
 ) -> Bool[Tensor, " B"]:
     """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on one line.
 
-    points: about their mean; size: of the image; threshold: of an inlier, pixels
+    Args:
+        points: about their mean
+        size: of the image
+        threshold: of an inlier, pixels
     """
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
@@ -378,7 +381,8 @@ def find_absolute_pose(
 ) -> tuple[Tensor, ...]:
     """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
 
-    effort: seed, confidence and max_samples of `estimate_absolute_pose`
+    Args:
+        effort: seed, confidence and max_samples of `estimate_absolute_pose`
     """
     with torch.inference_mode():  # less work per operation than without gradients only
         results = _Problem.of(points_w, pixels, camera, threshold, mask).solve(*effort)

@@ -25,12 +25,13 @@ _NEWTON_STEPS = 12
 class Distortion:
     """One model, as functions of undistorted coordinates xy and coefficients k.
 
-    distort:           (xy, k) -> distorted coordinates (..., N, 2)
-    slope:             (xy, k) -> d distorted / d xy (..., N, 2, 2)
-    coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K)
-    undistort:         (distorted, k, limit) -> xy
-    limit:             (k) -> up to which `coordinate` the map is monotone (...)
-    coordinate:        undistorted radius -> what the limit limits
+    Attributes:
+        distort: (xy, k) -> distorted coordinates (..., N, 2)
+        slope: (xy, k) -> d distorted / d xy (..., N, 2, 2)
+        coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K)
+        undistort: (distorted, k, limit) -> xy
+        limit: (k) -> up to which `coordinate` the map is monotone (...)
+        coordinate: undistorted radius -> what the limit limits
     """
 
     num_params: int

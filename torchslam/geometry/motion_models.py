@@ -93,7 +93,8 @@ def fit_models(
 ) -> Fits:
     """A homography and a pure rotation for matches that R, t explain.
 
-    by_noise: samples that most matches contradict, as those of a scene with depth, are not worth a fit
+    Args:
+        by_noise: skip the fit of samples that most matches contradict, as in a scene with depth
     """
     essential = sampson_squared(views, R[:, None], t[:, None])[:, 0]
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
@@ -127,9 +128,11 @@ def choose(
 ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
     """The index of the simplest model that no significant number of matches contradicts, and if a plane is one.
 
-    by_noise: nor all matches together, by where beside it they lie. The noise of keypoints has a long tail, and most of
-    those off a pure rotation are so by a few pixels: had it moved them in any direction, some would be on their lines.
-    Noise along edges may look so too, but goes both ways, which no motion does
+    Args:
+        by_noise: also require that all matches together do not contradict it by the direction of their
+            errors. Keypoint noise has a long tail, so many errors of a few pixels do not refute a rotation.
+            But noise has any direction, while parallax lies along the epipolar lines, in one sense. Noise
+            along image edges can lie along the lines too, but in both senses.
     """
     mask, (essential, homography, rotation) = views.mask, fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
@@ -170,7 +173,7 @@ def _leans(
     direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
     their squared distance, which tells most where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
 
-    squared: as of `Fits`; variance: of the noise by the essential matrix
+    squared: as of `Fits`; variance: variance of the noise, by the essential matrix
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     across, both = squared[ESSENTIAL], squared[1:] * TRANSFER_WIDTH**2
@@ -189,7 +192,8 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -
     The noise of keypoints on edges lies along lines, and where many edges are parallel, along epipolar lines: parallax
     by its size. But it puts as many matches behind the cameras as before them.
 
-    variance: of the noise by the essential matrix
+    Args:
+        variance: variance of the noise, by the essential matrix
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     near = views.mask & (fits.squared[ESSENTIAL] < _FARTHEST**2 * variance)
@@ -264,7 +268,8 @@ def pose_of(
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
     """R, t and the normal of the plane, and whether a plane leaves two motions.
 
-    by_noise: also where noise may be why one of them explains the matches better
+    Args:
+        by_noise: also if noise may be the reason why one of them explains the matches better
     """
     R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
     R_H, direction, normal, squared, possible = plane

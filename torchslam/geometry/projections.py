@@ -55,9 +55,10 @@ def squared_projections(
 class Tangent:
     """Derivatives and retraction of a mapping P (3, D) with T local parameters.
 
-    constant, linear: the 3 (T + 1) D entries of T derivatives of P and of itself, as an affine function of the entries
-    of P
-    retract: (P,), step (problems, T) -> (P,)
+    Attributes:
+        constant, linear: the 3 (T + 1) D entries of T derivatives of P and of itself, as an affine function
+            of the entries of P
+        retract: (P,), step (problems, T) -> (P,)
     """
 
     constant: Float[Tensor, " entries"]

@@ -64,7 +64,8 @@ def in_chunks(
 ) -> tuple[Tensor, ...]:
     """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
 
-    numbers: values of the function's largest intermediate result per problem
+    Args:
+        numbers: values of the function's largest intermediate result per problem
     """
     size = max(1, _MAX_VALUES_AT_ONCE // numbers)
     if len(tensors[0]) <= size:
@@ -143,7 +144,8 @@ def best_models(
 ) -> Int[Tensor, "B {count}"]:
     """Indices of the best of many models, which first have to do well on a random part of the rows.
 
-    score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
+    Args:
+        score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
     """
     few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
     if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
@@ -176,10 +178,12 @@ def gather_rows(
 
 
 def truncated_score(squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B K"]:
-    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC); `squared` is overwritten.
+    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC), higher is better; `squared` is overwritten.
 
-    squared: squared residuals in units of the threshold, NaN counted as outliers. Higher is better. Source: Torr and
-    Zisserman, "MLESAC", 2000.
+    Source: Torr and Zisserman, "MLESAC", 2000.
+
+    Args:
+        squared: squared residuals in units of the threshold; NaN counts as an outlier
     """
     weights = mask.to(squared.dtype)[..., None]
     cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
@@ -254,9 +258,12 @@ def is_significant(
 ) -> Bool[Tensor, " B"]:
     """Test whether inliers are significant: fewer than 0.001 false alarms expected among wrong matches.
 
-    inliers, available: counts; chance: probability that a wrong row fits a model; solutions: models per minimal sample
-    of `size` rows. Source: Moisan and Stival, "A probabilistic criterion to detect rigid point
-    matches between two images", 2004, eq. for the number of false alarms.
+    Source: Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images", 2004.
+
+    Args:
+        inliers, available: counts
+        chance: probability that a wrong row fits a model
+        solutions: models per minimal sample of `size` rows
     """
     problems = zip(inliers.tolist(), available.tolist(), chance.tolist(), strict=True)
     logs = [_log_false_alarms(k, n, size, p, solutions) for k, n, p in problems]

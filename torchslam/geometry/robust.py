@@ -30,9 +30,10 @@ Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 class Robustified(NamedTuple):
     """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
 
-    rho:       the cost, twice the contribution of the residual to the objective
-    weight:    rho', the weight of the residual in iteratively reweighted least squares, in [0, 1]
-    curvature: rho'', never positive
+    Attributes:
+        rho: the cost, twice the contribution of the residual to the objective
+        weight: rho', the weight of the residual in iteratively reweighted least squares, in [0, 1]
+        curvature: rho'', never positive
     """
 
     rho: Float[Tensor, "*batch"]
@@ -84,10 +85,16 @@ _KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
 def robustify(
     squared: Float[Tensor, "*#batch"], kernel: Kernel, scale: Float[Tensor, "*#batch"]
 ) -> Robustified:
-    """rho, rho' and rho'' of squared whitened residuals.
+    """Return rho, rho' and rho'' of squared whitened residuals.
 
-    squared: not negative; scale: broadcastable to it, positive. Differentiable to both, except on the
-    boundary of "huber" (rho'') and "truncated". Raises ValueError for an unknown kernel.
+    Differentiable in both, except on the boundary of "huber" (rho'') and "truncated".
+
+    Args:
+        squared: not negative
+        scale: positive, broadcastable to `squared`
+
+    Raises:
+        ValueError: for an unknown kernel
     """
     if kernel not in _KERNELS:
         raise ValueError(f"unknown kernel {kernel!r}; known are {', '.join(get_args(Kernel))}")

@@ -66,8 +66,7 @@ def carry_points(
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
     """Move points, covariances and unit normals as the pose T_cw of their camera is corrected to a similarity S_cw.
 
-    points_w: (..., 3); covariances_w: (..., 3, 3); normals_w: (..., 3); T_cw, S_cw: (..., 4, 4), one for each point,
-    world to camera. What is seen in the direction and with the relative depth p_c = T_cw p is seen so by S_cw after.
+    T_cw and S_cw map the world to the camera of each point. A point keeps its direction and relative depth in it.
     """
     S_wc = sim3_inverse(S_cw)
     moved_w = transform(S_wc, transform(T_cw, points_w[..., None, :]))[..., 0, :]
@@ -126,8 +125,8 @@ def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]
 def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
     """Rotation (3, 3) from the world to one whose z is up and whose x is as close to the world's x as possible.
 
-    T_wc: (N, 4, 4). Gravity is not known: up is the mean up direction of the cameras. Where they have none, as when
-    half of them hang upside down, it is that of a world whose y points down.
+    Gravity is not known: up is the mean up direction of the cameras. If that is zero (half of the cameras are
+    upside down), up is -y.
     """
     down = T_wc[:, :3, 1].mean(dim=0) if len(T_wc) else T_wc.new_zeros(3)
     if float(down.norm()) < 1e-3:  # a unit vector in any but made-up cases

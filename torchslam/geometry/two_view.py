@@ -257,7 +257,9 @@ def noise_variance(squared: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> 
 def score_essential(views: TwoViews, E: Float[Tensor, "B K 3 3"], soft: bool = False) -> Float[Tensor, "B K"]:
     """Scores of many essential matrices, in float32.
 
-    soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of `truncated_score`
+    Args:
+        soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of
+            `truncated_score`
     """
     constraint, variance = views.epipolar_float
     squared = (E.flatten(-2).float() @ constraint).square_()
@@ -273,8 +275,9 @@ def propose_essential(
 ) -> tuple[ModelState, Tensor, Tensor]:
     """The best (R, t) of `count` samples of five matches, locally optimized, its score and its support.
 
-    by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
-    lie behind a camera count as wrong
+    Args:
+        by_noise: matches count the more the closer they are, in units of the noise that the best sample
+            shows; those that lie behind a camera count as wrong
     """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)

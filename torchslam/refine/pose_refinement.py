@@ -40,9 +40,10 @@ MIN_KEYFRAMES = 2  # keyframes of a map
 class CameraChoice(Enum):
     """How the given camera is treated.
 
-    IF_CONTRADICTED: its focal length is replaced if the images contradict it.
-    FREE: it is replaced if the images determine it.
-    FIXED: it is kept.
+    Attributes:
+        IF_CONTRADICTED: replace its focal length if the images contradict it
+        FREE: replace it if the images determine it
+        FIXED: keep it
     """
 
     IF_CONTRADICTED = "if_contradicted"
