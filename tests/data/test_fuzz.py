@@ -21,7 +21,7 @@ from tests.fuzz.inputs import clear, numbers, outcome
 from tests.fuzz.readers import Reader, readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
 from torchslam.data.formats.image_file import read_gray
-from torchslam.data.readers.eth3d_tum import read_image_list
+from torchslam.data.readers.rgbd import read_image_list
 from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
 
 WORDS = st.one_of(
@@ -126,7 +126,7 @@ def wait(root: Path) -> None:
     ("read", "patience", "verdict", "where"),
     [(spin, 0.2, "hang", "in spin"), (sleep, 0.4, "read", ""), (wait, 0.1, "hang", "in wait")],
 )
-def test_patience_is_of_the_processor_and_what_waits_for_ever_ends(
+def test_the_time_limit_is_cpu_time_and_a_hang_ends(
     tmp_path: Path, read: Callable[[Path], None], patience: float, verdict: str, where: str
 ) -> None:
     found = outcome(Reader("mine", lambda: {"a.txt": b"a"}, read, 1), 0, tmp_path, patience)
@@ -135,7 +135,7 @@ def test_patience_is_of_the_processor_and_what_waits_for_ever_ends(
     assert signal.getitimer(signal.ITIMER_PROF) == signal.getitimer(signal.ITIMER_REAL) == (0, 0)
 
 
-def test_a_process_that_no_signal_reaches_is_ended_and_the_next_input_tried(
+def test_a_process_that_ignores_signals_is_killed_and_the_next_input_runs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("tests.fuzz.__main__.LOOK", 0.05)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torchslam
-from torchslam.data.synthetic import sequence as synthetic
+from torchslam.data.synthetic import is_synthetic
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, whole_folder, write_whole
 
@@ -158,7 +158,7 @@ def hash_files(paths: list[str]) -> str:
     """
     found = hashlib.sha256()
     for path in paths:
-        if synthetic.matches(path):
+        if is_synthetic(path):
             found.update(path.encode() + b"\0")
             continue
         for name, status in _files(path):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from torchslam.data.formats.text_file import MAX_LINE, numbered_lines, parse_count, read_text
-from torchslam.data.synthetic import sequence as synthetic
+from torchslam.data.synthetic import is_synthetic
 from torchslam.errors import SequenceError
 
 MAX_BYTES = 1 << 26
@@ -56,7 +56,7 @@ class Row:
 
     def path(self, name: str) -> str:
         """Resolve a file or folder that the row names."""
-        return name if synthetic.matches(name) else str(Path(self.folder, name))
+        return name if is_synthetic(name) else str(Path(self.folder, name))
 
     def completed(self, defaults: Mapping[str, Any]) -> Row:
         """Fill in defaults for what the row does not set; overrides of the defaults come before its own."""
@@ -108,7 +108,7 @@ def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
 
 def short_name(sequence: str) -> str:
     """Derive a name from the path of a sequence: letters, digits, and `-` for anything else."""
-    text = sequence if synthetic.matches(sequence) else Path(sequence).stem
+    text = sequence if is_synthetic(sequence) else Path(sequence).stem
     text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
     return text[:MAX_NAME] or "sequence"
 

@@ -29,7 +29,7 @@ from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
-from torchslam.data.readers.registry import live
+from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
 from torchslam.data.transforms import WithGroundTruth
@@ -131,7 +131,7 @@ def open_row(row: Row) -> Sequence:
 
     Raises SequenceError, CalibrationError or TrajectoryError.
     """
-    if live.matches(row.sequence) and not Path(row.path(row.sequence)).exists():
+    if is_live(row.sequence) and not Path(row.path(row.sequence)).exists():
         raise SequenceError(f"{row.sequence}: a live source has no end and is not repeatable")
     camera = row.camera
     if camera is not None and Path(row.path(camera)).is_file():

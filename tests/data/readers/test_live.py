@@ -83,7 +83,7 @@ def test_a_slow_reader_gets_the_newest_frames(clip: Path) -> None:
     assert capture.released.wait(1.0)
 
 
-def test_a_reader_that_is_slow_once_gets_them_all(clip: Path) -> None:
+def test_a_reader_that_is_slow_once_gets_all_frames(clip: Path) -> None:
     sequence = LiveSequence("clip", Played(clip), parse_calibration("f=0.8w"))
     frames = []
     for frame in sequence:
@@ -93,7 +93,7 @@ def test_a_reader_that_is_slow_once_gets_them_all(clip: Path) -> None:
     assert sequence.dropped == 0
 
 
-def test_a_quick_reader_gets_them_all(clip: Path) -> None:
+def test_a_fast_reader_gets_all_frames(clip: Path) -> None:
     sequence = LiveSequence("clip", Played(clip), None)
     assert sequence.known_length is None
     with pytest.raises(TypeError, match="has no length"):
@@ -106,7 +106,7 @@ def test_a_quick_reader_gets_them_all(clip: Path) -> None:
         sequence[len(frames)]
 
 
-def test_each_frame_once(clip: Path) -> None:
+def test_each_frame_is_delivered_once(clip: Path) -> None:
     sequence = LiveSequence("clip", Played(clip), None)
     assert sequence[0].index == 0
     assert sequence[5].index == 5  # a run that goes on
@@ -115,7 +115,7 @@ def test_each_frame_once(clip: Path) -> None:
     sequence.close()
 
 
-def test_without_a_clock_arrival_counts(clip: Path) -> None:
+def test_without_a_clock_arrival_times_are_used(clip: Path) -> None:
     sequence = LiveSequence("clip", Played(clip, has_clock=False), None)
     before = time.time()
     frames = [sequence[index] for index in range(5)]
@@ -125,7 +125,7 @@ def test_without_a_clock_arrival_counts(clip: Path) -> None:
     sequence.close()
 
 
-def test_the_end_can_be_chosen(clip: Path) -> None:
+def test_the_last_frame_can_be_chosen(clip: Path) -> None:
     part = LiveSequence("clip", Played(clip), None).part(stop=4)
     assert (len(part), part.known_length) == (4, 4)
     with pytest.raises(SequenceError, match="only the end can be chosen"):
@@ -138,7 +138,7 @@ def test_the_end_can_be_chosen(clip: Path) -> None:
     part.close()
 
 
-def test_what_comes_after_the_last_frame_is_not_counted(clip: Path) -> None:
+def test_frames_after_the_last_one_are_not_counted(clip: Path) -> None:
     sequence = LiveSequence("clip", Played(clip), None, backlog=1).part(stop=2)
     for _ in sequence:
         time.sleep(0.1)
@@ -148,7 +148,7 @@ def test_what_comes_after_the_last_frame_is_not_counted(clip: Path) -> None:
     assert sequence.dropped == dropped
 
 
-def test_nobody_watches_before_a_frame_is_asked_for(clip: Path) -> None:
+def test_capture_starts_with_the_first_request(clip: Path) -> None:
     capture = Played(clip)
     others = threading.active_count()
     sequence = LiveSequence("clip", capture, None)
@@ -162,7 +162,7 @@ def test_nobody_watches_before_a_frame_is_asked_for(clip: Path) -> None:
     assert capture.released.wait(1.0)
 
 
-def test_what_was_never_watched_is_let_go(clip: Path) -> None:
+def test_an_unused_source_is_released(clip: Path) -> None:
     capture = Played(clip)
     sequence = LiveSequence("clip", capture, None)
     assert not capture.released.is_set()
@@ -182,7 +182,7 @@ def test_capture_clock() -> None:
     assert clock.at(0.0, 1000.5) > 1000.5
 
 
-def test_nothing_comes() -> None:
+def test_a_source_without_frames_times_out() -> None:
     class Silent(Played):
         def __init__(self) -> None:
             pass
@@ -198,15 +198,15 @@ def test_nothing_comes() -> None:
         LiveSequence("camera 0", Silent(), None, patience=0.5)
 
 
-def test_what_is_live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_sources_are_recognized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert live.matches("0")
-    assert live.matches("rtsp://user@camera:554/stream?x=1")
-    assert live.matches("http://camera/video.mjpg")
-    assert not live.matches("video.mp4")
-    assert not live.matches("https://server/video.mp4")
+    assert live.is_live("0")
+    assert live.is_live("rtsp://user@camera:554/stream?x=1")
+    assert live.is_live("http://camera/video.mjpg")
+    assert not live.is_live("video.mp4")
+    assert not live.is_live("https://server/video.mp4")
     (tmp_path / "0").mkdir()
-    assert not live.matches("0")
+    assert not live.is_live("0")
     with pytest.raises(SequenceError, match="97: cannot be opened as a camera"):
         open_sequence("97")
     with pytest.raises(SequenceError, match=r"^rtsp://127\.0\.0\.1:9/x: cannot be opened as a stream"):

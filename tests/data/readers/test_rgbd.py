@@ -59,7 +59,7 @@ def test_part_is_renumbered_and_keeps_its_poses(tum_folder: Folder) -> None:
     assert sequence.frame_rate == pytest.approx(5.0)
 
 
-def test_nothing_left_and_other_impossible_requests(tum_folder: Folder) -> None:
+def test_empty_and_invalid_selections_are_refused(tum_folder: Folder) -> None:
     folder = tum_folder()
     with pytest.raises(SequenceError, match="no frames left of 5"):
         open_sequence(folder, limit=0)
@@ -78,7 +78,7 @@ def test_negative_index_counts_from_the_end(tum_folder: Folder) -> None:
         sequence[5]
 
 
-def test_describe_names_what_would_be_read(tum_folder: Folder) -> None:
+def test_describe_names_the_sequence(tum_folder: Folder) -> None:
     described = open_sequence(tum_folder()).describe()
     assert described["frames"] == "5"
     assert described["size"] == "64x48"
@@ -107,7 +107,7 @@ def test_truncated_image_names_list_and_line(tum_folder: Folder, suffix: str) ->
             sequence[3]
 
 
-def test_file_that_is_no_image(tum_folder: Folder) -> None:
+def test_a_file_that_is_no_image_is_named(tum_folder: Folder) -> None:
     folder = tum_folder()
     (folder / "rgb" / "0.png").write_text("<html>404</html>")
     sequence = open_sequence(folder)  # the size comes from the next image
@@ -123,7 +123,7 @@ def test_image_of_another_size(tum_folder: Folder, write_picture: Callable) -> N
         open_sequence(folder)[4]
 
 
-def test_first_image_is_the_odd_one(tum_folder: Folder, write_picture: Callable) -> None:
+def test_the_first_image_has_another_size(tum_folder: Folder, write_picture: Callable) -> None:
     folder = tum_folder()
     write_picture(folder / "rgb" / "0.png", size=(32, 48))
     sequence = open_sequence(folder)
@@ -173,7 +173,7 @@ def test_names_with_spaces_and_hashes(tum_folder: Folder, write_picture: Callabl
     assert torch.equal(open_sequence(folder)[0].image[0, 0], torch.from_numpy(image).float() / 255)
 
 
-def test_without_calibration_asks_for_the_camera(tum_folder: Folder) -> None:
+def test_a_missing_calibration_is_reported(tum_folder: Folder) -> None:
     folder = tum_folder(calibration=None)
     with pytest.raises(CalibrationError, match="--camera fx,fy,cx,cy"):
         _ = open_sequence(folder).camera
