@@ -68,9 +68,10 @@ def ray_data(
 ) -> Iterator[tuple[int, Columns | None]]:
     """Run `Engine.each` as Ray tasks of one row and one processor each.
 
-    workers: maximum number at a time; None: the number of processors
-    address: of a cluster (`auto`, `ray://HOST:10001`), whose nodes have this package and the files at the same paths;
-             None: a temporary cluster of this machine
+    Args:
+        workers: maximum number of workers at a time; None: the number of processors
+        address: address of a cluster (`auto`, `ray://HOST:10001`), whose nodes have this package and the files at the
+            same paths; None: a temporary cluster of this machine
     """
     ray, data = _import_ray()
     _start(ray, workers, address)

@@ -73,7 +73,8 @@ def counts(rows: Sequence[Mapping[str, Any]]) -> str:
 def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
     """Read the rows of the table from the records in the folder of a batch; an invalid record is an error row.
 
-    configurations: of the tasks, by `task.configuration`; empty if that failed
+    Args:
+        configurations: configuration of each task by `task.configuration`; empty if that failed
     """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):

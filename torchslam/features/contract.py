@@ -101,7 +101,8 @@ def _described(values: object) -> str:
 def only_where(features: Features, wanted: Tensor) -> Features:
     """Features without the keypoints whose nearest pixel is not wanted; pixels beyond the image count as its edge.
 
-    wanted: (B, 1, H, W) bool.
+    Args:
+        wanted: (B, 1, H, W) bool.
     """
     height, width = wanted.shape[-2:]
     x, y = features.keypoints.detach().round().to(torch.int64).unbind(-1)

@@ -56,9 +56,13 @@ class XFeat(nn.Module):
     def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
 
-        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
+        Rows are in order of falling score, masked ones last.
 
-        Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
+        Args:
+            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
+
+        Raises:
+            ValueError: for another shape or type
         """
         from kornia.geometry.subpix import nms2d
 
@@ -128,10 +132,14 @@ class ALIKED(nn.Module):
     def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
         """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
 
-        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere. The network's own detector knows no mask,
-                so that its other keypoints are lost rather than replaced
+        Rows are in order of falling score, masked ones last.
 
-        Raises ValueError for another shape or type. Rows are in order of falling score, masked ones last.
+        Args:
+            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere. The detector of the network has
+                no mask, so keypoints elsewhere are dropped, not replaced
+
+        Raises:
+            ValueError: for another shape or type
         """
         check_images(images, wanted)
         found = self.network(images.float())

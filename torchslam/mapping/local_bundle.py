@@ -33,10 +33,11 @@ HUBER = CHI_SQUARE_95**0.5  # whitened residual at which the kernel leaves its q
 class BundleWindow:
     """A part of the map that is adjusted at once.
 
-    keyframes: (k,) rows, ascending
-    point_ids: (p,) rows
-    seen:      observations of the points by the keyframes
-    problem:   the same as a bundle adjustment problem
+    Attributes:
+        keyframes: (k,) rows, ascending
+        point_ids: (p,) rows
+        seen: observations of the points by the keyframes
+        problem: the same, as a bundle adjustment problem
     """
 
     keyframes: Tensor
@@ -219,7 +220,8 @@ class ApplyAt(Enum):
 class AdjustmentRequest:
     """A requested adjustment: applied after frame `due`, or before the next frame if `due` is None.
 
-    version: `Map.version` at the time of the request
+    Attributes:
+        version: `Map.version` at the time of the request
     """
 
     due: int | None
@@ -242,7 +244,8 @@ class AsyncBundleAdjustment:
     Until it is applied, only the frame counters of the map may change; hence the result does not depend on when or
     where it is solved.
 
-    solver: solves in this process by default
+    Args:
+        solver: solver of the problem; default: in this process
     """
 
     def __init__(

@@ -127,7 +127,8 @@ def _name(frame: Frame) -> str:
 class Simulated:
     """Simulated features of a random scene around the true trajectory.
 
-    T_cw_groundtruth: (F, 4, 4) true poses, around which the scene lies
+    Args:
+        T_cw_groundtruth: (F, 4, 4) true poses, around which the scene is generated
     """
 
     def __init__(self, config: Config, camera: Camera, T_cw_groundtruth: Tensor) -> None:
@@ -160,7 +161,8 @@ class Simulated:
 class WithFeatures(Transformed):
     """A sequence whose frames bring features, extracted when they are read.
 
-    extract: from a frame of the sequence to its features
+    Args:
+        extract: function from a frame to its features
     """
 
     def __init__(self, whole: Sequence, extract: Extractor) -> None:
@@ -182,7 +184,11 @@ class WithFeatures(Transformed):
 def source(sequence: Sequence, config: Config, camera: Camera) -> Sequence:
     """The sequence as a run reads it: with simulated features if these are configured, else as it is.
 
-    camera: that of the run, on its device. Raises ConfigError for simulated features without true poses.
+    Args:
+        camera: camera of the run, on its device
+
+    Raises:
+        ConfigError: for simulated features without true poses
     """
     if config.features.kind != "simulated" or sequence.brings_features:
         return sequence

@@ -51,14 +51,16 @@ class Frames(Protocol):
 class Run:
     """The result of a run.
 
-    submaps:       in the order of their creation; mostly one
-    results:       one per processed frame
-    skipped:       messages about the frames that could not be read
-    interrupted:   whether the run was stopped by the user
-    failure:       why no frame has a pose; empty if some have
-    loop_closures: the loops that were closed, and the places at which submaps were merged
-    session:       number of the run among those over the same map; frames and trajectories are those of this session
-    sessions:      number of sessions of the map, without those that only localized
+    Attributes:
+        submaps: submaps in the order of their creation; usually one
+        results: one result per processed frame
+        skipped: messages about the frames that could not be read
+        interrupted: True if the user stopped the run
+        failure: reason why no frame has a pose; empty if some have one
+        loop_closures: closed loops and merges of submaps
+        session: number of the run among those over the same map; frames and trajectories are those of this
+            session
+        sessions: number of sessions of the map, without those that only localized
     """
 
     submaps: tuple[Submap, ...]
@@ -144,8 +146,10 @@ class Run:
 class RunProgress:
     """How far a run has come.
 
-    next:    index of the frame that comes next
-    results: one per processed frame; skipped: the frames that could not be read, in words
+    Attributes:
+        next: index of the next frame
+        results: one result per processed frame
+        skipped: messages about the frames that could not be read
     """
 
     next: int = 0
@@ -166,11 +170,13 @@ def run_sequence(
     A frame that cannot be read, or that does not fit the camera or the order of time, is skipped with a warning and
     counted; an interrupt ends the run, or its final adjustment, and keeps what there is.
 
-    so_far:    progress to resume from; it is updated after every frame
-    adjusting: called before each iteration of the final adjustments with its number and the most there are
-    frames:    the frames of the sequence, if they are not read from itself
+    Args:
+        so_far: progress to resume from; it is updated after every frame
+        adjusting: called before each iteration of the final adjustments with its number and the maximum
+        frames: source of the frames; None: the sequence
 
-    Raises TorchslamError where the system has processed frames that `so_far` does not know of.
+    Raises:
+        TorchslamError: if the system has processed frames that are missing in `so_far`
     """
     if slam.last_frame is not None and (so_far is None or not so_far.next):
         raise TorchslamError(

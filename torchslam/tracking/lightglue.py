@@ -23,8 +23,11 @@ MAX_BYTES = 1 << 30  # of a file of weights
 class LightGlue(nn.Module):
     """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
 
-    weights: safetensors or .pt/.pth file; which variant it is, its shapes tell
-    Raises ConfigError if the file cannot be read or holds another network.
+    Args:
+        weights: safetensors or .pt/.pth file; the shapes determine the variant
+
+    Raises:
+        ConfigError: if the file cannot be read or holds another network.
     """
 
     weighs = True

@@ -111,9 +111,14 @@ def hamming(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
 def sign_products(descriptors_1: Tensor, descriptors_2: Tensor, amplitude: int) -> Tensor:
     """Inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
 
-    descriptors_1: (..., N1, D) uint8; descriptors_2: (..., N2, D) uint8; amplitude: at most 64. Returns
-    (..., N1, N2), int32 where the processor multiplies int8 matrices quickly, else float32. Both are exact, as the
-    sums stay below 2^24.
+    Args:
+        descriptors_1: (..., N1, D) uint8
+        descriptors_2: (..., N2, D) uint8
+        amplitude: at most 64
+
+    Returns:
+        (..., N1, N2), int32 if the processor multiplies int8 matrices quickly, else float32. Both are exact,
+            because the sums stay below 2^24.
     """
     signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
     return int8_product(signs_1, signs_2.mT)
@@ -146,11 +151,12 @@ def _fast_int8(device: torch.device) -> bool:
 class Nearest(NamedTuple):
     """Nearest columns of N1 rows.
 
-    column:   (B, N1) the nearest column
-    distance: (B, N1) to it
-    found:    (B, N1) whether any column may match
-    mutual:   (B, N1) whether no other row is nearer to that column
-    second:   (B, N1) distance of the second nearest column, if requested
+    Attributes:
+        column: (B, N1) the nearest column
+        distance: (B, N1) distance to it
+        found: (B, N1) bool, some column may match
+        mutual: (B, N1) bool, no other row is nearer to that column
+        second: (B, N1) distance of the second nearest column, if requested
     """
 
     column: Tensor
