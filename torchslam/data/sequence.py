@@ -64,7 +64,7 @@ class Sequence(ABC):
         guessed: bool = False,
         notes: Iterable[str] = (),
     ) -> None:
-        """Args: `size` of the images, required without a camera; `guessed`: the camera is approximate."""
+        """Take the size of the images (required without a camera); `guessed`: the camera is approximate."""
         self.name = name
         self.kind = kind
         known = size if camera is None else camera.size
