@@ -45,11 +45,11 @@ def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
         descriptors = torch.randint(0, 256, (20, 32), generator=generator, dtype=torch.uint8)
         covariances_w = 0.01 * torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
         ids = made.add_points(3 * offsets, descriptors, keyframe, covariances_w)
-        made.observe(keyframe, torch.arange(20), ids)
+        made.add_observations(keyframe, torch.arange(20), ids)
         if keyframe:
-            made.observe(keyframe, torch.arange(20, 30), ids[:10] - 20)
-    made.refresh(torch.arange(made.num_keyframes))
-    made.invalidate(torch.tensor([3]))
+            made.add_observations(keyframe, torch.arange(20, 30), ids[:10] - 20)
+    made.update_appearance(torch.arange(made.num_keyframes))
+    made.remove_points(torch.tensor([3]))
     return made
 
 
@@ -60,7 +60,7 @@ def submap(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> 
     nothing = torch.zeros(0, dtype=torch.int64)
     for result in results:
         if result.T_cw is not None:
-            view = replace(slam_map.view(0), index=result.index, timestamp=result.timestamp)
+            view = replace(slam_map.frame_features(0), index=result.index, timestamp=result.timestamp)
             T_cw = se3_inverse(trajectory.T_wc[result.index])
             seen = PoseEstimate(T_cw, nothing, nothing, 0, torch.eye(6, dtype=torch.float64), 1.0)
             made.posed_frames.add(view, seen, T_cw @ se3_inverse(slam_map.T_cw[0]), 0)

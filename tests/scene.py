@@ -117,12 +117,12 @@ def world_in(
                 transform(S_ws, scene.points_w[order]), scene.descriptors[order], keyframe
             )
         at = torch.nonzero(view.mask & known[scene.shows(first + offset)])[:, 0]
-        submap.map.observe(keyframe, at, rows[scene.shows(first + offset)[at]])
+        submap.map.add_observations(keyframe, at, rows[scene.shows(first + offset)[at]])
         estimate = tracked_at(submap.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
         submap.posed_frames.add(view, estimate, UNTOUCHED, keyframe)
-    submap.map.refresh(torch.arange(len(T_cw)))
+    submap.map.update_appearance(torch.arange(len(T_cw)))
     lonely = torch.nonzero(submap.map.points["times_observed"] == 0)[:, 0]
-    submap.map.invalidate(lonely)
+    submap.map.remove_points(lonely)
     Tracker(CAMERA, Config()).reset_to_keyframe(submap, len(T_cw) - 1)
     return submap
 

@@ -56,7 +56,7 @@ class Walk:
             self._add(index)
         slam_map = self.submap.map
         for some in torch.arange(keyframes).split(100):
-            slam_map.refresh(some)
+            slam_map.update_appearance(some)
         self.submap.num_cull_checked = keyframes
         self.loop_closer = LoopCloser(CAMERA, Config(), self.atlas)
 
@@ -95,7 +95,7 @@ class Walk:
         new = seen[(self.rows[seen] < 0) & (seen % UNMAPPED > 0)]
         self.rows[new] = slam_map.add_points(self.points_w[new], self.descriptors[new], keyframe)
         at = torch.nonzero(self.rows[seen] >= 0)[:, 0]
-        slam_map.observe(keyframe, at, self.rows[seen[at]])
+        slam_map.add_observations(keyframe, at, self.rows[seen[at]])
 
     def next(self) -> dict[str, float]:
         """Map the next keyframe; returns the milliseconds of the process by stage."""

@@ -64,9 +64,9 @@ def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: 
 def test_counts_of_several_worlds_and_sessions(run: Run, submap: Submap) -> None:
     """Frames 10 to 14 uncertain in submap 0; from frame 22 in submap 3, which has as many frames of another session."""
     other = Submap(3, submap.tracking)
-    other.map.add_keyframe(replace(submap.map.view(0), session=2), submap.map.T_cw[0])
+    other.map.add_keyframe(replace(submap.map.frame_features(0), session=2), submap.map.T_cw[0])
     for index in range(30):
-        view = replace(submap.map.view(0), index=index, session=int(index < 22))
+        view = replace(submap.map.frame_features(0), index=index, session=int(index < 22))
         estimate = PoseEstimate(
             submap.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
         )

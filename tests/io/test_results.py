@@ -30,9 +30,9 @@ def write(run: Run, directory: Path) -> None:
 def two(run: Run, submap: Submap) -> Run:
     """A second submap with two frames."""
     other = Submap(3, submap.tracking)
-    other.map.add_keyframe(replace(submap.map.view(0), index=18, timestamp=100.6), submap.map.T_cw[0])
+    other.map.add_keyframe(replace(submap.map.frame_features(0), index=18, timestamp=100.6), submap.map.T_cw[0])
     for index in (18, 19):
-        view = replace(submap.map.view(0), index=index, timestamp=100 + index / 30)
+        view = replace(submap.map.frame_features(0), index=index, timestamp=100 + index / 30)
         seen = PoseEstimate(
             submap.map.T_cw[0], *[torch.zeros(0, dtype=torch.int64)] * 2, 0, torch.eye(6), 1.0
         )

@@ -58,9 +58,9 @@ def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
         if keyframe < EARLY:
             early.update(seen)
         ids = torch.tensor([rows[name] for name in names])
-        submap.map.observe(keyframe, at, ids)
+        submap.map.add_observations(keyframe, at, ids)
         submap.posed_frames.add(view, tracked_at(true, ids, at), pose(), keyframe)
-    submap.map.refresh(torch.arange(KEYFRAMES))
+    submap.map.update_appearance(torch.arange(KEYFRAMES))
     submap.apply_sim3_correction(drifted(T_cw, scale, twist))
     Tracker(CAMERA, Config()).reset_to_keyframe(submap, END)
     return submap

@@ -16,7 +16,7 @@ def keyframes_that_see(*ranges: tuple[int, int]) -> Map:
         if index == 0:
             slam_map.add_points(scene.points_w, scene.descriptors, 0)
         seen = torch.arange(start, end)
-        slam_map.observe(index, seen, seen)
+        slam_map.add_observations(index, seen, seen)
     return slam_map
 
 

@@ -53,7 +53,7 @@ def test_a_way_that_drifted_comes_back() -> None:
     assert error(submap) < 2e-3
     visible = {int(p) for k, T in enumerate(around()) for p in visible_points(k, T)}
     assert submap.map.num_points <= len(visible) + 0.02 * points < points
-    assert int(submap.map.observers(submap.map.points_seen_by(torch.tensor([0])))[END]) > 50
+    assert int(submap.map.count_observed(submap.map.observed_points(torch.tensor([0])))[END]) > 50
 
 
 def visible_points(keyframe: int, T_cw: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ def test_the_final_adjustment_can_be_left_out() -> None:
         unit = torch.linalg.det(T_cw[:, :3, :3]) ** (1 / 3)
         torch.testing.assert_close(submap.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
         torch.testing.assert_close(submap.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])
-        assert len(submap.map.points_seen_by(torch.tensor([0]))) > 0
+        assert len(submap.map.observed_points(torch.tensor([0]))) > 0
 
 
 @pytest.mark.parametrize("asks", ["younger", "older"])
@@ -117,7 +117,7 @@ def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), submap.map.T_cw, atol=1e-5, rtol=0)
     once = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
     assert len(once) == submap.map.num_points  # every point of the scene is there once
-    shared = submap.map.observers(submap.map.points_seen_by(torch.tensor([1])))
+    shared = submap.map.count_observed(submap.map.observed_points(torch.tensor([1])))
     assert int(shared[6]) > 100
 
 
@@ -144,10 +144,10 @@ def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     first = submap.map.num_keyframes
     submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
     looks = submap.map.points["descriptors"].long() @ torch.arange(1, 33)
-    early, late = (submap.map.points_seen_by(torch.arange(start, start + VISIT)) for start in (0, first))
+    early, late = (submap.map.observed_points(torch.arange(start, start + VISIT)) for start in (0, first))
     same = torch.nonzero(looks[late][:, None] == looks[early])[:tied]
-    submap.map.replace(late[same[:, 0]], early[same[:, 1]])
-    submap.map.refresh(torch.arange(submap.map.num_keyframes))
+    submap.map.merge_points(late[same[:, 0]], early[same[:, 1]])
+    submap.map.update_appearance(torch.arange(submap.map.num_keyframes))
     Tracker(CAMERA, CONFIG).reset_to_keyframe(submap, submap.map.num_keyframes - 1)
     return submap
 
@@ -173,13 +173,13 @@ def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> No
     submap = two_visits(S_21)
     last = submap.map.num_keyframes - 1
     early = torch.arange(VISIT)
-    before = int(submap.map.observers(submap.map.points_seen_by(early))[last])
+    before = int(submap.map.count_observed(submap.map.observed_points(early))[last])
     fuse_with_earlier_visits(submap, last, CAMERA, CONFIG)
-    seen = submap.map.points_seen_by(torch.tensor([last]))
-    visible = submap.map.points_seen_by(early)
-    after = int(submap.map.observers(visible)[last])
+    seen = submap.map.observed_points(torch.tensor([last]))
+    visible = submap.map.observed_points(early)
+    after = int(submap.map.count_observed(visible)[last])
     assert after > 2 * before
-    assert int(submap.map.observers(seen)[early].min()) > 0.8 * after
+    assert int(submap.map.count_observed(seen)[early].min()) > 0.8 * after
     # the track looks for what is alive
     assert bool(submap.map.points["is_valid"][submap.tracking.local_points].all())
     assert bool(submap.map.points["is_valid"][submap.tracking.last_inlier_points].all())
@@ -200,10 +200,10 @@ def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
     for one in (1, VISIT + 2):
         seen = submap.map.keyframes["point_ids"][one]
         keypoints = torch.nonzero(seen >= 0)[:, 0]
-        submap.map.forget(torch.full_like(keypoints, one), keypoints)
+        submap.map.remove_observations(torch.full_like(keypoints, one), keypoints)
     fuse_landmarks(submap.map, here, there, CAMERA, CONFIG)
-    assert int(submap.map.observers(submap.map.points_seen_by(here))[1]) > 100
-    assert int(submap.map.observers(submap.map.points_seen_by(there))[VISIT + 2]) > 100
+    assert int(submap.map.count_observed(submap.map.observed_points(here))[1]) > 100
+    assert int(submap.map.count_observed(submap.map.observed_points(there))[VISIT + 2]) > 100
 
 
 def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) -> None:

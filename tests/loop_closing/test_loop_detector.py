@@ -35,7 +35,7 @@ def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetecto
     atlas._submaps = list(held)
     for submap in held:
         for keyframe in range(submap.map.num_keyframes):
-            view = submap.map.view(keyframe)
+            view = submap.map.frame_features(keyframe)
             database.add(submap.map.key(keyframe), view.descriptors, view.mask)
     return LoopDetector(CAMERA, load_config(None, overrides), atlas, database)
 
@@ -101,7 +101,7 @@ def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
 def test_what_two_steps_reach() -> None:
     slam_map = ring_world().map
     near = covisible_twice(slam_map, 10)
-    shared = slam_map.observers(slam_map.points_seen_by(torch.tensor([10])))
+    shared = slam_map.count_observed(slam_map.observed_points(torch.tensor([10])))
     assert set(torch.nonzero(shared)[:, 0].tolist()) <= set(near.tolist())
     furthest = int(torch.nonzero(shared)[-1])
     assert int(near.max()) > furthest

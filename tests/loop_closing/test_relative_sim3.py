@@ -46,11 +46,11 @@ def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
     relation = related(map_1, map_2)
     assert relation is not None
     torch.testing.assert_close(relation.S_21, S_21, atol=1e-6, rtol=0)
-    seen = set(map_1.points_seen_by(torch.tensor([2])).tolist())
-    there = set(map_2.points_seen_by(torch.arange(4)).tolist())
+    seen = set(map_1.observed_points(torch.tensor([2])).tolist())
+    there = set(map_2.observed_points(torch.arange(4)).tolist())
     assert relation.forward == relation.pairs == len(seen & there)  # rows are the same in both
-    back = set(map_2.points_seen_by(torch.tensor([1])).tolist())
-    here = set(map_1.points_seen_by(torch.arange(4)).tolist())
+    back = set(map_2.observed_points(torch.tensor([1])).tolist())
+    here = set(map_1.observed_points(torch.arange(4)).tolist())
     assert relation.backward == len(back & here)
 
 
@@ -110,7 +110,7 @@ def test_points_that_look_alike_but_lie_elsewhere_are_not_related(S_21: Tensor) 
 def thinned(slam_map: Map, points: Tensor) -> Map:
     """Only these points are left."""
     living = slam_map.valid_points()
-    slam_map.invalidate(living[~torch.isin(living, points)])
+    slam_map.remove_points(living[~torch.isin(living, points)])
     return slam_map
 
 

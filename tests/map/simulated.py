@@ -1,4 +1,4 @@
-"""A world that a camera might have made: keyframes that look at a cloud, frames between them, and a track."""
+"""A simulated submap: keyframes that look at a point cloud, frames between them, and a tracking state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def path(frames: int) -> Tensor:
 def view_of(
     index: int, T_cw: Tensor, points_w: Tensor, generator: torch.Generator, session: int = 0
 ) -> FrameFeatures:
-    """A view that sees point i at keypoint i, with half a pixel of noise, at scales of 1 to 3 px."""
+    """Features that see point i at keypoint i, with half a pixel of noise, at scales of 1 to 3 px."""
     pixels, _ = CAMERA.project(transform(T_cw, points_w))
     count = len(points_w)
     return FrameFeatures(
@@ -37,7 +37,7 @@ def view_of(
     )
 
 
-def tracked_at(
+def estimate_at(
     T_cw: Tensor,
     point_ids: Tensor,
     keypoints: Tensor,
@@ -45,7 +45,7 @@ def tracked_at(
     matches: int | None = None,
     **values: float | Tensor,
 ) -> PoseEstimate:
-    """A frame tracked at T_cw (4, 4), all of its matches inliers, without a doubt; `values` say otherwise."""
+    """A certain pose estimate at T_cw (4, 4) whose matches are all inliers; `values` override fields."""
     certain: dict[str, float | Tensor] = {
         "covariance": 1e-6 * torch.eye(6, dtype=T_cw.dtype),
         "depth": 4.0,
@@ -62,7 +62,7 @@ def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
     return 1e-4 * (root @ root.mT + torch.eye(size, dtype=torch.float64))
 
 
-def simulated_world(
+def simulated_submap(
     seed: int = 0, frames: int = 14, points: int = 40, number: int = 0, session: int = 0
 ) -> Submap:
     """Every third frame is a keyframe and sees most of the points; the frames between refer to the one before."""
@@ -82,12 +82,12 @@ def simulated_world(
             ids[new] = slam_map.add_points(
                 cloud_w[new], view.descriptors[new], keyframe, spreads(len(new), 3, generator)
             )
-            slam_map.observe(keyframe, seen, ids[seen])
+            slam_map.add_observations(keyframe, seen, ids[seen])
         seen = seen[ids[seen] >= 0]
         T_cr = T_cw[index] @ se3_inverse(slam_map.T_cw[keyframe])
-        submap.posed_frames.add(view, tracked_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
+        submap.posed_frames.add(view, estimate_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
     everyone = torch.arange(slam_map.num_keyframes)
-    slam_map.refresh(everyone)
+    slam_map.update_appearance(everyone)
     slam_map.keyframes["covariances"][:] = spreads(len(everyone), 6, generator)
     last = int(everyone[-1])
     submap.tracking = TrackingState(
@@ -95,9 +95,9 @@ def simulated_world(
         reference=last,
         reference_size=10,
         velocity=T_cw[-1] @ se3_inverse(T_cw[-2]),
-        last_inlier_points=slam_map.points_seen_by(everyone[-1:]),
+        last_inlier_points=slam_map.observed_points(everyone[-1:]),
         local_keyframes=everyone.flip(0),
-        local_points=slam_map.points_seen_by(everyone),
+        local_points=slam_map.observed_points(everyone),
     )
     return submap
 

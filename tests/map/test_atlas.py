@@ -1,18 +1,18 @@
-"""Several worlds beside each other, and a second camera in one of them."""
+"""Several submaps, and a second camera in one of them."""
 
 from __future__ import annotations
 
 import torch
 
-from tests.map.simulated import simulated_world
-from tests.scene import CAMERA, Scene, pose, sideways, world_in
+from tests.map.simulated import simulated_submap
+from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from torchslam.geometry import se3_inverse
 from torchslam.map.atlas import Atlas, TrackingState
 from torchslam.map.compaction import RowRemap, replacement_keyframe
 from torchslam.map.map import Map
 
 
-def test_worlds_are_numbered_as_they_begin_and_numbers_are_not_used_again() -> None:
+def test_submaps_are_numbered_in_order_and_numbers_are_not_reused() -> None:
     submaps = Atlas(CAMERA.params)
     assert submaps.main() is None
     created = [submaps.create() for _ in range(3)]
@@ -26,8 +26,8 @@ def test_worlds_are_numbered_as_they_begin_and_numbers_are_not_used_again() -> N
     assert created[1].tracking.T_cr.dtype == CAMERA.params.dtype
 
 
-def test_the_main_world_is_that_of_most_frames() -> None:
-    held = [simulated_world(frames=frames, number=number) for number, frames in enumerate((9, 12, 12))]
+def test_the_main_submap_has_the_most_frames() -> None:
+    held = [simulated_submap(frames=frames, number=number) for number, frames in enumerate((9, 12, 12))]
     submaps = Atlas(CAMERA.params)
     submaps._submaps = held
     assert submaps.main() is held[1]
@@ -35,9 +35,9 @@ def test_the_main_world_is_that_of_most_frames() -> None:
     assert submaps.main() is held[2]
 
 
-def test_a_keyframe_is_found_by_its_name_in_whichever_world_it_is() -> None:
+def test_a_keyframe_is_found_by_its_key_in_any_submap() -> None:
     scene = Scene.of(30)
-    held = [world_in(scene, sideways(3), first=first) for first in (0, 40)]
+    held = [submap_of_scene(scene, sideways(3), first=first) for first in (0, 40)]
     submaps = Atlas(CAMERA.params)
     empty = submaps.create()
     submaps._submaps += held
@@ -47,13 +47,13 @@ def test_a_keyframe_is_found_by_its_name_in_whichever_world_it_is() -> None:
     assert submaps.find(7) is None
     assert empty.map.row(0) == -1
     assert Map().row(0) == -1
-    single = world_in(scene, sideways(1), first=5)
+    single = submap_of_scene(scene, sideways(1), first=5)
     assert single.map.row(5) == 0
     assert single.map.row(6) == -1
 
 
-def test_a_second_camera_has_a_track_of_its_own() -> None:
-    submap = simulated_world()
+def test_a_second_camera_has_its_own_tracking_state() -> None:
+    submap = simulated_submap()
     before = submap.T_cw.clone()
     aside = submap.fork()
     aside.tracking.reference = 0
@@ -65,26 +65,26 @@ def test_a_second_camera_has_a_track_of_its_own() -> None:
     torch.testing.assert_close(submap.T_cw, before)
 
 
-def test_the_nearest_of_those_that_share_most_stands_in() -> None:
+def test_the_nearest_of_the_most_covisible_keyframes_is_the_replacement() -> None:
     """Cameras in a row that look at one scene: those on either side are as near as the step says."""
     T_cw = sideways(6)
     T_cw[3, 0, 3], T_cw[3, 1, 3] = T_cw[2, 0, 3] - 0.05, 0.02  # nearer to 2 than 1 is
-    slam_map = world_in(Scene.of(200), T_cw).map
-    centres = se3_inverse(slam_map.T_cw)[:, :3, 3]
+    slam_map = submap_of_scene(Scene.of(200), T_cw).map
+    centers = se3_inverse(slam_map.T_cw)[:, :3, 3]
     for removed in ([2], [2, 3], [2, 3, 1], [0, 2]):
         gone = torch.zeros(6, dtype=torch.bool)
         gone[removed] = True
-        distance = (centres - centres[2]).norm(dim=-1).masked_fill(gone, torch.inf)
+        distance = (centers - centers[2]).norm(dim=-1).masked_fill(gone, torch.inf)
         assert replacement_keyframe(slam_map, 2, gone) == int(distance.argmin())
 
 
-def test_of_many_only_those_that_share_most_stand_in() -> None:
+def test_only_the_most_covisible_keyframes_can_be_replacements() -> None:
     """With a single candidate, the one that shares most is taken, though another is nearer."""
     T_cw = sideways(3)
     T_cw[1, 0, 3], T_cw[2, 0, 3] = -0.1, 0.4
-    slam_map = world_in(Scene.of(200), T_cw).map
-    seen = slam_map.points_seen_by(torch.tensor([1]))
-    slam_map.forget(
+    slam_map = submap_of_scene(Scene.of(200), T_cw).map
+    seen = slam_map.observed_points(torch.tensor([1]))
+    slam_map.remove_observations(
         torch.ones(len(seen) - 3, dtype=torch.int64),
         torch.nonzero(slam_map.keyframes["point_ids"][1] >= 0)[3:, 0],
     )
@@ -93,7 +93,7 @@ def test_of_many_only_those_that_share_most_stand_in() -> None:
     assert replacement_keyframe(slam_map, 0, gone, count=2) == 1
 
 
-def test_two_renumberings_one_after_the_other() -> None:
+def test_row_remaps_compose() -> None:
     one = RowRemap(torch.tensor([0, -1, 1]), torch.tensor([1, -1, 0, 2]), torch.tensor([0, 1, 1]))
     two = RowRemap(torch.tensor([-1, 0]), torch.tensor([2, -1, 0]), torch.tensor([0, 0]))
     both = one.then(two)

@@ -1,4 +1,4 @@
-"""A world without some of its keyframes and points says of the others what it said before."""
+"""Removing keyframes and points leaves the rest of a submap unchanged."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.map.simulated import CAMERA, path, reprojection_errors, simulated_world, view_of
+from tests.map.simulated import CAMERA, path, reprojection_errors, simulated_submap, view_of
 from tests.map.test_observation_index import check
 from torchslam.map import compaction
 from torchslam.map.atlas import Submap
@@ -22,7 +22,7 @@ FRAMES = 20
 @pytest.fixture
 def submap() -> Submap:
     """Seven keyframes, the last one the track's reference."""
-    return simulated_world(frames=FRAMES)
+    return simulated_submap(frames=FRAMES)
 
 
 def pairs(graph: RunGraph) -> dict[tuple[int, int], tuple[float, float]]:
@@ -43,7 +43,7 @@ def by_frame(graph: RunGraph) -> Tensor:
     return graph.T_cw[torch.argsort(graph.frame_ids)]
 
 
-def test_no_frame_moves_when_keyframes_go(submap: Submap) -> None:
+def test_removing_keyframes_moves_no_frame(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     remove_keyframes(submap, GONE)
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), before.posed_frames.T_cw(before.map))
@@ -53,7 +53,7 @@ def test_no_frame_moves_when_keyframes_go(submap: Submap) -> None:
     assert int(submap.posed_frames.frames["reference_keyframe"].max()) < submap.map.num_keyframes == 5
 
 
-def test_the_other_keyframes_see_what_they_saw(submap: Submap) -> None:
+def test_the_other_keyframes_keep_their_observations(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     renumbering = remove_keyframes(submap, GONE)
     assert renumbering.keyframes.tolist() == [0, -1, 1, -1, 2, 3, 4]
@@ -68,14 +68,14 @@ def test_the_other_keyframes_see_what_they_saw(submap: Submap) -> None:
     check(submap.map)
 
 
-def test_the_heir_of_a_keyframe_is_near_it_and_stays(submap: Submap) -> None:
+def test_the_replacement_of_a_keyframe_is_near_and_is_kept(submap: Submap) -> None:
     replacement = remove_keyframes(submap, GONE).replacement
     assert replacement.tolist()[::2] == [0, 1, 2, 4]
-    assert replacement[1] in (0, 1)  # old rows 0 and 2, its neighbours on the way
+    assert replacement[1] in (0, 1)  # old rows 0 and 2, its neighbors on the way
     assert replacement[3] in (1, 2)
 
 
-def test_points_are_left_to_a_keyframe_that_sees_them(submap: Submap) -> None:
+def test_points_are_assigned_to_a_keyframe_that_observes_them(submap: Submap) -> None:
     made_by_gone = torch.isin(submap.map.points["first_keyframe"], GONE)
     assert int(made_by_gone.sum()) > 0
     remove_keyframes(submap, GONE)
@@ -86,14 +86,14 @@ def test_points_are_left_to_a_keyframe_that_sees_them(submap: Submap) -> None:
     assert int(points["first_keyframe"].max()) < submap.map.num_keyframes
 
 
-def test_the_graph_keeps_what_removed_keyframes_saw_last(submap: Submap) -> None:
+def test_the_graph_keeps_observations_of_removed_keyframes(submap: Submap) -> None:
     """Not what their frames were tracked with: a dropped observation stays dropped, a new one stays."""
     keyframe = int(GONE[1])
     seen = torch.nonzero(submap.map.keyframes["point_ids"][keyframe] >= 0)[:, 0]
-    submap.map.forget(GONE[1:], seen[:1])
+    submap.map.remove_observations(GONE[1:], seen[:1])
     first = submap.map.keyframes["point_ids"][keyframe]
-    free, others = torch.nonzero(first < 0)[1:2, 0], submap.map.points_seen_by(torch.tensor([2]))
-    submap.map.observe(keyframe, free, others[~torch.isin(others, first)][:1])
+    free, others = torch.nonzero(first < 0)[1:2, 0], submap.map.observed_points(torch.tensor([2]))
+    submap.map.add_observations(keyframe, free, others[~torch.isin(others, first)][:1])
     before = copy.deepcopy(submap)
     remove_keyframes(submap, GONE)
     old, new = before.posed_frames.graph(before.map, CAMERA), submap.posed_frames.graph(submap.map, CAMERA)
@@ -111,9 +111,9 @@ def test_the_graph_keeps_what_removed_keyframes_saw_last(submap: Submap) -> None
 
 
 @pytest.mark.parametrize("forgotten", [0, 5])
-def test_the_history_of_the_other_frames_is_untouched(submap: Submap, forgotten: int) -> None:
+def test_the_other_frames_are_unchanged(submap: Submap, forgotten: int) -> None:
     keypoints = torch.nonzero(submap.map.keyframes["point_ids"][3] >= 0)[:forgotten, 0]
-    submap.map.forget(torch.full_like(keypoints, 3), keypoints)
+    submap.map.remove_observations(torch.full_like(keypoints, 3), keypoints)
     before = copy.deepcopy(submap.posed_frames)
     own = torch.isin(before.observations["frame_row"], 3 * GONE)  # every third frame is a keyframe
     remove_keyframes(submap, GONE)
@@ -129,7 +129,7 @@ def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(submap: Submap) 
     view = view_of(FRAMES, T_cw, torch.rand(40, 3, generator=generator).double() + 4, generator)
     keyframe = submap.map.add_keyframe(view, T_cw)
     ids = submap.map.valid_points()[:10]
-    submap.map.observe(keyframe, torch.arange(10), ids)
+    submap.map.add_observations(keyframe, torch.arange(10), ids)
     count = len(submap.posed_frames)
     remove_keyframes(submap, torch.tensor([keyframe]))
     assert len(submap.posed_frames) == count + 1
@@ -137,13 +137,13 @@ def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(submap: Submap) 
     assert int((submap.posed_frames.observations["frame_row"] == count).sum()) == 10
 
 
-def test_what_holds_the_world_cannot_go(submap: Submap) -> None:
+def test_keyframes_in_use_cannot_be_removed(submap: Submap) -> None:
     for keyframe in (0, submap.tracking.reference):
         with pytest.raises(ValueError, match="cannot be removed"):
             remove_keyframes(submap, torch.tensor([keyframe]))
 
 
-def test_the_track_forgets_what_is_gone(submap: Submap) -> None:
+def test_the_tracking_state_drops_removed_rows(submap: Submap) -> None:
     renumbering = remove_keyframes(submap, GONE)
     assert submap.tracking.reference == renumbering.keyframes[6] == 4
     assert submap.tracking.local_keyframes.tolist() == [4, 3, 2, 1, 0]
@@ -152,13 +152,13 @@ def test_the_track_forgets_what_is_gone(submap: Submap) -> None:
 
 def thinned(submap: Submap) -> Submap:
     """Some points merged, some of these again, some dead."""
-    submap.map.replace(torch.tensor([5, 6]), torch.tensor([2, 2]))
-    submap.map.replace(torch.tensor([2]), torch.tensor([9]))
-    submap.map.invalidate(torch.tensor([0, 11, 12]))
+    submap.map.merge_points(torch.tensor([5, 6]), torch.tensor([2, 2]))
+    submap.map.merge_points(torch.tensor([2]), torch.tensor([9]))
+    submap.map.remove_points(torch.tensor([0, 11, 12]))
     return submap
 
 
-def test_dropping_dead_points_changes_nothing_but_their_numbers(submap: Submap) -> None:
+def test_compaction_only_renumbers_points(submap: Submap) -> None:
     thinned(submap)
     before = copy.deepcopy(submap)
     rows = remove_invalid_rows(submap).points
@@ -178,14 +178,14 @@ def test_dropping_dead_points_changes_nothing_but_their_numbers(submap: Submap) 
     check(submap.map)
 
 
-def test_a_merged_point_is_seen_as_its_heir_afterwards(submap: Submap) -> None:
+def test_observations_of_a_merged_point_move_to_its_replacement(submap: Submap) -> None:
     merged = torch.isin(submap.posed_frames.observations["point_ids"], torch.tensor([2, 5, 6, 9]))
     count = int(merged.sum())
     rows = remove_invalid_rows(thinned(submap)).points
     assert int((submap.posed_frames.observations["point_ids"] == rows[9]).sum()) == count
 
 
-def test_a_compacted_world_goes_on(submap: Submap) -> None:
+def test_a_compacted_submap_can_be_extended(submap: Submap) -> None:
     remove_invalid_rows(thinned(submap))
     remove_keyframes(submap, GONE)
     ids = submap.map.add_points(
@@ -193,17 +193,17 @@ def test_a_compacted_world_goes_on(submap: Submap) -> None:
     )
     assert ids.tolist() == [len(submap.map.points) - 2, len(submap.map.points) - 1]
     free = torch.nonzero(submap.map.keyframes["point_ids"][4] < 0)[:2, 0]
-    submap.map.observe(4, free, ids)
+    submap.map.add_observations(4, free, ids)
     check(submap.map)
 
 
-def test_rows_are_dropped_when_most_of_them_are_dead(submap: Submap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_dropped_when_most_are_invalid(submap: Submap, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compaction, "MIN_INVALID_ROWS", 10)
     count = len(submap.map.points)
     half = count // 2
-    submap.map.invalidate(torch.arange(half))
+    submap.map.remove_points(torch.arange(half))
     assert compact(submap) is None  # not more than half
-    submap.map.invalidate(torch.tensor([half]))
+    submap.map.remove_points(torch.tensor([half]))
     monkeypatch.setattr(compaction, "_MAX_REWRITTEN", len(submap.posed_frames.observations) / (half + 1))
     assert compact(submap) is None  # the history is too long for so few
     monkeypatch.setattr(compaction, "_MAX_REWRITTEN", 1 + len(submap.posed_frames.observations) / (half + 1))

@@ -25,7 +25,7 @@ def submap(slam_map: Map) -> Submap:
     made = Submap.empty(0, slam_map.T_cw)
     made.map = slam_map
     for index, session in ((1, 0), (2, 0), (1, 1)):
-        view = slam_map.view(0)
+        view = slam_map.frame_features(0)
         view = FrameFeatures(
             **{**view.__dict__, "index": index, "timestamp": 100.0 + index, "session": session}
         )
@@ -53,7 +53,7 @@ def tables(submap: Submap) -> list[dict[str, Tensor]]:
     return [table.columns() for table in kept]
 
 
-def test_worlds_and_camera_come_back_as_they_were(path: Path, submaps: list[Submap], camera: Camera) -> None:
+def test_submaps_and_camera_round_trip(path: Path, submaps: list[Submap], camera: Camera) -> None:
     saved = read_atlas(path)
     assert [submap.number for submap in saved.atlas] == [0, 2]
     assert saved.atlas.num_created == 3
@@ -70,7 +70,7 @@ def test_worlds_and_camera_come_back_as_they_were(path: Path, submaps: list[Subm
     assert torch.equal(saved.camera.params, camera.params)
 
 
-def test_a_loaded_map_can_grow(path: Path) -> None:
+def test_a_loaded_map_can_be_extended(path: Path) -> None:
     loaded, _ = read_map(path)
     before = loaded.num_points
     loaded.add_points(
@@ -79,7 +79,7 @@ def test_a_loaded_map_can_grow(path: Path) -> None:
     assert loaded.num_points == before + 2
 
 
-def test_same_worlds_give_same_bytes_also_when_read(
+def test_saving_is_deterministic_also_after_loading(
     path: Path, submaps: list[Submap], camera: Camera
 ) -> None:
     write_atlas(path.with_name("two"), submaps, camera, sessions=2)
@@ -99,14 +99,14 @@ def test_frames_of_later_sessions_are_left_out(path: Path, submaps: list[Submap]
         read_atlas(path)
 
 
-def test_no_worlds_are_a_file_too(tmp_path: Path, camera: Camera) -> None:
+def test_an_empty_atlas_can_be_saved(tmp_path: Path, camera: Camera) -> None:
     write_atlas(tmp_path / "map.safetensors", [], camera)
     loaded, _ = read_map(tmp_path / "map.safetensors")
     assert loaded.num_keyframes == 0
     assert loaded.num_points == 0
 
 
-def test_the_device_is_that_asked_for(path: Path, device: torch.device) -> None:
+def test_a_map_is_loaded_to_the_requested_device(path: Path, device: torch.device) -> None:
     saved = read_atlas(path, device)
     assert saved.camera.params.device.type == device.type
     for submap in saved.atlas:
@@ -117,7 +117,7 @@ def test_the_device_is_that_asked_for(path: Path, device: torch.device) -> None:
 # --- what is no map ------------------------------------------------------------------------------------------
 
 
-def test_missing_damaged_and_foreign_files_are_named(path: Path) -> None:
+def test_missing_damaged_and_unknown_files_are_named(path: Path) -> None:
     whole = path.read_bytes()
     path.unlink()
     with pytest.raises(ResultsError, match=r"map\.safetensors: no map file"):
@@ -234,7 +234,7 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         (put(O + "keypoint_index", 0, -2), "keypoint_index from -2"),
     ],
 )
-def test_tables_that_do_not_fit_are_refused(
+def test_inconsistent_tables_are_refused(
     path: Path, damage: Callable[[Tensors], object], message: str
 ) -> None:
     about, tensors = described(path), load_file(str(path))
@@ -246,7 +246,7 @@ def test_tables_that_do_not_fit_are_refused(
         read_atlas(path)
 
 
-def test_a_long_line_of_heirs_is_no_circle(path: Path) -> None:
+def test_a_long_chain_of_replacements_is_no_cycle(path: Path) -> None:
     about, tensors = described(path), load_file(str(path))
     tensors[P + "replaced_by"][:119] = torch.arange(1, 120)
     save_file(tensors, str(path), metadata={"torchslam": json.dumps(about)})
@@ -270,7 +270,7 @@ def test_a_long_line_of_heirs_is_no_circle(path: Path) -> None:
         ({"submaps": []}, "unknown tensors"),
     ],
 )
-def test_descriptions_that_do_not_fit_are_refused(path: Path, changes: dict[str, Any], message: str) -> None:
+def test_inconsistent_metadata_are_refused(path: Path, changes: dict[str, Any], message: str) -> None:
     about, tensors = described(path) | changes, load_file(str(path))
     save_file(tensors, str(path), metadata={"torchslam": json.dumps(about)})
     with pytest.raises(ResultsError, match=r"map\.safetensors: not a whole torchslam map: .*" + message):
@@ -280,9 +280,7 @@ def test_descriptions_that_do_not_fit_are_refused(path: Path, changes: dict[str,
 # --- whole or not at all -------------------------------------------------------------------------------------
 
 
-def test_a_file_that_cannot_be_written_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "map"
     write_whole(path, b"old")
 
@@ -297,7 +295,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
     assert [found.name for found in tmp_path.iterdir()] == ["map"]
 
 
-def test_what_a_killed_program_left_is_written_over(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_process_are_overwritten(tmp_path: Path) -> None:
     (tmp_path / ("map" + PART)).write_bytes(b"a half")
     write_whole(tmp_path / "map", b"whole")
     assert [found.name for found in tmp_path.iterdir()] == ["map"]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.scene import Scene, sideways, world_in
+from tests.scene import Scene, sideways, submap_of_scene
 from torchslam.map.map import NO_POINT, Map
 from torchslam.optim import Marginals
 from torchslam.types import FrameFeatures
@@ -42,7 +42,7 @@ def make_map(generator: torch.Generator) -> Map:
     positions_w = torch.rand(6, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0])
     slam_map.add_points(positions_w, torch.zeros(6, 32, dtype=torch.uint8), keyframe=0)
     for keyframe, ids in ((0, [0, 1, 2, 3]), (1, [0, 1, 2, 3, 4, 5]), (2, [4, 5])):
-        slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
+        slam_map.add_observations(keyframe, torch.arange(len(ids)), torch.tensor(ids))
     return slam_map
 
 
@@ -60,30 +60,30 @@ def test_observations_are_flat_and_ordered(small_map: Map) -> None:
 
 
 def test_covisibility(small_map: Map) -> None:
-    assert small_map.observers(torch.tensor([4, 5, 0])).tolist() == [1, 3, 2]
-    assert small_map.observers(torch.tensor([4, 5, 0]), torch.tensor([2, 1])).tolist() == [2, 3]
-    assert small_map.covisible(1, 5, min_shared=1).tolist() == [0, 2]
-    assert small_map.covisible(1, 5, min_shared=3).tolist() == [0]
-    assert small_map.covisible(1, 1, min_shared=1).tolist() == [0]
-    assert small_map.points_seen_by(torch.tensor([1, 2])).tolist() == [0, 1, 2, 3, 4, 5]
+    assert small_map.count_observed(torch.tensor([4, 5, 0])).tolist() == [1, 3, 2]
+    assert small_map.count_observed(torch.tensor([4, 5, 0]), torch.tensor([2, 1])).tolist() == [2, 3]
+    assert small_map.covisible_keyframes(1, 5, min_shared=1).tolist() == [0, 2]
+    assert small_map.covisible_keyframes(1, 5, min_shared=3).tolist() == [0]
+    assert small_map.covisible_keyframes(1, 1, min_shared=1).tolist() == [0]
+    assert small_map.observed_points(torch.tensor([1, 2])).tolist() == [0, 1, 2, 3, 4, 5]
     assert small_map.points["times_observed"].tolist() == [2] * 6
 
 
-def test_who_sees_what(small_map: Map) -> None:
-    sees = small_map.sees(torch.tensor([2, 0]), torch.tensor([5, 0, 4, 3]))
+def test_observers_of_points(small_map: Map) -> None:
+    sees = small_map.observation_mask(torch.tensor([2, 0]), torch.tensor([5, 0, 4, 3]))
     assert sees.tolist() == [[True, False, True, False], [False, True, False, True]]
-    assert small_map.sees(torch.tensor([1]), torch.tensor([], dtype=torch.int64)).shape == (1, 0)
+    assert small_map.observation_mask(torch.tensor([1]), torch.tensor([], dtype=torch.int64)).shape == (1, 0)
 
 
-def test_killed_points_are_observed_by_nobody_and_keep_their_ids(small_map: Map) -> None:
-    small_map.invalidate(torch.tensor([0, 4]))
+def test_invalidated_points_have_no_observations_and_keep_their_ids(small_map: Map) -> None:
+    small_map.remove_points(torch.tensor([0, 4]))
     assert small_map.num_points == 4
     assert small_map.valid_points().tolist() == [1, 2, 3, 5]
-    assert small_map.points_seen_by(torch.tensor([0, 1, 2])).tolist() == [1, 2, 3, 5]
+    assert small_map.observed_points(torch.tensor([0, 1, 2])).tolist() == [1, 2, 3, 5]
 
 
-def test_merging_moves_observations_and_leaves_one_per_keyframe(small_map: Map) -> None:
-    small_map.replace(torch.tensor([4]), torch.tensor([0]))
+def test_merging_moves_observations_and_keeps_one_per_keyframe(small_map: Map) -> None:
+    small_map.merge_points(torch.tensor([4]), torch.tensor([0]))
     assert small_map.keyframes["point_ids"][2, 0] == 0  # had seen 4 alone: moved
     assert (
         small_map.keyframes["point_ids"][1, 4] == NO_POINT
@@ -93,14 +93,14 @@ def test_merging_moves_observations_and_leaves_one_per_keyframe(small_map: Map) 
     assert small_map.points["times_found"][0] == 2
 
 
-def test_merged_points_resolve_to_their_last_heir(small_map: Map) -> None:
-    small_map.replace(torch.tensor([5]), torch.tensor([4]))
-    small_map.replace(torch.tensor([4]), torch.tensor([0]))
+def test_merged_points_resolve_to_their_final_replacement(small_map: Map) -> None:
+    small_map.merge_points(torch.tensor([5]), torch.tensor([4]))
+    small_map.merge_points(torch.tensor([4]), torch.tensor([0]))
     assert small_map.follow_merges(torch.tensor([5, 4, 0, 1])).tolist() == [0, 0, 0, 1]
 
 
 def test_refresh_takes_direction_scale_and_descriptor_from_the_newest_keyframe(small_map: Map) -> None:
-    small_map.refresh(torch.tensor([1, 0]))
+    small_map.update_appearance(torch.tensor([1, 0]))
     ray = small_map.positions_w[2] - torch.tensor([1.0, 0.0, 0.0])
     distance = float(ray.norm())
     assert torch.allclose(small_map.points["view_directions_w"][2], ray / distance)
@@ -108,10 +108,10 @@ def test_refresh_takes_direction_scale_and_descriptor_from_the_newest_keyframe(s
     assert torch.equal(small_map.points["descriptors"][2], small_map.keyframes["descriptors"][1, 2])
 
 
-def test_a_view_comes_back_from_its_keyframe(small_map: Map, generator: torch.Generator) -> None:
+def test_features_are_restored_from_a_keyframe(small_map: Map, generator: torch.Generator) -> None:
     view = make_view(77, generator)
     keyframe = small_map.add_keyframe(view, pose(3.0))
-    back = small_map.view(keyframe)
+    back = small_map.frame_features(keyframe)
     assert (back.index, back.timestamp) == (view.index, view.timestamp)
     assert torch.equal(back.keypoints, view.keypoints)
     assert torch.equal(back.descriptors, view.descriptors)
@@ -123,16 +123,16 @@ def test_a_view_comes_back_from_its_keyframe(small_map: Map, generator: torch.Ge
         max_size=8,
     )
 )
-def test_the_count_of_observations_is_what_the_table_holds(changes: list[tuple[str, int, int]]) -> None:
+def test_the_observation_count_agrees_with_the_table(changes: list[tuple[str, int, int]]) -> None:
     slam_map = make_map(torch.Generator().manual_seed(0))
     for change, one, other in changes:
         alive = slam_map.points["is_valid"]
         if change == "invalidate":
-            slam_map.invalidate(torch.tensor([one]))
+            slam_map.remove_points(torch.tensor([one]))
         elif change == "replace" and one != other and alive[one] and alive[other]:
-            slam_map.replace(torch.tensor([one]), torch.tensor([other]))
+            slam_map.merge_points(torch.tensor([one]), torch.tensor([other]))
         elif change == "forget" and slam_map.keyframes["point_ids"][1, one] >= 0:
-            slam_map.forget(torch.tensor([1]), torch.tensor([one]))
+            slam_map.remove_observations(torch.tensor([1]), torch.tensor([one]))
         seen = slam_map.keyframes["point_ids"]
         assert torch.equal(slam_map.points["times_observed"], torch.bincount(seen[seen >= 0], minlength=6))
         for row in seen:
@@ -140,12 +140,12 @@ def test_the_count_of_observations_is_what_the_table_holds(changes: list[tuple[s
 
 
 def test_several_points_merge_into_one(small_map: Map) -> None:
-    small_map.replace(torch.tensor([4, 5]), torch.tensor([0, 0]))
+    small_map.merge_points(torch.tensor([4, 5]), torch.tensor([0, 0]))
     assert small_map.keyframes["point_ids"][2].tolist()[:2].count(0) == 1
     assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 0]
 
 
-def test_covariances_are_taken_over_and_unknown_ones_leave_what_is_there(small_map: Map) -> None:
+def test_covariances_are_stored_and_unknown_ones_are_kept(small_map: Map) -> None:
     frames = torch.eye(6, dtype=torch.float64).repeat(3, 1, 1)
     frames[0] = 0
     points = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
@@ -157,22 +157,22 @@ def test_covariances_are_taken_over_and_unknown_ones_leave_what_is_there(small_m
     torch.testing.assert_close(small_map.center_covariances_w()[1:], points)
 
 
-def test_what_many_keyframes_share_is_what_each_of_them_shares(small_map: Map) -> None:
+def test_covisibility_of_many_keyframes_equals_that_of_each(small_map: Map) -> None:
     everyone = torch.arange(small_map.num_keyframes)
-    shared = small_map.shared(everyone)
+    shared = small_map.covisibility_weights(everyone)
     assert torch.equal(shared, shared.T)
     assert not shared.diagonal().any()
     for keyframe in everyone.tolist():
-        seen = small_map.points_seen_by(everyone[keyframe][None])
-        others = small_map.observers(seen)
+        seen = small_map.observed_points(everyone[keyframe][None])
+        others = small_map.count_observed(seen)
         others[keyframe] = 0
         assert torch.equal(shared[keyframe], others)
     assert int(shared.max()) > 0
 
 
-def test_around_are_the_nearest_of_each() -> None:
-    slam_map = world_in(Scene.of(200), sideways(8, step=0.3)).map
-    asked = torch.tensor([6, 1])
-    near = [slam_map.covisible(keyframe, 2) for keyframe in asked.tolist()]
+def test_the_local_map_unites_the_most_covisible_of_each() -> None:
+    slam_map = submap_of_scene(Scene.of(200), sideways(8, step=0.3)).map
+    keyframes = torch.tensor([6, 1])
+    near = [slam_map.covisible_keyframes(keyframe, 2) for keyframe in keyframes.tolist()]
     assert [len(some) for some in near] == [2, 2]
-    assert torch.equal(slam_map.covisibility_union(asked, 2), torch.unique(torch.cat([asked, *near])))
+    assert torch.equal(slam_map.covisibility_union(keyframes, 2), torch.unique(torch.cat([keyframes, *near])))

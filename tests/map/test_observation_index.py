@@ -69,22 +69,24 @@ def change_map(slam_map: Map, change: Change) -> None:
         fresh = living[~torch.isin(living, table[keyframe])]
         fresh = fresh[torch.unique(torch.tensor(numbers) % len(fresh))] if len(fresh) else fresh
         count = min(len(free), len(fresh))
-        slam_map.observe(keyframe, free[:count], fresh[:count])
+        slam_map.add_observations(keyframe, free[:count], fresh[:count])
     elif kind == "forget":
         rows, columns = torch.nonzero(table >= 0, as_tuple=True)
         if len(rows):
             which = torch.unique(torch.tensor(numbers) % len(rows))
-            slam_map.forget(rows[which], columns[which])
+            slam_map.remove_observations(rows[which], columns[which])
     elif kind == "invalidate" and len(living):
-        slam_map.invalidate(torch.unique(living[torch.tensor(numbers) % len(living)]))
+        slam_map.remove_points(torch.unique(living[torch.tensor(numbers) % len(living)]))
     elif kind == "replace" and len(living) > 1:
         chosen = torch.unique(living[torch.tensor(numbers) % len(living)])
         replacement = living[~torch.isin(living, chosen)]
         if len(replacement):
-            slam_map.replace(chosen, replacement[torch.arange(len(chosen)) * (number + 1) % len(replacement)])
+            slam_map.merge_points(
+                chosen, replacement[torch.arange(len(chosen)) * (number + 1) % len(replacement)]
+            )
     elif kind == "append" and len(slam_map.points) < 200:
         other = make_map(2, 3)
-        other.observe(1, torch.tensor([0, 4]), torch.tensor([2, 0]))
+        other.add_observations(1, torch.tensor([0, 4]), torch.tensor([2, 0]))
         slam_map.append(other)
 
 
@@ -102,17 +104,17 @@ def check(slam_map: Map) -> None:
         assert len(torch.unique(row[row >= 0])) == int((row >= 0).sum())
     assert not bool(((table >= 0) & ~points["is_valid"][table]).any())
     some = ids[::3]
-    assert torch.equal(slam_map.observers(some), scanned(slam_map, some).sum(1))
+    assert torch.equal(slam_map.count_observed(some), scanned(slam_map, some).sum(1))
     few = torch.arange(slam_map.num_keyframes).flip(0)[:2]
-    assert torch.equal(slam_map.observers(some, few), scanned(slam_map, some).sum(1)[few])
+    assert torch.equal(slam_map.count_observed(some, few), scanned(slam_map, some).sum(1)[few])
     for keyframe in range(slam_map.num_keyframes):
         seen = table[keyframe]
         shared = scanned(slam_map, seen[seen >= 0]).sum(1)
         shared[keyframe] = 0
         order = torch.sort(shared, descending=True, stable=True)
         expected = order.indices[:3][order.values[:3] >= 1]
-        assert torch.equal(slam_map.covisible(keyframe, 3, min_shared=1), expected)
-    keyframes, scales = slam_map.scales_of(ids)
+        assert torch.equal(slam_map.covisible_keyframes(keyframe, 3, min_shared=1), expected)
+    keyframes, scales = slam_map.observers_and_scales(ids)
     for point in ids.tolist():
         rows, columns = torch.nonzero(table == point, as_tuple=True)
         held = keyframes[point] >= 0
@@ -134,21 +136,21 @@ def test_the_index_agrees_with_a_scan_of_the_table(changes: list[Change]) -> Non
 
 
 def replaced_by_scan(table: Tensor, old: Tensor, new: Tensor, points: int) -> Tensor:
-    """The table after a merge, row by row: the heir's own keypoint stays, else the first."""
+    """The table after a merge, row by row: the replacement's own keypoint stays, else the first."""
     table = table.clone()
-    heir = dict(zip(old.tolist(), new.tolist(), strict=True))
+    replacement = dict(zip(old.tolist(), new.tolist(), strict=True))
     for row in table:
-        seen = set(row[row >= 0].tolist()) - heir.keys()
+        seen = set(row[row >= 0].tolist()) - replacement.keys()
         for keypoint, point in enumerate(row.tolist()):
-            if point in heir:
-                row[keypoint] = NO_POINT if heir[point] in seen else heir[point]
-                seen.add(heir[point])
+            if point in replacement:
+                row[keypoint] = NO_POINT if replacement[point] in seen else replacement[point]
+                seen.add(replacement[point])
     return table
 
 
 @settings(deadline=None, max_examples=60)
 @given(CHANGES, st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_merging_does_what_a_scan_of_the_table_does(changes: list[Change], replacement: list[int]) -> None:
+def test_merging_agrees_with_a_scan_of_the_table(changes: list[Change], replacement: list[int]) -> None:
     slam_map = make_map(points=12)
     for change in changes:
         change_map(slam_map, change)
@@ -157,16 +159,16 @@ def test_merging_does_what_a_scan_of_the_table_does(changes: list[Change], repla
         return
     old, new = living[3 : 3 + len(replacement)], living[torch.tensor(replacement)]
     before = slam_map.keyframes["point_ids"].clone()
-    slam_map.replace(old, new)
+    slam_map.merge_points(old, new)
     expected = replaced_by_scan(before, old, new, len(slam_map.points))
     assert torch.equal(slam_map.keyframes["point_ids"], expected)
     check(slam_map)
 
 
-def test_a_loaded_map_answers_the_same(tmp_path: Path) -> None:
+def test_a_loaded_map_has_the_same_index(tmp_path: Path) -> None:
     slam_map = make_map(3, 8)
     for keyframe, ids in ((0, [0, 1, 2]), (1, [1, 2, 3]), (2, [2, 7])):
-        slam_map.observe(keyframe, torch.arange(len(ids)), torch.tensor(ids))
+        slam_map.add_observations(keyframe, torch.arange(len(ids)), torch.tensor(ids))
     write_atlas(
         tmp_path / "map",
         [Submap(0, TrackingState.empty(torch.zeros(0, dtype=torch.float64)), slam_map)],
@@ -174,29 +176,29 @@ def test_a_loaded_map_answers_the_same(tmp_path: Path) -> None:
     )
     loaded, _ = read_map(tmp_path / "map")
     check(loaded)
-    loaded.invalidate(torch.tensor([2]))
+    loaded.remove_points(torch.tensor([2]))
     check(loaded)
 
 
-def test_a_point_may_have_more_observers_than_there_is_room_for_at_first() -> None:
+def test_the_index_grows_with_the_observations_of_a_point() -> None:
     slam_map = make_map(40, 2)
     for keyframe in range(40):
-        slam_map.observe(keyframe, torch.tensor([keyframe % KEYPOINTS]), torch.tensor([1]))
+        slam_map.add_observations(keyframe, torch.tensor([keyframe % KEYPOINTS]), torch.tensor([1]))
     check(slam_map)
-    slam_map.forget(torch.arange(0, 40, 2), torch.arange(0, 40, 2) % KEYPOINTS)
+    slam_map.remove_observations(torch.arange(0, 40, 2), torch.arange(0, 40, 2) % KEYPOINTS)
     check(slam_map)
 
 
-def test_places_come_back_ordered_as_asked() -> None:
+def test_slots_are_returned_in_the_requested_order() -> None:
     index = ObservationIndex(torch.tensor([[0, -1, 1], [1, 0, -1]]))
-    which, slots = index.of(torch.tensor([1, 0, 5]))
+    which, slots = index.observations_of(torch.tensor([1, 0, 5]))
     assert sorted(zip(which.tolist(), slots.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
     index.remove(torch.tensor([1]), torch.tensor([2]))
     assert index.padded_slots(torch.tensor([1]))[0].tolist()[:2] == [3, -1]
 
 
 @given(st.lists(st.integers(0, 5), max_size=20), st.integers(1, 6), st.integers(1, 4))
-def test_the_most_are_those_of_a_full_sort(counts: list[int], limit: int, least: int) -> None:
+def test_the_most_frequent_equal_those_of_a_full_sort(counts: list[int], limit: int, least: int) -> None:
     values = torch.tensor(counts, dtype=torch.int64)
     order = torch.sort(values, descending=True, stable=True)
     expected = order.indices[:limit][order.values[:limit] >= least]
@@ -204,19 +206,19 @@ def test_the_most_are_those_of_a_full_sort(counts: list[int], limit: int, least:
 
 
 @pytest.mark.parametrize("values", [[], [3], [3, 1, 3, 3, 1, 2]])
-def test_the_first_of_each(values: list[int]) -> None:
+def test_the_first_observation_of_each_point(values: list[int]) -> None:
     expected = [value not in values[:place] for place, value in enumerate(values)]
     assert first_of_each(torch.tensor(values, dtype=torch.int64)).tolist() == expected
 
 
-def test_an_index_that_grew_in_inference_mode_may_be_changed_outside() -> None:
+def test_an_index_grown_in_inference_mode_can_be_changed_outside() -> None:
     with torch.inference_mode():
         index = ObservationIndex(torch.full((1, 4), -1))
         index.add(torch.arange(200), torch.arange(200))
     index.remove(torch.tensor([7]), torch.tensor([7]))
     index.clear(torch.tensor([8]))
-    assert index.of(torch.tensor([6, 7, 8]))[1].tolist() == [6]
+    assert index.observations_of(torch.tensor([6, 7, 8]))[1].tolist() == [6]
     with torch.inference_mode():
-        assert index.of(torch.tensor([1000]))[1].tolist() == []  # a point that nobody has seen yet
+        assert index.observations_of(torch.tensor([1000]))[1].tolist() == []  # a point without observations
     index.add(torch.tensor([1000]), torch.tensor([9]))
-    assert index.of(torch.tensor([1000]))[1].tolist() == [9]
+    assert index.observations_of(torch.tensor([1000]))[1].tolist() == [9]

@@ -7,8 +7,8 @@ import copy
 import pytest
 import torch
 
-from tests.map.simulated import simulated_world, tracked_at
-from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from tests.map.simulated import estimate_at, simulated_submap
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.geometry import se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.map.posed_frames import PosedFrames
@@ -19,14 +19,14 @@ SCENE = Scene.of(150)
 
 def walked(noise: float = 0.0) -> Submap:
     """Two keyframes, and three frames that refer to the second."""
-    submap = world_in(SCENE, sideways(2, step=0.5), noise=noise)
+    submap = submap_of_scene(SCENE, sideways(2, step=0.5), noise=noise)
     for index, T_cw in enumerate(sideways(3, start=0.6), start=10):
         view = SCENE.view(index, T_cw, noise=noise)
         at = torch.nonzero(view.mask)[:, 0]
         ids = rows_of(SCENE)[SCENE.shows(index)][at]
         alive = submap.map.points["is_valid"][ids]
         T_cr = T_cw @ se3_inverse(submap.map.T_cw[1])
-        submap.posed_frames.add(view, tracked_at(T_cw, ids[alive], at[alive]), T_cr, 1)
+        submap.posed_frames.add(view, estimate_at(T_cw, ids[alive], at[alive]), T_cr, 1)
     return submap
 
 
@@ -52,7 +52,7 @@ def test_a_trajectory_is_in_order_of_time() -> None:
     assert len(PosedFrames().trajectory(submap.map)) == 0
 
 
-def test_the_graph_of_a_run_holds_what_was_seen() -> None:
+def test_the_run_graph_holds_all_observations() -> None:
     submap = walked()
     graph = submap.posed_frames.graph(submap.map, CAMERA)
     assert graph.frame_ids.tolist() == [0, 1, 10, 11, 12]
@@ -72,7 +72,7 @@ def test_the_graph_of_a_run_holds_what_was_seen() -> None:
     torch.testing.assert_close(submap.map.positions_w[graph.point_ids], graph.points_w)
 
 
-def test_map_and_frames_take_over_the_solution_of_their_graph() -> None:
+def test_map_and_frames_apply_the_solution_of_their_graph() -> None:
     submap = walked(noise=0.5)
     graph = submap.posed_frames.graph(submap.map, CAMERA)
     solution = solve_graph(graph, backward="detached")
@@ -87,7 +87,7 @@ def test_map_and_frames_take_over_the_solution_of_their_graph() -> None:
     assert float(submap.map.points["covariances_w"][graph.point_ids].sum()) > 0
 
 
-def test_frames_take_over_wherever_they_stand_in_the_history() -> None:
+def test_frames_apply_a_solution_in_any_order() -> None:
     submap = walked(noise=0.5)
     order = torch.tensor([3, 0, 4, 1, 2])
     shuffled = copy.deepcopy(submap)
@@ -106,8 +106,8 @@ def test_frames_take_over_wherever_they_stand_in_the_history() -> None:
     )
 
 
-def test_another_reference_moves_nobody() -> None:
-    submap = simulated_world()
+def test_another_reference_moves_no_frame() -> None:
+    submap = simulated_submap()
     before, references = (
         submap.posed_frames.T_cw(submap.map).clone(),
         submap.posed_frames.frames["reference_keyframe"].clone(),
@@ -122,7 +122,7 @@ def test_another_reference_moves_nobody() -> None:
     )
 
 
-def test_units_change_around_each_keyframe() -> None:
+def test_a_scale_change_applies_around_each_keyframe() -> None:
     submap = walked()
     before = submap.posed_frames.frames["T_cr"].clone()
     submap.posed_frames.rescale(torch.tensor([1.0, 3.0]).double())
@@ -144,7 +144,7 @@ def of_frames(submap: Submap) -> list[int]:
     return torch.bincount(submap.posed_frames.observations["frame_row"]).tolist()
 
 
-def test_what_is_far_astray_is_forgotten() -> None:
+def test_outliers_of_frames_are_removed() -> None:
     submap = walked()
     before, ids = of_frames(submap), submap.posed_frames.observations["point_ids"].clone()
     at = torch.nonzero(submap.posed_frames.observations["frame_row"] == 3)[:, 0]
@@ -156,7 +156,7 @@ def test_what_is_far_astray_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize(("off", "forgotten"), [(4.85, 0), (4.95, 5)])
-def test_astray_is_twice_as_far_as_agrees(off: float, forgotten: int) -> None:
+def test_the_outlier_threshold_is_twice_the_inlier_threshold(off: float, forgotten: int) -> None:
     """sqrt(4 x 5.991) = 4.895"""
     submap = walked()
     count = len(submap.posed_frames.observations)
@@ -165,7 +165,7 @@ def test_astray_is_twice_as_far_as_agrees(off: float, forgotten: int) -> None:
     assert count - len(submap.posed_frames.observations) == forgotten
 
 
-def test_a_frame_that_agrees_with_little_keeps_all() -> None:
+def test_a_frame_with_few_inliers_keeps_all_observations() -> None:
     submap = walked()
     before = of_frames(submap)
     stray(submap, 3, before[3] // 4 + 1)
@@ -173,7 +173,7 @@ def test_a_frame_that_agrees_with_little_keeps_all() -> None:
     assert of_frames(submap) == before
 
 
-def test_a_stray_does_not_pull_its_frame() -> None:
+def test_an_outlier_does_not_move_its_frame() -> None:
     submap = walked()
     truth = submap.posed_frames.T_cw(submap.map)[3].clone()
     stray(submap, 3, 3)

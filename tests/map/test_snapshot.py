@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tests.map.simulated import simulated_world, view_of
+from tests.map.simulated import simulated_submap, view_of
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map, MapSnapshot
 
@@ -24,38 +24,38 @@ def disturb(slam_map: Map, keyframes: int, points: int) -> None:
         view = view_of(100 + k, T_cw, around_w, generator)
         keyframe = slam_map.add_keyframe(view, T_cw)
         ids = slam_map.add_points(around_w, view.descriptors, keyframe)
-        slam_map.observe(keyframe, torch.arange(points), ids)
+        slam_map.add_observations(keyframe, torch.arange(points), ids)
         slam_map.images[slam_map.key(keyframe)] = torch.zeros(1)
     slam_map.keyframes["T_cw"][:, :3, 3] += 1.0
     slam_map.keyframes["covariances"][:] *= 2.0
     slam_map.points["positions_w"][:] += 1.0
     slam_map.points["times_found"][:] += 3
     living = slam_map.valid_points()
-    slam_map.replace(living[:4], living[-4:])
-    slam_map.invalidate(living[5:9])
-    seen = slam_map.observations(slam_map.ids(0))
-    slam_map.forget(seen.keyframe_index[:2], seen.keypoint_index[:2])
-    slam_map.refresh(torch.arange(slam_map.num_keyframes))
+    slam_map.merge_points(living[:4], living[-4:])
+    slam_map.remove_points(living[5:9])
+    seen = slam_map.observations(slam_map.index_tensor(0))
+    slam_map.remove_observations(seen.keyframe_index[:2], seen.keypoint_index[:2])
+    slam_map.update_appearance(torch.arange(slam_map.num_keyframes))
 
 
-def test_a_map_is_what_it_was() -> None:
-    slam_map, asked = simulated_world().map, torch.arange(10)
+def test_a_snapshot_restores_the_map() -> None:
+    slam_map, points = simulated_submap().map, torch.arange(10)
     slam_map.images[slam_map.key(0)] = torch.ones(1)
-    before, observers = columns(slam_map), slam_map.observers(asked)
-    bookmark = MapSnapshot.of(slam_map)
-    assert bookmark.num_keyframes == slam_map.num_keyframes
-    for _ in range(2):  # a bookmark can be returned to as often as one likes
+    before, observers = columns(slam_map), slam_map.count_observed(points)
+    snapshot = MapSnapshot.of(slam_map)
+    assert snapshot.num_keyframes == slam_map.num_keyframes
+    for _ in range(2):  # a snapshot can be restored repeatedly
         disturb(slam_map, keyframes=70, points=40)  # more than there is room for
-        assert slam_map.num_keyframes == bookmark.num_keyframes + 70
-        bookmark.restore(slam_map)
+        assert slam_map.num_keyframes == snapshot.num_keyframes + 70
+        snapshot.restore(slam_map)
         assert all(torch.equal(now, then) for now, then in zip(columns(slam_map), before, strict=True))
-        assert torch.equal(slam_map.observers(asked), observers)
+        assert torch.equal(slam_map.count_observed(points), observers)
         assert list(slam_map.images) == [slam_map.key(0)]
 
 
-def test_a_bookmark_is_a_copy() -> None:
-    slam_map = simulated_world().map
-    bookmark = MapSnapshot.of(slam_map)
+def test_a_snapshot_is_a_copy() -> None:
+    slam_map = simulated_submap().map
+    snapshot = MapSnapshot.of(slam_map)
     positions = slam_map.positions_w.clone()
     slam_map.positions_w[:] = 0.0
-    assert torch.equal(bookmark.points["positions_w"], positions)
+    assert torch.equal(snapshot.points["positions_w"], positions)

@@ -1,4 +1,4 @@
-"""What moves a world moves all of it: positions, poses, covariances, directions, frames and the track."""
+"""A transform applies to positions, poses, covariances, directions, frames and tracking state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.map.simulated import reprojection_errors, simulated_world
+from tests.map.simulated import reprojection_errors, simulated_submap
 from torchslam.geometry import se3_inverse, sim3_exp, sim3_inverse, sim3_scale, transform
 from torchslam.map.atlas import Submap
 
@@ -19,7 +19,7 @@ SIMILARITY = torch.tensor([0.4, -0.3, 0.2, 0.5, -0.2, 0.3, math.log(SCALE)], dty
 
 @pytest.fixture
 def submap() -> Submap:
-    return simulated_world()
+    return simulated_submap()
 
 
 def similarity() -> Tensor:
@@ -37,7 +37,7 @@ def moved_poses(T_cw: Tensor, S_ba: Tensor) -> Tensor:
     return moved
 
 
-def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them(submap: Submap) -> None:
+def test_a_transform_moves_points_and_cameras_by_the_similarity(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     submap.transform(similarity())
     torch.testing.assert_close(submap.map.positions_w, transform(similarity(), before.map.positions_w))
@@ -48,7 +48,7 @@ def test_a_moved_world_has_its_points_and_cameras_where_the_similarity_puts_them
     torch.testing.assert_close(submap.T_cw, moved_poses(before.T_cw[None], similarity())[0])
 
 
-def test_a_moved_world_is_as_certain_as_before(submap: Submap) -> None:
+def test_a_transform_scales_covariances(submap: Submap) -> None:
     """Covariances of points turn and grow; those of poses live in the cameras: their unit alone grows."""
     before = copy.deepcopy(submap)
     submap.transform(similarity())
@@ -60,11 +60,11 @@ def test_a_moved_world_is_as_certain_as_before(submap: Submap) -> None:
     torch.testing.assert_close(
         submap.map.keyframes["covariances"], units @ before.map.keyframes["covariances"] @ units
     )
-    centres = before.map.center_covariances_w()
-    torch.testing.assert_close(submap.map.center_covariances_w(), linear @ centres @ linear.T)
+    centers = before.map.center_covariances_w()
+    torch.testing.assert_close(submap.map.center_covariances_w(), linear @ centers @ linear.T)
 
 
-def test_directions_and_reach_are_those_that_a_refresh_would_find(submap: Submap) -> None:
+def test_transformed_directions_and_scale_distances_equal_refreshed_ones(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     submap.transform(similarity())
     torch.testing.assert_close(
@@ -74,19 +74,19 @@ def test_directions_and_reach_are_those_that_a_refresh_would_find(submap: Submap
         submap.map.points["scale_distance"], SCALE * before.map.points["scale_distance"]
     )
     refreshed = copy.deepcopy(submap)
-    refreshed.map.refresh(torch.arange(submap.map.num_keyframes))
+    refreshed.map.update_appearance(torch.arange(submap.map.num_keyframes))
     for name in ("view_directions_w", "scale_distance"):
         torch.testing.assert_close(submap.map.points[name], refreshed.map.points[name])
 
 
-def test_a_move_changes_no_reprojection(submap: Submap) -> None:
+def test_a_transform_changes_no_reprojection(submap: Submap) -> None:
     before = reprojection_errors(submap)
     assert float(before.norm(dim=-1).max()) > 0.5
     submap.transform(similarity())
     torch.testing.assert_close(reprojection_errors(submap), before)
 
 
-def test_the_track_goes_on_after_a_move(submap: Submap) -> None:
+def test_tracking_continues_after_a_transform(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     submap.transform(similarity())
     assert before.tracking.velocity is not None
@@ -97,7 +97,7 @@ def test_the_track_goes_on_after_a_move(submap: Submap) -> None:
     )
 
 
-def test_there_and_back(submap: Submap) -> None:
+def test_a_transform_and_its_inverse_cancel(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     submap.transform(similarity())
     submap.transform(sim3_inverse(similarity()))
@@ -114,7 +114,7 @@ def corrections(submap: Submap) -> Tensor:
     return sim3_exp(xi) @ submap.map.T_cw
 
 
-def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(submap: Submap) -> None:
+def test_corrected_points_project_as_before_in_their_first_keyframe(submap: Submap) -> None:
     before, seen = reprojection_errors(submap), submap.map.observations()
     submap.apply_sim3_correction(corrections(submap))
     own = submap.map.points["first_keyframe"][seen.point_index] == seen.keyframe_index
@@ -123,7 +123,7 @@ def test_corrected_points_are_seen_as_before_by_the_keyframe_that_made_them(subm
     assert float((reprojection_errors(submap) - before)[~own].abs().max()) > 1.0
 
 
-def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(submap: Submap) -> None:
+def test_corrected_keyframes_are_rigid_and_follow_their_similarities(submap: Submap) -> None:
     S_cw = corrections(submap)
     submap.apply_sim3_correction(S_cw)
     torch.testing.assert_close(se3_inverse(submap.map.T_cw)[:, :3, 3], sim3_inverse(S_cw)[:, :3, 3])
@@ -131,7 +131,7 @@ def test_corrected_keyframes_are_rigid_and_where_the_similarities_say(submap: Su
     torch.testing.assert_close(gram, torch.eye(3, dtype=torch.float64).expand_as(gram))
 
 
-def test_corrected_frames_see_what_their_keyframe_made_as_before(submap: Submap) -> None:
+def test_corrected_frames_see_points_of_their_keyframe_as_before(submap: Submap) -> None:
     """A frame stays where it was among the points of its reference keyframe, in that keyframe's unit."""
     before = copy.deepcopy(submap)
     S_cw = corrections(submap)
@@ -151,7 +151,7 @@ def test_corrected_frames_see_what_their_keyframe_made_as_before(submap: Submap)
     torch.testing.assert_close(submap.tracking.velocity[:3, 3], before.tracking.velocity[:3, 3] / around)
 
 
-def test_corrected_uncertainty_keeps_its_size_in_pixels(submap: Submap) -> None:
+def test_corrected_covariances_keep_their_size_in_pixels(submap: Submap) -> None:
     """Seen from the keyframe that made it, a point is as uncertain in shares of its depth as it was."""
     before = copy.deepcopy(submap)
     S_cw = corrections(submap)
@@ -174,8 +174,8 @@ def test_corrected_uncertainty_keeps_its_size_in_pixels(submap: Submap) -> None:
     )
 
 
-def test_an_absorbed_world_lies_beside_what_was_there(submap: Submap) -> None:
-    other = simulated_world(seed=3, number=1, session=1)
+def test_a_merged_submap_is_appended(submap: Submap) -> None:
+    other = simulated_submap(seed=3, number=1, session=1)
     mine, theirs = copy.deepcopy(submap), copy.deepcopy(other)
     submap.merge(other, similarity())
     theirs.transform(similarity())
@@ -206,9 +206,9 @@ def test_an_absorbed_world_lies_beside_what_was_there(submap: Submap) -> None:
     assert (other.map.num_keyframes, len(other.map.points), len(other.posed_frames)) == (0, 0, 0)
 
 
-def test_merged_points_keep_their_heirs_in_an_absorbed_world(submap: Submap) -> None:
-    other = simulated_world(seed=3)
-    other.map.replace(torch.tensor([5]), torch.tensor([2]))
+def test_merged_points_keep_their_replacements_in_a_merged_submap(submap: Submap) -> None:
+    other = simulated_submap(seed=3)
+    other.map.merge_points(torch.tensor([5]), torch.tensor([2]))
     count = len(submap.map.points)
     submap.merge(other, torch.eye(4, dtype=torch.float64))
     assert submap.map.follow_merges(torch.tensor([count + 5, 5])).tolist() == [count + 2, 5]

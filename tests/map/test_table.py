@@ -40,13 +40,13 @@ def test_a_column_is_a_view_of_the_storage() -> None:
     assert table["number"].tolist() == [0.0, 5.0, 0.0]
 
 
-def test_what_is_stored_carries_no_graph() -> None:
+def test_stored_tensors_are_detached() -> None:
     table = Table(NUMBER)
     table.append(number=torch.ones(2, requires_grad=True) * 2)
     assert not table["number"].requires_grad
 
 
-def test_columns_that_differ_are_refused() -> None:
+def test_mismatched_columns_are_refused() -> None:
     table = Table(PLACES)
     with pytest.raises(ValueError, match="differ in length"):
         table.append(number=torch.zeros(2, dtype=torch.int64), place=torch.zeros(3, 3))
@@ -58,7 +58,7 @@ def test_columns_that_differ_are_refused() -> None:
         table.append(number=torch.zeros(2), place=torch.zeros(2, 3))
 
 
-def test_rows_that_are_kept_stand_in_the_asked_order() -> None:
+def test_kept_rows_are_in_the_requested_order() -> None:
     table = Table(NUMBER)
     table.append(number=torch.arange(10.0))
     table.keep(torch.tensor([7, 2]))
@@ -67,7 +67,7 @@ def test_rows_that_are_kept_stand_in_the_asked_order() -> None:
 
 
 @pytest.mark.parametrize(("kept", "moves"), [(40, False), (20, True)])
-def test_memory_is_given_back_where_most_is_empty(kept: int, moves: bool) -> None:
+def test_memory_is_released_when_most_rows_are_unused(kept: int, moves: bool) -> None:
     table = Table(NUMBER)
     table.append(number=torch.arange(64.0))
     place = table["number"].data_ptr()
@@ -78,7 +78,7 @@ def test_memory_is_given_back_where_most_is_empty(kept: int, moves: bool) -> Non
     assert table["number"].tolist()[-2:] == [64.0 - kept, 1.0]
 
 
-def test_what_inference_mode_filled_may_be_read_by_autograd_and_written_by_anybody() -> None:
+def test_a_table_filled_in_inference_mode_works_with_autograd() -> None:
     table = Table(NUMBER)
     with torch.inference_mode():
         table.append(number=torch.ones(3))

@@ -436,7 +436,7 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
     assert len(run.trajectory) == 16
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
     localizer = Localizer(run.camera, run.config)
-    ids = run.map.points_seen_by(torch.tensor([1]))
+    ids = run.map.observed_points(torch.tensor([1]))
     T_cw, noise = run.map.T_cw[1], KeypointNoise.of(torch.ones(len(ids), dtype=torch.float64), None)
     pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
     assert localizer.agrees(run.map, T_cw, ids, pixels, noise).all()

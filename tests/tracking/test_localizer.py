@@ -68,9 +68,9 @@ def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
     estimate = finder.locate(here.map, view, matches, here.tracking.local_points)
     assert estimate is not None
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
-    near = finder.local_keyframes(here.map, int(here.map.observers(there[alive][:30]).argmax()))
+    near = finder.local_keyframes(here.map, int(here.map.count_observed(there[alive][:30]).argmax()))
     assert near.tolist() == [0, 1]
-    assert set(estimate.point_ids.tolist()) <= set(here.map.points_seen_by(near).tolist())
+    assert set(estimate.point_ids.tolist()) <= set(here.map.observed_points(near).tolist())
     assert estimate.inliers > 60
 
 
@@ -80,7 +80,7 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
     offset: float, agrees: bool, scale: float
 ) -> None:
     here = submap()
-    seen = here.map.points_seen_by(torch.tensor([0]))
+    seen = here.map.observed_points(torch.tensor([0]))
     T_cw = here.map.T_cw[0]
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
     off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
@@ -96,7 +96,7 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
 @pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
 def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
     here = submap()
-    seen = here.map.points_seen_by(torch.tensor([0]))
+    seen = here.map.observed_points(torch.tensor([0]))
     roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
     T_cw = roll @ here.map.T_cw[0]
     points_c = transform(T_cw, here.map.positions_w[seen])
@@ -116,7 +116,7 @@ def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: 
 
 def test_points_behind_the_camera_agree_with_nothing() -> None:
     here = submap()
-    seen = here.map.points_seen_by(torch.tensor([0]))
+    seen = here.map.observed_points(torch.tensor([0]))
     T_cw = pose(0, 0, 0, 0, math.pi)
     middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
     here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
@@ -131,7 +131,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
     here = submap()
     T_cw = here.map.T_cw[0]
-    seen = here.map.points_seen_by(torch.tensor([0]))
+    seen = here.map.observed_points(torch.tensor([0]))
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
     coarse = torch.arange(len(seen)) % 2 == 1
     scales = torch.where(coarse, 4.0, 1.0).double()
@@ -148,7 +148,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
 def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
     here = submap()
     T_cw = here.map.T_cw[0]
-    seen = here.map.points_seen_by(torch.tensor([0]))
+    seen = here.map.observed_points(torch.tensor([0]))
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
     scales = torch.ones(len(seen), dtype=torch.float64)
     wrong = torch.arange(len(seen)) < len(seen) // 4

@@ -98,7 +98,7 @@ def test_it_is_asked_in_all_stages() -> None:
 def test_a_matcher_that_wants_images_gets_those_of_keyframes_too() -> None:
     slam, run = run_with(Wrapped(wants_images=True))
     assert len(run.trajectory) == len(WALK)
-    image = slam.map.view(0).image
+    image = slam.map.frame_features(0).image
     assert image is not None
     assert image.shape == (1, 1, 240, 320)
 

@@ -98,7 +98,7 @@ def test_a_keyframe_matches_by_its_own_descriptors() -> None:
     points, keypoints = pairs.first, pairs.second
     assert len(points) > 150
     assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
-    assert set(points.tolist()) <= set(right.map.points_seen_by(torch.tensor([2])).tolist())
+    assert set(points.tolist()) <= set(right.map.observed_points(torch.tensor([2])).tolist())
 
 
 def test_points_match_by_descriptor_wherever_they_are() -> None:

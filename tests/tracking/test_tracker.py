@@ -66,14 +66,14 @@ def test_follow_goes_on_from_a_keyframe() -> None:
     assert sorted(tracking.local_keyframes.tolist()) == [0, 1, 2, 3]
     seen = here.map.keyframes["point_ids"][2]
     assert torch.equal(tracking.last_inlier_points, seen[seen >= 0])
-    assert torch.equal(tracking.local_points, here.map.points_seen_by(torch.arange(4)))
+    assert torch.equal(tracking.local_points, here.map.observed_points(torch.arange(4)))
 
 
 def test_the_local_map_is_bounded() -> None:
     here, few = submap(6), tracker("tracking.local_keyframes=2")
     few.reset_to_keyframe(here, 0)
     assert here.tracking.local_keyframes.tolist() == [0, 1, 2]  # the nearest share most
-    assert torch.equal(here.tracking.local_points, here.map.points_seen_by(torch.arange(3)))
+    assert torch.equal(here.tracking.local_points, here.map.observed_points(torch.arange(3)))
 
 
 def test_the_local_map_may_be_what_was_seen_lately() -> None:
@@ -82,7 +82,7 @@ def test_the_local_map_may_be_what_was_seen_lately() -> None:
     last_seen[:] = 10
     last_seen[:20] = 15
     last_seen[20:30] = 11
-    here.map.invalidate(torch.tensor([3]))
+    here.map.remove_points(torch.tensor([3]))
     recent.reset_to_keyframe(here, 3)
     wanted = [row for row in range(30) if here.map.points["is_valid"][row]]
     assert here.tracking.local_points.tolist() == wanted
@@ -120,7 +120,7 @@ def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() ->
     T_cw = sideways(1, start=0.16)[0]
     view = SCENE.view(50, T_cw)
     estimate = followed(here, view, follower)
-    shared = here.map.observers(estimate.point_ids)
+    shared = here.map.count_observed(estimate.point_ids)
     assert int(shared[here.tracking.reference]) == int(shared.max())
     assert here.tracking.reference != 4
     torch.testing.assert_close(here.T_cw, T_cw, atol=1e-7, rtol=0)
@@ -208,7 +208,7 @@ def few(here: Submap, count: int) -> None:
     """Leave the map so many of the points that all keyframes see."""
     everyone = torch.nonzero(here.map.points["times_observed"] == here.map.num_keyframes)[:, 0]
     rest = here.map.valid_points()
-    here.map.invalidate(rest[~torch.isin(rest, everyone[:count])])
+    here.map.remove_points(rest[~torch.isin(rest, everyone[:count])])
     tracker().reset_to_keyframe(here, here.map.num_keyframes - 1)
 
 
@@ -270,7 +270,7 @@ def test_without_a_place_to_look_descriptors_alone_decide() -> None:
 def test_points_that_died_are_not_looked_for() -> None:
     here = submap(3)
     dead = here.tracking.last_inlier_points[:20]
-    here.map.invalidate(dead)
+    here.map.remove_points(dead)
     estimate = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]))
     assert not torch.isin(estimate.point_ids, dead).any()
 

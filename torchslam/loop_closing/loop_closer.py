@@ -51,7 +51,7 @@ class LoopCloser:
 
     def add(self, slam_map: Map, keyframe: int) -> None:
         """Add a keyframe to the keyframe database."""
-        view = slam_map.view(keyframe)
+        view = slam_map.frame_features(keyframe)
         self.keyframe_database.add(slam_map.key(keyframe), view.descriptors, view.mask)
 
     def remove(self, keys: Tensor) -> None:
@@ -156,7 +156,7 @@ def fuse_with_earlier_visits(submap: Submap, keyframe: int, camera: Camera, conf
     """
     earlier = earlier_visit_keyframes(submap.map, keyframe)
     if len(earlier):
-        fuse_landmarks(submap.map, submap.map.ids(keyframe), earlier, camera, config)
+        fuse_landmarks(submap.map, submap.map.index_tensor(keyframe), earlier, camera, config)
         tracking = submap.tracking  # must not refer to merged points
         tracking.local_points = torch.unique(submap.map.follow_merges(tracking.local_points))
         tracking.last_inlier_points = submap.map.follow_merges(tracking.last_inlier_points)
@@ -166,19 +166,19 @@ def earlier_visit_keyframes(slam_map: Map, keyframe: int) -> Tensor:
     """Return covisible keyframes (<= 20,) of earlier visits: before the last gap in covisibility over time."""
     order = torch.argsort(slam_map.keys)
     rank = torch.argsort(order)
-    shares = slam_map.observers(slam_map.points_seen_by(slam_map.ids(keyframe)))[order] > 0
+    shares = slam_map.count_observed(slam_map.observed_points(slam_map.index_tensor(keyframe)))[order] > 0
     missing = torch.nonzero(~shares[: int(rank[keyframe])])[:, 0]
     began = int(missing[-1]) + 1 if len(missing) else 0
-    near = slam_map.covisible(keyframe, slam_map.num_keyframes)
+    near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes)
     return near[rank[near] < began][:_VISIT_KEYFRAMES]
 
 
 def fuse_landmarks(slam_map: Map, here: Tensor, there: Tensor, camera: Camera, config: Config) -> None:
     """Match the points of keyframes (k,) and others (l,) in each other, and merge duplicates."""
     for keyframes, others in ((here, there), (there, here)):
-        points = slam_map.points_seen_by(others)
+        points = slam_map.observed_points(others)
         merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
-    slam_map.refresh(torch.unique(torch.cat([here, there])))
+    slam_map.update_appearance(torch.unique(torch.cat([here, there])))
 
 
 def essential_edges(slam_map: Map) -> Tensor:
@@ -188,9 +188,9 @@ def essential_edges(slam_map: Map) -> Tensor:
     """
     edges: set[tuple[int, int]] = set()
     for keyframe in range(1, slam_map.num_keyframes):
-        near = slam_map.covisible(keyframe, slam_map.num_keyframes, min_shared=1)
+        near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes, min_shared=1)
         earlier = near[near < keyframe]
         edges.add((int(earlier[0]) if len(earlier) else keyframe - 1, keyframe))
-        strong = slam_map.covisible(keyframe, _MAX_STRONG_EDGES, min_shared=STRONG)
+        strong = slam_map.covisible_keyframes(keyframe, _MAX_STRONG_EDGES, min_shared=STRONG)
         edges.update((other, keyframe) for other in strong.tolist() if other < keyframe)
     return torch.tensor(sorted(edges), dtype=torch.int64, device=slam_map.T_cw.device).reshape(-1, 2)

@@ -107,7 +107,7 @@ class LoopDetector:
         ):
             return None
         near = neighborhood(other.map, place)
-        covisible = submap.map.covisible(keyframe, _NUM_VERIFYING)
+        covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
         sure = sum(
             verify(relation, submap.map, one, other.map, near, self.camera, self.config)
             for one in covisible.tolist()
@@ -117,7 +117,7 @@ class LoopDetector:
 
 def covisible_twice(slam_map: Map, keyframe: int) -> Tensor:
     """(k,) a keyframe, those that share points with it, and those that share many with the first of these."""
-    near = slam_map.covisible(keyframe, slam_map.num_keyframes, min_shared=1)
+    near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes, min_shared=1)
     further = slam_map.covisibility_union(near[:_AROUND], _AROUND)
     return torch.unique(torch.cat([near.new_tensor([keyframe]), near, further]))
 
@@ -156,7 +156,7 @@ def are_consistent(one: LoopCandidate, other: LoopCandidate) -> bool:
     turned = torch.rad2deg(rotation_angle(S[:3, :3] / scale @ (Z[:3, :3] / second).mT))
     camera_1 = se3_inverse(one.submap.map.T_cw[one.keyframe])[:3, 3]
     apart = torch.linalg.vector_norm((S - Z)[:3, :3] @ camera_1 + (S - Z)[:3, 3])
-    seen = one.other.map.points_seen_by(one.other.map.ids(one.place))
+    seen = one.other.map.observed_points(one.other.map.index_tensor(one.place))
     T_cw = one.other.map.T_cw[one.place]
     depth = (one.other.map.positions_w[seen] @ T_cw[2, :3] + T_cw[2, 3]).median()
     ratio = float(scale / second)

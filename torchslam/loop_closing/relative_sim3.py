@@ -58,7 +58,7 @@ def estimate_relative_sim3(
     T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config)
     if T_12 is None:
         return None
-    points_2 = map_2.points_seen_by(neighborhood(map_2, keyframe_2))
+    points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
     ids, keypoints = match_by_sim3_pose(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
     settings = config.loop_closing
     if len(ids) < settings.min_matches:
@@ -75,7 +75,7 @@ def estimate_relative_sim3(
     depth_2 = transform(T_12, map_2.positions_w[ids])[:, 2]
     scale = (depth_2 / depth_1).median()
     S_21 = se3_inverse(T_12) @ rescaling(scale) @ T_11
-    points_1 = map_1.points_seen_by(neighborhood(map_1, keyframe_1))
+    points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
     T_21 = seen_from(map_2.T_cw[keyframe_2], S_21)
     back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
     if len(back) < settings.min_matches // 2:
@@ -94,13 +94,13 @@ def verify(
 ) -> bool:
     """Whether another keyframe of map 1 observes the points of keyframes (k,) of map 2 as the Sim(3) predicts."""
     T_o2 = seen_from(map_1.T_cw[other], sim3_inverse(relation.S_21))
-    ids, _ = inlier_matches(map_2, map_2.points_seen_by(near_2), T_o2, map_1, other, camera, settings)
+    ids, _ = inlier_matches(map_2, map_2.observed_points(near_2), T_o2, map_1, other, camera, settings)
     return len(ids) >= settings.loop_closing.min_matches // 2
 
 
 def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
     """Return a keyframe and the most covisible ones, (k,)."""
-    near = slam_map.covisible(keyframe, count)
+    near = slam_map.covisible_keyframes(keyframe, count)
     return torch.cat([near.new_tensor([keyframe]), near])
 
 
@@ -124,7 +124,7 @@ def match_by_sim3_pose(
     slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
 ) -> tuple[Tensor, Tensor]:
     """(m,), (m,) points (n,) of a map and keypoints of another map's keyframe, which is at T_cw in this one."""
-    view = other.view(keyframe)
+    view = other.frame_features(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
     pairs = match_projected_points(
@@ -138,7 +138,7 @@ def inlier_matches(
 ) -> tuple[Tensor, Tensor]:
     """Return the matches of `match_by_sim3_pose` that pass a gate widened for the noise of the Sim(3)."""
     ids, keypoints = match_by_sim3_pose(slam_map, point_ids, T_cw, other, keyframe, camera, config)
-    view = other.view(keyframe)
+    view = other.frame_features(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
     good = passes_gate(errors, WIDER**2 * config.measurement.max_chi_square)
@@ -149,7 +149,7 @@ def _first_guess(
     map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
 ) -> Tensor | None:
     """(4, 4) the pose of keyframe 1 in map 2, from points that both see; None where there is none."""
-    view_1, view_2 = map_1.view(keyframe_1), map_2.view(keyframe_2)
+    view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
     points_1 = map_1.keyframes["point_ids"][keyframe_1]
     points_2 = map_2.keyframes["point_ids"][keyframe_2]
     rows_1, rows_2 = match_views(
@@ -184,7 +184,7 @@ def _refined(
     slam_map: Map, ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, keypoints: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
     """(4, 4), (n,): the pose of another map's keyframe by points (n,) it sees at keypoints (n,), and who agrees."""
-    view, points_w = other.view(keyframe), slam_map.positions_w[ids]
+    view, points_w = other.frame_features(keyframe), slam_map.positions_w[ids]
     pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
     refined = refine_pose(
         T_cw[None],

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import sim3_inverse, sim3_scale
@@ -29,24 +30,25 @@ from torchslam.types import Trajectory
 class TrackingState:
     """The state of tracking in a submap after the last frame.
 
-    T_cr:               (4, 4) pose of the last frame relative to its reference keyframe, so that it follows the map
-    reference:          row of the reference keyframe; -1 before there is one
-    reference_size:     number of points of the reference keyframe that other keyframes observe as well
-    velocity:           (4, 4) last motion, T_c_previous; None if unknown
-    last_inlier_points: (n,) points that the last frame observed
-    local_keyframes:    (k,) keyframes of the local map: the reference keyframe and the most covisible ones
-    local_points:       (m,) points of the local map: those that the local keyframes observe
-    error:              moving average of the median squared error of the matches in units of their variance
-    explained_ratio:    moving average of the ratio of image cells with keypoints in which some agree with the map
+    Attributes:
+        T_cr: Pose of the last frame relative to its reference keyframe, so that it follows the map.
+        reference: Row of the reference keyframe; -1 before there is one.
+        reference_size: Number of points of the reference keyframe that other keyframes observe as well.
+        velocity: Last motion, T_c_previous; None if unknown.
+        last_inlier_points: Points that the last frame observed.
+        local_keyframes: Keyframes of the local map: the reference keyframe and the most covisible ones.
+        local_points: Points of the local map: those that the local keyframes observe.
+        error: Moving average of the median squared error of the matches in units of their variance.
+        explained_ratio: Moving average of the ratio of image cells with keypoints in which some agree with the map.
     """
 
-    T_cr: Tensor
+    T_cr: Float[Tensor, "4 4"]
     reference: int
     reference_size: int
-    velocity: Tensor | None
-    last_inlier_points: Tensor
-    local_keyframes: Tensor
-    local_points: Tensor
+    velocity: Float[Tensor, "4 4"] | None
+    last_inlier_points: Int[Tensor, " N"]
+    local_keyframes: Int[Tensor, " K"]
+    local_points: Int[Tensor, " L"]
     error: float = 0.0
     explained_ratio: float = 1.0
 
@@ -62,8 +64,12 @@ class TrackingState:
 class Submap:
     """A map with a coordinate frame of its own, the frames posed in it, and the tracking state.
 
-    number:           from 0, in the order in which the submaps of a run were created
-    num_cull_checked: number of leading keyframes that keyframe culling has already checked
+    Attributes:
+        number: From 0, in the order in which the submaps of a run were created.
+        tracking: The state of tracking after the last frame.
+        map: Keyframes and points.
+        posed_frames: All frames with a pose in the map.
+        num_cull_checked: Number of leading keyframes that keyframe culling has already checked.
     """
 
     number: int
@@ -78,8 +84,8 @@ class Submap:
         return cls(number, TrackingState.empty(like))
 
     @property
-    def T_cw(self) -> Tensor:
-        """(4, 4) current pose of the last frame."""
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """The current pose of the last frame."""
         return self.tracking.T_cr @ self.map.T_cw[self.tracking.reference]
 
     def trajectory(self, session: int | None = None) -> Trajectory:
@@ -90,8 +96,8 @@ class Submap:
         """Return a submap that shares map and posed frames but has a tracking state of its own."""
         return replace(self, tracking=replace(self.tracking))
 
-    def apply_sim3_correction(self, S_cw: Tensor) -> None:
-        """Move every keyframe to the pose of a Sim(3) S_cw (K, 4, 4), world to camera.
+    def apply_sim3_correction(self, S_cw: Float[Tensor, "K 4 4"]) -> None:
+        """Move every keyframe to the pose of its Sim(3) S_cw, world to camera.
 
         The scale of S_cw changes the map unit around the keyframe. Points follow the keyframe that created them, posed
         frames and the tracking state their reference keyframe.
@@ -115,12 +121,12 @@ class Submap:
             if self.tracking.velocity is not None:
                 self.tracking.velocity = with_unit(self.tracking.velocity, around)
 
-    def transform(self, S_ba: Tensor) -> None:
-        """Change the coordinate frame and unit: points p become S_ba p, with a Sim(3) S_ba (4, 4)."""
+    def transform(self, S_ba: Float[Tensor, "4 4"]) -> None:
+        """Change the coordinate frame and unit by a Sim(3): points p become S_ba p."""
         self.apply_sim3_correction(self.map.T_cw @ sim3_inverse(S_ba))
 
-    def merge(self, other: Submap, S_ab: Tensor) -> None:
-        """Move everything of another submap into this one by a Sim(3) S_ab (4, 4); the other is empty afterwards.
+    def merge(self, other: Submap, S_ab: Float[Tensor, "4 4"]) -> None:
+        """Move everything of another submap into this one by a Sim(3) S_ab; the other is empty afterwards.
 
         The other's rows of keyframes, points and frames are appended. The tracking state becomes that of the other.
         """

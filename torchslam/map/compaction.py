@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
@@ -22,17 +23,18 @@ _MAX_REWRITTEN = 64  # rows of frame observations that may be rewritten per row 
 class RowRemap:
     """The new rows after a removal.
 
-    keyframes:   (K,) new row of every old keyframe; -1 if removed
-    points:      (L,) likewise for points
-    replacement: (K,) new row of the keyframe that replaces a removed one; its own for the others
+    Attributes:
+        keyframes: New row of every old keyframe; -1 if removed.
+        points: New row of every old point; -1 if removed.
+        replacement: New row of the keyframe that replaces a removed one; its own for the others.
     """
 
-    keyframes: Tensor
-    points: Tensor
-    replacement: Tensor
+    keyframes: Int[Tensor, " K"]
+    points: Int[Tensor, " L"]
+    replacement: Int[Tensor, " K"]
 
     def then(self, later: RowRemap) -> RowRemap:
-        """Compose with a later removal."""
+        """Return the new rows after a later removal as well."""
         return RowRemap(
             torch.where(self.keyframes >= 0, later.keyframes[self.keyframes], -1),
             torch.where(self.points >= 0, later.points[self.points], -1),
@@ -40,8 +42,8 @@ class RowRemap:
         )
 
 
-def remove_keyframes(submap: Submap, keyframes: Tensor) -> RowRemap:
-    """Remove keyframes (k,) from the map; they become posed frames that keep the observations of the keyframe.
+def remove_keyframes(submap: Submap, keyframes: Int[Tensor, " R"]) -> RowRemap:
+    """Remove keyframes from the map; they become posed frames that keep the observations of the keyframe.
 
     Frames that referred to one of them refer to the nearest covisible keyframe, without moving. Points follow the first
     keyframe that still observes them; those that fewer than two observe become invalid.
@@ -66,7 +68,7 @@ def remove_keyframes(submap: Submap, keyframes: Tensor) -> RowRemap:
     rows = torch.where(removed, -1, torch.cumsum(~removed, 0) - 1)
     slam_map.keyframes.keep(kept)
     slam_map.points["first_keyframe"][:] = rows[replacement][slam_map.points["first_keyframe"]]
-    slam_map.reindex()
+    slam_map.mark_renumbered()
     if len(posed_frames):
         posed_frames.frames["reference_keyframe"][:] = rows[posed_frames.frames["reference_keyframe"]]
     alive, tracking = slam_map.points["is_valid"], submap.tracking
@@ -81,23 +83,23 @@ def remove_keyframes(submap: Submap, keyframes: Tensor) -> RowRemap:
     return RowRemap(rows, torch.arange(len(slam_map.points), device=device), rows[replacement])
 
 
-def replacement_keyframe(slam_map: Map, keyframe: int, removed: Tensor, count: int = 8) -> int:
-    """Return the nearest of the most covisible keyframes that are not removed (K,) bool."""
+def replacement_keyframe(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"], count: int = 8) -> int:
+    """Return the nearest of the `count` most covisible keyframes, without the removed ones."""
     seen = slam_map.keyframes["point_ids"][keyframe]
-    shared = slam_map.observers(seen[seen >= 0]).masked_fill(removed, -1)
+    shared = slam_map.count_observed(seen[seen >= 0]).masked_fill(removed, -1)
     best = torch.sort(shared, descending=True, stable=True).indices[:count]
     best = best[~removed[best]]
     centers_w = se3_inverse(slam_map.T_cw[torch.cat([best.new_tensor([keyframe]), best])])[:, :3, 3]
     return int(best[torch.linalg.vector_norm(centers_w[1:] - centers_w[0], dim=-1).argmin()])
 
 
-def _leave_points(slam_map: Map, removed: Tensor, replacement: Tensor) -> None:
-    """Remove the observations of removed keyframes (K,) bool and reassign the points that they created."""
+def _leave_points(slam_map: Map, removed: Bool[Tensor, " K"], replacement: Int[Tensor, " K"]) -> None:
+    """Remove the observations of removed keyframes and reassign the points that they created."""
     gone = torch.nonzero(removed)[:, 0]
     seen = slam_map.observations(gone)
-    slam_map.drop(seen, torch.ones_like(seen.point_index, dtype=torch.bool))
+    slam_map.remove_masked_observations(seen, torch.ones_like(seen.point_index, dtype=torch.bool))
     orphans = torch.nonzero(removed[slam_map.points["first_keyframe"]])[:, 0]
-    observers, _ = slam_map.scales_of(orphans)
+    observers, _ = slam_map.observers_and_scales(orphans)
     first = torch.where(observers >= 0, observers, len(removed)).amin(1)
     first_keyframe = slam_map.points["first_keyframe"][orphans]
     slam_map.points["first_keyframe"][orphans] = torch.where(
@@ -106,18 +108,18 @@ def _leave_points(slam_map: Map, removed: Tensor, replacement: Tensor) -> None:
 
 
 def compact(submap: Submap) -> RowRemap | None:
-    """Remove the rows of invalid points if worthwhile; return where rows went, or None if nothing was removed."""
+    """Remove the rows of invalid points if that is worth its cost; return the new rows, or None if nothing changed."""
     return remove_invalid_rows(submap) if is_worth_compacting(submap) else None
 
 
 def is_worth_compacting(submap: Submap) -> bool:
-    """Whether so many rows are invalid that removing them costs O(1) for each of them."""
-    rows, living = len(submap.map.points), submap.map.num_points
-    dead = rows - living
+    """Test whether so many rows are invalid that removing them costs O(1) for each of them."""
+    rows, valid = len(submap.map.points), submap.map.num_points
+    invalid = rows - valid
     return (
-        dead > MIN_INVALID_ROWS
-        and dead > living
-        and _MAX_REWRITTEN * dead > len(submap.posed_frames.observations)
+        invalid > MIN_INVALID_ROWS
+        and invalid > valid
+        and _MAX_REWRITTEN * invalid > len(submap.posed_frames.observations)
     )
 
 
@@ -131,7 +133,7 @@ def remove_invalid_rows(submap: Submap) -> RowRemap:
     slam_map.points.keep(kept)
     for column in (slam_map.keyframes["point_ids"], slam_map.points["replaced_by"]):
         column[:] = torch.where(column >= 0, rows[column], NO_POINT)
-    slam_map.reindex()
+    slam_map.mark_renumbered()
     local, last = rows[tracking.local_points], rows[tracking.last_inlier_points]
     submap.tracking = replace(tracking, local_points=local[local >= 0], last_inlier_points=last[last >= 0])
     everyone = torch.arange(slam_map.num_keyframes, device=rows.device)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from torchslam.errors import ResultsError
@@ -52,10 +53,13 @@ _FINITE = (
 
 
 @dataclass(frozen=True)
-class Saved:
+class SavedAtlas:
     """The content of a map file.
 
-    sessions: number of sessions (runs over the map) in it; the next session gets this number
+    Attributes:
+        atlas: The submaps.
+        camera: The camera of all submaps.
+        sessions: Number of sessions (runs over the map) in it; the next session gets this number.
     """
 
     atlas: Atlas
@@ -72,10 +76,10 @@ def write_atlas(path: str | Path, submaps: Iterable[Submap], camera: Camera, ses
         camera: The camera of all submaps.
         sessions: Number of sessions to keep; frames of later sessions, which were only localized, are left out.
     """
-    write_tensors(path, *pack(submaps, camera, sessions))
+    write_tensors(path, *pack_submaps(submaps, camera, sessions))
 
 
-def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> Saved:
+def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> SavedAtlas:
     """Read and check a file that `write_atlas` wrote.
 
     Raises:
@@ -83,21 +87,21 @@ def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> Saved:
             fit their schema or each other.
     """
     tensors, about = read_tensors(path)
-    return unpack(path, tensors, about, device)
+    return unpack_submaps(path, tensors, about, device)
 
 
 def read_map(path: str | Path) -> tuple[Map, Camera]:
     """Read the main submap's map, empty if there is no submap, and the camera.
 
     Raises:
-        ResultsError: As `read_atlas`.
+        ResultsError: The file is missing, damaged or no map, as in `read_atlas`.
     """
     saved = read_atlas(path)
     main = saved.atlas.main()
     return Map() if main is None else main.map, saved.camera
 
 
-def pack(
+def pack_submaps(
     submaps: Iterable[Submap], camera: Camera, sessions: int, num_created: int | None = None
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert submaps to tensors and a JSON description.
@@ -107,6 +111,9 @@ def pack(
         camera: The camera of all submaps.
         sessions: Number of sessions to keep.
         num_created: Number of submaps ever created; by default the highest number in use plus one.
+
+    Returns:
+        The tensors by name, and the description.
     """
     tensors, numbers = {CAMERA: camera.params}, []
     for submap in submaps:
@@ -124,13 +131,19 @@ def pack(
     return tensors, about
 
 
-def unpack(
+def unpack_submaps(
     path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any], device: torch.device | str = "cpu"
-) -> Saved:
-    """Check and convert the tensors and the description that `pack` made.
+) -> SavedAtlas:
+    """Check and convert the tensors and the description that `pack_submaps` made.
+
+    Args:
+        path: The file that error messages name.
+        tensors: By name.
+        about: The description.
+        device: Of the submaps.
 
     Raises:
-        ResultsError: They are not a valid map; `path` is the file that the message names.
+        ResultsError: They are not a valid map.
     """
     try:
         numbers, num_created, sessions = _numbers(about)
@@ -153,10 +166,10 @@ def unpack(
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
-    return Saved(Atlas(like, submaps, num_created), camera.with_params(like), sessions)
+    return SavedAtlas(Atlas(like, submaps, num_created), camera.with_params(like), sessions)
 
 
-def write_tensors(path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
+def write_tensors(path: str | Path, tensors: dict[str, Shaped[Tensor, "..."]], about: dict[str, Any]) -> None:
     """Write tensors and their description as one file, atomically; equal content gives equal bytes."""
     from safetensors.torch import save
 
@@ -165,7 +178,7 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], about: dict[str,
     write_whole(path, save(tensors, metadata={"torchslam": json.dumps(about, sort_keys=True)}))
 
 
-def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_tensors(path: str | Path) -> tuple[dict[str, Shaped[Tensor, "..."]], dict[str, Any]]:
     """Read a file that `write_tensors` wrote.
 
     Raises:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry import KeypointNoise, se3_inverse
@@ -24,17 +25,27 @@ SESSION_BITS = 40  # of a key, below the number of the session: more frames than
 
 
 class Map:
-    """Points and keyframes in one coordinate frame."""
+    """Points and keyframes in one coordinate frame.
+
+    In shapes K is the number of keyframes and L that of all points, removed ones included.
+
+    Attributes:
+        points: One row per point, see `table.POINTS`.
+        keyframes: One row per keyframe, see `table.KEYFRAMES`.
+        images: Of the keyframes, by key, if the matcher needs them; not saved.
+        version: Changes when rows are renumbered.
+    """
 
     def __init__(self) -> None:
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
-        self.images: dict[int, Tensor] = {}  # of keyframes, by key, where a matcher wants them; saved nowhere
-        self._index: ObservationIndex | None = None  # of what the tables hold; None: not made yet
-        self.version = 0  # of the rows: changes when they are renumbered
+        self.images: dict[int, Shaped[Tensor, "1 1 H W"]] = {}
+        self.version = 0
+        self._index: ObservationIndex | None = None  # None: not built yet
 
     @property
     def num_keyframes(self) -> int:
+        """The number of keyframes."""
         return len(self.keyframes)
 
     @property
@@ -43,22 +54,22 @@ class Map:
         return int(self.points["is_valid"].sum()) if len(self.points) else 0
 
     @property
-    def T_cw(self) -> Tensor:
-        """(K, 4, 4) poses of the keyframes, world to camera."""
+    def T_cw(self) -> Float[Tensor, "K 4 4"]:
+        """The poses of the keyframes, world to camera."""
         return self.keyframes["T_cw"]
 
     @property
-    def positions_w(self) -> Tensor:
-        """(L, 3) positions of all points, invalid ones included."""
+    def positions_w(self) -> Float[Tensor, "L 3"]:
+        """The positions of all points, removed ones included."""
         return self.points["positions_w"]
 
-    def ids(self, *keyframes: int) -> Tensor:
-        """Return rows of keyframes as a tensor (k,) on the device of the map."""
+    def index_tensor(self, *keyframes: int) -> Int[Tensor, " R"]:
+        """Return rows of keyframes as a tensor on the device of the map."""
         return torch.tensor(keyframes, device=self.T_cw.device)
 
     @property
-    def keys(self) -> Tensor:
-        """(K,) keys of the keyframes, which stay the same when rows are renumbered: session and frame index in one."""
+    def keys(self) -> Int[Tensor, " K"]:
+        """The keys of the keyframes, session and frame index in one number: renumbering rows does not change them."""
         return key_of(self.keyframes["session"], self.keyframes["frame_index"])
 
     def key(self, keyframe: int) -> int:
@@ -73,12 +84,12 @@ class Map:
         rows = torch.nonzero(self.keys == key)
         return int(rows[0]) if len(rows) else -1
 
-    def valid_points(self) -> Tensor:
-        """Return the rows (L',) of the valid points."""
+    def valid_points(self) -> Int[Tensor, " N"]:
+        """Return the rows of the valid points."""
         return torch.nonzero(self.points["is_valid"])[:, 0]
 
-    def point_features(self, point_ids: Tensor) -> Features:
-        """Return points (n,) as features without pixels, a batch of one, for matching by descriptor."""
+    def point_features(self, point_ids: Int[Tensor, " N"]) -> Features:
+        """Return points as features without pixels, a batch of one, for matching by descriptor."""
         points = self.points
         ones = torch.ones_like(points["scale_distance"][point_ids])[None]
         return Features(
@@ -90,32 +101,34 @@ class Map:
             mask=points["is_valid"][point_ids][None],
         )
 
-    def features(self, keyframes: Tensor, rows: Tensor | None = None) -> Features:
-        """Return the features of keyframes (k,) as a batch: all keypoints, or the rows (k, n) of them."""
+    def features(self, keyframes: Int[Tensor, " B"], rows: Int[Tensor, "B N"] | None = None) -> Features:
+        """Return the features of keyframes as a batch: all keypoints, or some rows of each."""
         at = (keyframes,) if rows is None else (keyframes[:, None], rows)
         names = ("keypoints", "scales", "angles", "descriptors", "mask")
         keypoints, scales, angles, descriptors, mask = (self.keyframes[name][at] for name in names)
         return Features(keypoints, torch.ones_like(scales), scales, angles, descriptors, mask)
 
-    def noise(self, keyframes: Tensor, keypoints: Tensor) -> KeypointNoise:
-        """Return the noise of keypoints (n,) of keyframes (n,)."""
+    def keypoint_noise(
+        self, keyframes: int | Int[Tensor, "*#batch"], keypoints: Int[Tensor, "*#batch"]
+    ) -> KeypointNoise:
+        """Return the noise of keypoints of the given keyframes."""
         table = self.keyframes
         return KeypointNoise(
             table["scales"][keyframes, keypoints], table["information"][keyframes, keypoints]
         )
 
-    def scale_ranges(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the finest and the coarsest keypoint scale of keyframes (k,), (k, 1) each."""
+    def scale_ranges(self, keyframes: Int[Tensor, " B"]) -> tuple[Float[Tensor, "B 1"], Float[Tensor, "B 1"]]:
+        """Return the finest and the coarsest keypoint scale of keyframes, pixels."""
         scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
         finest = scales.masked_fill(~mask, torch.inf).amin(1, keepdim=True)
         return finest, scales.masked_fill(~mask, 0.0).amax(1, keepdim=True)
 
-    def center_covariances_w(self) -> Tensor:
-        """Return the covariances (K, 3, 3) of the keyframe positions, zero where unknown."""
+    def center_covariances_w(self) -> Float[Tensor, "K 3 3"]:
+        """Return the covariances of the camera centers of the keyframes, zero where unknown."""
         R_cw = self.T_cw[:, :3, :3]
         return R_cw.mT @ self.keyframes["covariances"][:, :3, :3] @ R_cw
 
-    def add_keyframe(self, view: FrameFeatures, T_cw: Tensor) -> int:
+    def add_keyframe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"]) -> int:
         """Add a keyframe without observations and with unknown covariance; return its row."""
         if view.image is not None:
             self.images[(view.session << SESSION_BITS) + view.index] = view.image
@@ -137,23 +150,23 @@ class Map:
 
     def add_points(
         self,
-        positions_w: Tensor,
-        descriptors: Tensor,
+        positions_w: Float[Tensor, "N 3"],
+        descriptors: Shaped[Tensor, "N D"],
         keyframe: int,
-        covariances_w: Tensor | None = None,
+        covariances_w: Float[Tensor, "N 3 3"] | None = None,
         from_initialization: bool = False,
-    ) -> Tensor:
-        """Add points that a keyframe created; `refresh` sets their view directions and scales once they are observed.
+    ) -> Int[Tensor, " N"]:
+        """Add points that a keyframe created; `update_appearance` completes them once they are observed.
 
         Args:
-            positions_w: (n, 3)
-            descriptors: (n, D)
-            keyframe: The row of the keyframe.
-            covariances_w: (n, 3, 3) of the positions, zero where unknown; all unknown if None.
+            positions_w: Positions in map units.
+            descriptors: Of the keypoints.
+            keyframe: Row of the keyframe.
+            covariances_w: Of the positions, zero where unknown; None: all unknown.
             from_initialization: Whether the two-view initialization created them.
 
         Returns:
-            Rows (n,) of the points.
+            The rows of the points.
         """
         n, like = len(positions_w), positions_w
         frame_index = self.keyframes["frame_index"][keyframe].expand(n)
@@ -175,18 +188,30 @@ class Map:
             replaced_by=torch.full((n,), NO_POINT, device=like.device),
         )
 
-    def observe(self, keyframe: int | Tensor, keypoint_index: Tensor, point_ids: Tensor) -> None:
-        """Add observations of points (n,) by free keypoints (n,) of one keyframe or of keyframes (n,)."""
+    def add_observations(
+        self,
+        keyframe: int | Int[Tensor, " N"],
+        keypoint_index: Int[Tensor, " N"],
+        point_ids: Int[Tensor, " N"],
+    ) -> None:
+        """Add observations of points by keypoints, none of which observes a point yet, of one or N keyframes."""
         self._index_of_points.add(point_ids, keyframe * self._keypoints + keypoint_index)
         self.keyframes["point_ids"][keyframe, keypoint_index] = point_ids
         self._count(point_ids, 1)
 
-    def weigh(self, keyframe: int | Tensor, keypoint_index: Tensor, weights: Tensor) -> None:
-        """Multiply the stated information of keypoints (n,) of one keyframe or of keyframes (n,) by weights (n,)."""
+    def scale_information(
+        self,
+        keyframe: int | Int[Tensor, " N"],
+        keypoint_index: Int[Tensor, " N"],
+        weights: Float[Tensor, " N"],
+    ) -> None:
+        """Multiply the information of keypoints of one or N keyframes by weights."""
         self.keyframes["information"][keyframe, keypoint_index] *= weights[:, None]
 
-    def forget(self, keyframe_index: Tensor, keypoint_index: Tensor) -> None:
-        """Remove observations, given by keyframe (n,) and keypoint (n,)."""
+    def remove_observations(
+        self, keyframe_index: Int[Tensor, " O"], keypoint_index: Int[Tensor, " O"]
+    ) -> None:
+        """Remove observations, given by keyframe and keypoint."""
         table = self.keyframes["point_ids"]
         point_ids = table[keyframe_index, keypoint_index]
         self._index_of_points.remove(point_ids, keyframe_index * self._keypoints + keypoint_index)
@@ -206,14 +231,14 @@ class Map:
 
     @property
     def _observations(self) -> Tensor:
-        """(K N,) the points that keypoints observe, as a flat view that the slots of the index refer to."""
+        """The point of each keypoint, (K * N,): a flat view, whose rows are the slots of the index."""
         return self.keyframes["point_ids"].view(-1)
 
     def _count(self, point_ids: Tensor, step: int) -> None:
         self.points["times_observed"].index_add_(0, point_ids, torch.full_like(point_ids, step))
 
-    def observations(self, keyframes: Tensor | None = None) -> Observations:
-        """Return all observations by keyframes (k,), or by all keyframes."""
+    def observations(self, keyframes: Int[Tensor, " B"] | None = None) -> Observations:
+        """Return all observations by the given keyframes, or by all."""
         if keyframes is None:
             keyframes = torch.arange(self.num_keyframes, device=self.T_cw.device)
         table = self.keyframes["point_ids"][keyframes]
@@ -228,19 +253,23 @@ class Map:
             self.keyframes["information"][keyframe, keypoint],
         )
 
-    def observers(self, point_ids: Tensor, keyframes: Tensor | None = None) -> Tensor:
-        """Count how many of the distinct points (n,) each keyframe observes: (K,), or (k,) for given keyframes."""
-        _, slots = self._index_of_points.of(point_ids)
+    def count_observed(
+        self, point_ids: Int[Tensor, " N"], keyframes: Int[Tensor, " B"] | None = None
+    ) -> Int[Tensor, " K"]:
+        """Count how many of the distinct points each of the keyframes, by default of all, observes."""
+        _, slots = self._index_of_points.observations_of(point_ids)
         counts = torch.bincount(slots // self._keypoints, minlength=self.num_keyframes)
         return counts if keyframes is None else counts[keyframes]
 
-    def scales_of(self, point_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Return observing keyframes (n, w) of points (n,), padded with NO_POINT, and the keypoint scales (n, w)."""
+    def observers_and_scales(
+        self, point_ids: Int[Tensor, " N"]
+    ) -> tuple[Int[Tensor, "N R"], Float[Tensor, "N R"]]:
+        """Return the observing keyframes of points, padded with NO_POINT, and the keypoint scales, pixels."""
         slots = self._index_of_points.padded_slots(point_ids).long()
         keyframes = torch.where(slots >= 0, slots // self._keypoints, NO_POINT)
         return keyframes, self.keyframes["scales"][keyframes, slots % self._keypoints]
 
-    def view(self, keyframe: int) -> FrameFeatures:
+    def frame_features(self, keyframe: int) -> FrameFeatures:
         """Return the features of a keyframe."""
         row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
         names = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
@@ -253,11 +282,11 @@ class Map:
             **{name: row[name] for name in names},
         )
 
-    def shared(self, keyframes: Tensor) -> Tensor:
-        """Return covisibility weights (k, K): points that keyframes (k,) share with every other one, 0 with itself."""
+    def covisibility_weights(self, keyframes: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
+        """Count the points that keyframes share with every other keyframe; 0 with itself."""
         table, count = self.keyframes["point_ids"][keyframes], self.num_keyframes
         ids = torch.nonzero(torch.bincount(table[table >= 0]))[:, 0]
-        which, slots = self._index_of_points.of(ids)
+        which, slots = self._index_of_points.observations_of(ids)
         observers = slots // self._keypoints
         takes_part = torch.bincount(observers, minlength=count) > 0
         takes_part[keyframes] = True
@@ -272,38 +301,41 @@ class Map:
             .scatter_(1, keyframes[:, None], 0)
         )
 
-    def covisible(self, keyframe: int, count: int, min_shared: int = MIN_SHARED) -> Tensor:
-        """Return the keyframes (<= count,) that share most points with a keyframe, best first, without itself."""
+    def covisible_keyframes(
+        self, keyframe: int, count: int, min_shared: int = MIN_SHARED
+    ) -> Int[Tensor, " R"]:
+        """Return at most `count` keyframes that share most points with a keyframe, best first, without itself."""
         row = self.keyframes["point_ids"][keyframe]
-        shared = self.observers(row[row >= 0])
+        shared = self.count_observed(row[row >= 0])
         shared[keyframe] = 0
         return top_rows(shared, count, min_shared)
 
-    def covisibility_union(self, keyframes: Tensor, count: int) -> Tensor:
-        """Return keyframes (k,) and the at most `count` most covisible ones of each, ascending."""
-        shared = self.shared(keyframes)
+    def covisibility_union(self, keyframes: Int[Tensor, " B"], count: int) -> Int[Tensor, " R"]:
+        """Return keyframes and the at most `count` most covisible ones of each, ascending."""
+        shared = self.covisibility_weights(keyframes)
         columns = torch.nonzero((shared >= MIN_SHARED).any(0))[:, 0]
         ranked = torch.sort(shared[:, columns], dim=1, descending=True, stable=True)
         is_near = ranked.values[:, :count] >= MIN_SHARED
         return torch.unique(torch.cat([keyframes, columns[ranked.indices[:, :count][is_near]]]))
 
-    def sees(self, keyframes: Tensor, point_ids: Tensor) -> Tensor:
-        """Return (k, n) bool: whether keyframes (k,) observe distinct points (n,)."""
+    def observation_mask(
+        self, keyframes: Int[Tensor, " B"], point_ids: Int[Tensor, " N"]
+    ) -> Bool[Tensor, "B N"]:
+        """Test which of the keyframes observe which of the distinct points."""
         column = torch.zeros(len(self.points) + 1, dtype=torch.int64, device=point_ids.device)
         column[point_ids] = torch.arange(1, len(point_ids) + 1, device=point_ids.device)
-        seen = column[
-            self.keyframes["point_ids"][keyframes]
-        ]  # NO_POINT finds the last entry, which stays zero
+        # NO_POINT reads the last entry, which stays zero.
+        seen = column[self.keyframes["point_ids"][keyframes]]
         found = torch.zeros(len(keyframes), len(point_ids) + 1, dtype=torch.bool, device=point_ids.device)
         return found.scatter_(1, seen, True)[:, 1:]
 
-    def points_seen_by(self, keyframes: Tensor) -> Tensor:
-        """Return the points (n,) that at least one of the keyframes (k,) observes, ascending."""
+    def observed_points(self, keyframes: Int[Tensor, " B"]) -> Int[Tensor, " N"]:
+        """Return the points that at least one of the keyframes observes, ascending."""
         table = self.keyframes["point_ids"][keyframes].flatten()
         return distinct(table[table >= 0])
 
     def append(self, other: Map) -> tuple[int, int]:
-        """Append keyframes and points of another map in the same coordinate frame; return the offsets of their rows."""
+        """Append keyframes and points of a map in the same coordinate frame; return the offsets of their rows."""
         keyframes, points = len(self.keyframes), len(self.points)
         self.images |= other.images
         rows = other.points.columns()
@@ -313,34 +345,32 @@ class Map:
         rows = other.keyframes.columns()
         rows["point_ids"] = torch.where(rows["point_ids"] >= 0, rows["point_ids"] + points, NO_POINT)
         self.keyframes.append(**rows)
-        self.reindex()
+        self.mark_renumbered()
         return keyframes, points
 
-    def reindex(self) -> None:
-        """Note that rows were renumbered: row numbers from before are no longer valid."""
+    def mark_renumbered(self) -> None:
+        """Rebuild the index on the next query and raise the version, after rows were renumbered."""
         self._index = None
         self.version += 1
 
-    # --- changing --------------------------------------------------------------------------------------------
-
-    def invalidate(self, point_ids: Tensor) -> None:
-        """Mark points (n,) invalid and remove their observations."""
+    def remove_points(self, point_ids: Int[Tensor, " N"]) -> None:
+        """Mark points invalid and remove their observations; the rows stay until the submap is compacted."""
         if len(point_ids) == 0:
             return
-        _, slots = self._index_of_points.of(point_ids)
+        _, slots = self._index_of_points.observations_of(point_ids)
         self._index_of_points.clear(point_ids)
         self._observations.scatter_(0, slots, NO_POINT)
         self.points["is_valid"][point_ids] = False
         self.points["times_observed"][point_ids] = 0
 
-    def drop(self, seen: Observations, wrong: Tensor) -> None:
-        """Remove the observations of a mask (O,), and points that fewer than two keyframes still observe."""
-        self.forget(seen.keyframe_index[wrong], seen.keypoint_index[wrong])
-        touched = torch.unique(seen.point_index[wrong])
-        self.invalidate(touched[self.points["times_observed"][touched] < 2])
+    def remove_masked_observations(self, observations: Observations, mask: Bool[Tensor, " O"]) -> None:
+        """Remove the observations of a mask, and their points that fewer than two keyframes still observe."""
+        self.remove_observations(observations.keyframe_index[mask], observations.keypoint_index[mask])
+        touched = torch.unique(observations.point_index[mask])
+        self.remove_points(touched[self.points["times_observed"][touched] < 2])
 
-    def replace(self, old: Tensor, new: Tensor) -> None:
-        """Merge points: observations of old (n,) become those of new (n,), and old become invalid.
+    def merge_points(self, old: Int[Tensor, " N"], new: Int[Tensor, " N"]) -> None:
+        """Merge points: the observations of the old points become those of the new, and the old are removed.
 
         Several may be merged into one; none of the new points may be among the old. A keyframe that observes both keeps
         one observation: that of the new point, or that at the first keypoint.
@@ -349,16 +379,14 @@ class Map:
             return
         index, count = self._index_of_points, len(self.points)
         replacement = torch.unique(new)
-        which, held = index.of(replacement)
-        taken = (held // self._keypoints) * count + replacement[
-            which
-        ]  # keyframes and the heirs that they see already
-        which, slots = index.of(old)
+        which, held = index.observations_of(replacement)
+        taken = (held // self._keypoints) * count + replacement[which]  # pairs of keyframe and new point
+        which, slots = index.observations_of(old)
         order = torch.argsort(slots)  # of several keypoints the first comes first
         slots, inherited = slots[order], new[which[order]]
         wanted = (slots // self._keypoints) * count + inherited
         kept = first_of_each(wanted) & ~torch.isin(wanted, taken)
-        self.invalidate(old)
+        self.remove_points(old)
         self._observations.scatter_(0, slots[kept], inherited[kept])
         index.add(inherited[kept], slots[kept])
         self._count(inherited[kept], 1)
@@ -366,16 +394,16 @@ class Map:
         for counter in ("times_visible", "times_found"):
             self.points[counter].index_add_(0, new, self.points[counter][old])
 
-    def follow_merges(self, point_ids: Tensor) -> Tensor:
-        """Return the points that points (n,) were merged into; others stay as they are."""
-        heir = self.points["replaced_by"][point_ids]
-        while bool((heir >= 0).any()):
-            point_ids = torch.where(heir >= 0, heir, point_ids)
-            heir = self.points["replaced_by"][point_ids]
+    def follow_merges(self, point_ids: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Return the points that points were merged into; others stay as they are."""
+        merged = self.points["replaced_by"][point_ids]
+        while bool((merged >= 0).any()):
+            point_ids = torch.where(merged >= 0, merged, point_ids)
+            merged = self.points["replaced_by"][point_ids]
         return point_ids
 
-    def refresh(self, keyframes: Tensor) -> None:
-        """Update direction, scale and descriptor of the points of keyframes (k,) from their newest observation.
+    def update_appearance(self, keyframes: Int[Tensor, " B"]) -> None:
+        """Update view direction, scale, angle and descriptor of the keyframes' points from the newest observation.
 
         `scale_distance` is keypoint scale times distance: from distance d the point is expected at scale_distance / d.
         """
@@ -395,13 +423,15 @@ class Map:
         self.points["angles"][ids] = self.keyframes["angles"][keyframe, keypoint]
         self.points["descriptors"][ids] = self.keyframes["descriptors"][keyframe, keypoint]
 
-    def forget_frames(self) -> None:
+    def reset_last_seen(self) -> None:
         """Reset `last_seen_frame` of all points, since a new session numbers its frames from 0."""
         if len(self.points):
             self.points["last_seen_frame"][:] = -1
 
-    def set_covariances(self, keyframes: Tensor, point_ids: Tensor, marginals: Marginals) -> None:
-        """Store covariances of keyframes (k,) and points (n,); those that are zero keep the present ones."""
+    def set_covariances(
+        self, keyframes: Int[Tensor, " B"], point_ids: Int[Tensor, " N"], marginals: Marginals
+    ) -> None:
+        """Store the covariances of keyframes and points; where they are zero, the old ones stay."""
         for column, rows, covariances in (
             (self.keyframes["covariances"], keyframes, marginals.frames),
             (self.points["covariances_w"], point_ids, marginals.points),
@@ -410,8 +440,8 @@ class Map:
             column[rows[known]] = covariances[known]
 
 
-def key_of(sessions: Tensor, frames: Tensor) -> Tensor:
-    """Return keys (n,) of the frames (n,) of sessions (n,)."""
+def key_of(sessions: Int[Tensor, " N"], frames: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """Return the keys of frames of sessions."""
     return (sessions << SESSION_BITS) + frames
 
 
@@ -420,7 +450,7 @@ def feature_mismatch(slam_map: Map, view: FrameFeatures, to_map: bool) -> str:
 
     Args:
         slam_map: The map.
-        view: The frame.
+        view: Features of the frame.
         to_map: Whether frames become keyframes, which all need the same number of keypoints.
     """
     if slam_map.num_keyframes == 0:
@@ -446,10 +476,15 @@ class MapSnapshot:
     """Copies of the columns that later keyframes may change, to restore the map when these are taken back.
 
     Rows must not be renumbered between `of` and `restore`.
+
+    Attributes:
+        points: All columns of the points.
+        keyframes: The mutable columns of the keyframes.
+        version: That of the map.
     """
 
-    points: dict[str, Tensor]
-    keyframes: dict[str, Tensor]
+    points: dict[str, Shaped[Tensor, "L ..."]]
+    keyframes: dict[str, Shaped[Tensor, "K ..."]]
     version: int
 
     @classmethod
@@ -469,7 +504,7 @@ class MapSnapshot:
         return len(self.keyframes["T_cw"])
 
     def restore(self, slam_map: Map) -> None:
-        """Restore the map."""
+        """Restore the map to its state at the snapshot."""
         assert slam_map.version == self.version, "rows were renumbered since the snapshot"
         for key in slam_map.keys[self.num_keyframes :].tolist():
             slam_map.images.pop(key, None)
@@ -478,5 +513,5 @@ class MapSnapshot:
         for table, columns in ((slam_map.points, self.points), (slam_map.keyframes, self.keyframes)):
             for name, column in columns.items():
                 table[name][:] = column
-        slam_map.reindex()
+        slam_map.mark_renumbered()
         slam_map.version = self.version

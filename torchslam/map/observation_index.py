@@ -7,6 +7,7 @@ observe it, so that a query costs O(observations of the queried points). It is d
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 NO_SLOT = -1
@@ -21,33 +22,33 @@ class ObservationIndex:
     """
 
     @torch.inference_mode(False)
-    def __init__(self, table: Tensor) -> None:
-        """Index a table (K, N) of point rows, negative where a keypoint observes nothing."""
+    def __init__(self, table: Int[Tensor, "K N"]) -> None:
+        """Index a table of point rows, negative where a keypoint observes nothing."""
         # Half the memory of int64: enough for two million keyframes of a thousand keypoints.
         like = torch.empty(0, dtype=torch.int32, device=table.device)
         self._slots = like.new_full((_LEAST_ROWS, _LEAST_WIDTH), NO_SLOT)
-        self._row_of = like.new_zeros(_LEAST_ROWS)  # by point; row 0 is that of all points that nobody sees
-        self._free = torch.arange(_LEAST_ROWS, device=table.device).flip(
-            0
-        )  # rows without a point: a stack, and
-        self._num_free = _LEAST_ROWS - 1  # how high it is
+        self._row_of = like.new_zeros(
+            _LEAST_ROWS
+        )  # by point; row 0 stands for all points without observations
+        self._free = torch.arange(_LEAST_ROWS, device=table.device).flip(0)  # a stack of rows without a point
+        self._num_free = _LEAST_ROWS - 1
         flat = table.flatten()
         slots = torch.nonzero(flat >= 0)[:, 0]
         self.add(flat[slots], slots)
 
-    def of(self, point_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Return for every observation of points (n,) the index of its point, 0 ... n - 1, and its slot: (o,), (o,)."""
+    def observations_of(self, point_ids: Int[Tensor, " N"]) -> tuple[Int[Tensor, " O"], Int[Tensor, " O"]]:
+        """Return for every observation of points the position of its point in `point_ids` and its slot."""
         slots = self.padded_slots(point_ids)
         which, column = torch.nonzero(slots >= 0, as_tuple=True)
         return which, slots[which, column].long()
 
-    def padded_slots(self, point_ids: Tensor) -> Tensor:
-        """Return the slots (n, w) that observe points (n,), padded with NO_SLOT."""
+    def padded_slots(self, point_ids: Int[Tensor, " N"]) -> Int[Tensor, "N R"]:
+        """Return the slots that observe points, padded with NO_SLOT."""
         return self._slots[self._rows(point_ids)]
 
     @torch.inference_mode(False)
-    def add(self, point_ids: Tensor, slots: Tensor) -> None:
-        """Add observations of points (n,) at slots (n,); points may repeat."""
+    def add(self, point_ids: Int[Tensor, " O"], slots: Int[Tensor, " O"]) -> None:
+        """Add observations of points at slots; points may repeat."""
         if len(point_ids) == 0:
             return
         order = torch.sort(point_ids, stable=True)
@@ -60,8 +61,8 @@ class ObservationIndex:
         self._widen(int(columns.max()) + 1)
         self._slots[self._rows(order.values), columns] = slots[order.indices].to(self._slots.dtype)
 
-    def remove(self, point_ids: Tensor, slots: Tensor) -> None:
-        """Remove observations of points (n,) at slots (n,)."""
+    def remove(self, point_ids: Int[Tensor, " O"], slots: Int[Tensor, " O"]) -> None:
+        """Remove observations of points at slots."""
         if len(point_ids) == 0:
             return
         rows = self._rows(torch.unique(point_ids))
@@ -69,8 +70,8 @@ class ObservationIndex:
         gone = torch.isin(held, slots.to(held.dtype))
         self._slots[rows] = torch.sort(held.masked_fill(gone, NO_SLOT), dim=1, descending=True).values
 
-    def clear(self, point_ids: Tensor) -> None:
-        """Remove all observations of points (n,)."""
+    def clear(self, point_ids: Int[Tensor, " N"]) -> None:
+        """Remove all observations of points."""
         rows = torch.unique(self._rows(point_ids))
         rows = rows[rows > 0]
         self._slots[rows] = NO_SLOT
@@ -78,8 +79,8 @@ class ObservationIndex:
         self._free[self._num_free : self._num_free + len(rows)] = rows
         self._num_free += len(rows)
 
-    def _rows(self, point_ids: Tensor) -> Tensor:
-        """Return the rows (n,) of points (n,)."""
+    def _rows(self, point_ids: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Return the rows of points."""
         if len(point_ids) and int(point_ids.max()) >= len(self._row_of):
             self._reach(int(point_ids.max()))
         return self._row_of[point_ids].long()
@@ -90,8 +91,8 @@ class ObservationIndex:
         more = self._row_of.new_zeros(max(len(self._row_of), point + 1))
         self._row_of = torch.cat([self._row_of, more])
 
-    def _take_rows(self, point_ids: Tensor) -> None:
-        """Assign a row to each of distinct points (n,) that has none."""
+    def _take_rows(self, point_ids: Int[Tensor, " N"]) -> None:
+        """Assign a row to each of distinct points that has none."""
         new = point_ids[self._rows(point_ids) == 0]
         rows, width = self._slots.shape
         if len(new) > self._num_free:
@@ -115,14 +116,14 @@ class ObservationIndex:
         self._slots[: old.shape[0], : old.shape[1]] = old
 
 
-def top_rows(counts: Tensor, limit: int, least: int) -> Tensor:
-    """Return indices (<= limit,) of the largest counts (K,) that are at least `least`, in descending order."""
+def top_rows(counts: Shaped[Tensor, " N"], limit: int, least: int) -> Int[Tensor, " R"]:
+    """Return the indices of at most `limit` largest counts that are at least `least`, in descending order."""
     enough = torch.nonzero(counts >= least)[:, 0]
     return enough[torch.sort(counts[enough], descending=True, stable=True).indices[:limit]]
 
 
-def first_of_each(values: Tensor) -> Tensor:
-    """Return (n,) bool: whether a value (n,) occurs for the first time."""
+def first_of_each(values: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """Test which values occur for the first time."""
     order = torch.sort(values, stable=True)
     is_first = torch.ones_like(values, dtype=torch.bool)
     is_first[order.indices[1:]] = order.values[1:] != order.values[:-1]

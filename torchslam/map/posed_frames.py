@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate, se3_inverse, transform
@@ -14,9 +15,8 @@ from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
-_OUTLIER_CHI_SQUARE = (
-    4.0 * CHI_SQUARE_95
-)  # twice the distance of the gate: the final adjustment moves frames by less
+# Twice the distance of the gate: the final adjustment moves frames by less.
+_OUTLIER_CHI_SQUARE = 4.0 * CHI_SQUARE_95
 _MIN_INLIER_RATIO = 0.75  # of a frame's observations, to remove the others
 _CHUNK = 1 << 16  # observations that are checked at once, to bound memory
 
@@ -25,16 +25,17 @@ _CHUNK = 1 << 16  # observations that are checked at once, to bound memory
 class RunGraph(ObservationGraph):
     """The observation graph of a submap, with the origin of its rows.
 
-    frame_ids:      (F,) frames of the sequence of their session
-    sessions:       (F,) which run over the map saw them
-    point_ids:      (P,) rows of the points of the submap's map
-    keypoint_index: (O,) rows of the features of the frame: with them, pixels can be read anew from a front end;
+    Attributes:
+        frame_ids: Index of each frame in the sequence of its session.
+        sessions: Session of each frame.
+        point_ids: Row of each point in the submap's map.
+        keypoint_index: Row of each observation among the frame's features, to read its pixels anew from a front end.
     """
 
-    frame_ids: Tensor
-    sessions: Tensor
-    point_ids: Tensor
-    keypoint_index: Tensor
+    frame_ids: Int[Tensor, " F"]
+    sessions: Int[Tensor, " F"]
+    point_ids: Int[Tensor, " N"]
+    keypoint_index: Int[Tensor, " O"]
 
     _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
         "frame_ids": ("F", (), int),
@@ -45,14 +46,21 @@ class RunGraph(ObservationGraph):
 
 
 class PosedFrames:
-    """All posed frames: poses relative to a keyframe, so that they follow the map; observations as flat rows."""
+    """All posed frames: poses relative to a keyframe, so that they follow the map; observations as flat rows.
+
+    Attributes:
+        frames: One row per frame, see `table.FRAMES`.
+        observations: One row per observation of a frame, see `table.OBSERVATIONS`.
+    """
 
     def __init__(self) -> None:
         self.frames = Table(FRAMES)
         self.observations = Table(OBSERVATIONS)
 
-    def add(self, view: FrameFeatures, estimate: PoseEstimate, T_cr: Tensor, reference: int) -> None:
-        """Add a frame with pose T_cr (4, 4) relative to keyframe `reference` and its inlier observations."""
+    def add(
+        self, view: FrameFeatures, estimate: PoseEstimate, T_cr: Float[Tensor, "4 4"], reference: int
+    ) -> None:
+        """Add a frame with pose T_cr relative to keyframe `reference` and its inlier observations."""
         device, view = T_cr.device, view.weighed(estimate.keypoints, estimate.weights)
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
@@ -80,12 +88,12 @@ class PosedFrames:
         return int((self.frames["session"] == session).sum())
 
     @property
-    def keys(self) -> Tensor:
-        """(F,) keys of the frames: session and frame index, as for keyframes."""
+    def keys(self) -> Int[Tensor, " F"]:
+        """The keys of the frames: session and frame index, as for keyframes."""
         return key_of(self.frames["session"], self.frames["frame_index"])
 
-    def T_cw(self, slam_map: Map) -> Tensor:
-        """Return the current poses (F, 4, 4) of the frames in the order they were added."""
+    def T_cw(self, slam_map: Map) -> Float[Tensor, "F 4 4"]:
+        """Return the current poses of the frames in the order they were added."""
         return self.frames["T_cr"] @ slam_map.T_cw[self.frames["reference_keyframe"]]
 
     def trajectory(self, slam_map: Map, session: int | None = None) -> Trajectory:
@@ -99,8 +107,8 @@ class PosedFrames:
         order = torch.argsort(timestamps, stable=True)
         return Trajectory(timestamps[order].clone(), se3_inverse(T_cw[order]))
 
-    def rescale(self, factors: Tensor) -> None:
-        """Scale the poses relative to each keyframe by factors (K,)."""
+    def rescale(self, factors: Float[Tensor, " K"]) -> None:
+        """Scale the translations relative to each keyframe by its factor."""
         if len(self):
             self.frames["T_cr"][:, :3, 3] *= factors[self.frames["reference_keyframe"]][:, None]
 
@@ -115,8 +123,8 @@ class PosedFrames:
         self.frames.append(**frames)
         self.observations.append(**seen)
 
-    def reassign_reference(self, replacement: Tensor, slam_map: Map) -> None:
-        """Change the reference of frames from keyframe i to replacement[i] (K,), without moving them."""
+    def reassign_reference(self, replacement: Int[Tensor, " K"], slam_map: Map) -> None:
+        """Change the reference of frames from keyframe i to replacement[i], without moving them."""
         old = self.frames["reference_keyframe"]
         moves = torch.nonzero(replacement[old] != old)[:, 0]
         new = replacement[old[moves]]
@@ -124,8 +132,8 @@ class PosedFrames:
         self.frames["T_cr"][moves] = self.frames["T_cr"][moves] @ T_rr
         old[moves] = new
 
-    def absorb_keyframes(self, slam_map: Map, keyframes: Tensor) -> None:
-        """Replace pose and observations of the frames of keyframes (k,) by those of the keyframes.
+    def absorb_keyframes(self, slam_map: Map, keyframes: Int[Tensor, " R"]) -> None:
+        """Replace pose and observations of the frames of keyframes by those of the keyframes.
 
         A keyframe without a frame gets one.
         """
@@ -147,8 +155,8 @@ class PosedFrames:
             information=seen.information,
         )
 
-    def _overwrite(self, stale: Tensor, **fresh: Tensor) -> None:
-        """Overwrite stale rows (n,), ascending, with fresh observations, and copy the table only if they do not fit."""
+    def _overwrite(self, stale: Int[Tensor, " N"], **fresh: Tensor) -> None:
+        """Overwrite stale rows, ascending, with fresh observations, and copy the table only if they do not fit."""
         count = min(len(stale), len(fresh["frame_row"]))
         for name, values in fresh.items():
             self.observations[name][stale[:count]] = values[:count]
@@ -157,8 +165,8 @@ class PosedFrames:
             self.observations.keep(torch.nonzero(is_left.index_fill(0, stale[count:], False))[:, 0])
         self.observations.append(**{name: values[count:] for name, values in fresh.items()})
 
-    def _frame_of(self, slam_map: Map, keyframe: int) -> Tensor:
-        """Return the row (1,) of the frame that a keyframe was made of; add it if it is missing."""
+    def _frame_of(self, slam_map: Map, keyframe: int) -> Int[Tensor, " 1"]:
+        """Return the row of the frame that a keyframe was made of; add it if it is missing."""
         own = {
             name: slam_map.keyframes[name][keyframe][None] for name in ("frame_index", "session", "timestamp")
         }
@@ -167,10 +175,10 @@ class PosedFrames:
         if len(row):
             return row
         eye = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)[None]
-        return self.frames.append(T_cr=eye, reference_keyframe=slam_map.ids(keyframe), **own)
+        return self.frames.append(T_cr=eye, reference_keyframe=slam_map.index_tensor(keyframe), **own)
 
-    def renumber_points(self, slam_map: Map, rows: Tensor) -> None:
-        """Renumber points to rows (L,), negative if removed; merged points count as their replacements."""
+    def renumber_points(self, slam_map: Map, rows: Int[Tensor, " L"]) -> None:
+        """Renumber points to new rows, negative if removed; merged points count as their replacements."""
         if len(self.observations) == 0:
             return
         renamed = rows[slam_map.follow_merges(self.observations["point_ids"])]
@@ -192,8 +200,10 @@ class PosedFrames:
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])
 
-    def _agree(self, rows: Tensor, T_cw: Tensor, slam_map: Map, camera: Camera) -> Tensor:
-        """Return (n,) bool: whether observations (n,) are near their reprojection by frames at T_cw (F, 4, 4)."""
+    def _agree(
+        self, rows: Int[Tensor, " O"], T_cw: Float[Tensor, "F 4 4"], slam_map: Map, camera: Camera
+    ) -> Bool[Tensor, " O"]:
+        """Test which observations are near their reprojection by the frames."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
         points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
         points_c = transform(T_cw[seen["frame_row"]], points_w[:, None])[:, 0]

@@ -10,18 +10,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int, Shaped
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Column:
-    """The shape of one row, the kind of its numbers, and a description."""
+    """A column of a table.
+
+    Attributes:
+        shape: Of one row; a letter is a size that the first row fixes.
+        kind: Of its numbers, a key of `_KINDS`.
+        about: A description.
+    """
 
     shape: tuple[int | str, ...]
     kind: str
     about: str
 
-    def mismatch(self, values: Tensor) -> str:
+    def mismatch(self, values: Shaped[Tensor, "..."]) -> str:
         """Describe how values violate the column; empty if they fit."""
         row = tuple(values.shape[1:])
         fits = len(row) == len(self.shape) and all(
@@ -112,6 +119,7 @@ class Table:
     """
 
     def __init__(self, schema: Schema) -> None:
+        """Create an empty table."""
         self.schema = schema
         self._columns: dict[str, Tensor] = {}
         self._size = 0
@@ -122,7 +130,7 @@ class Table:
     def __contains__(self, name: str) -> bool:
         return name in self._columns
 
-    def __getitem__(self, name: str) -> Tensor:
+    def __getitem__(self, name: str) -> Shaped[Tensor, "R ..."]:
         return self._columns[name][: self._size]
 
     def columns(self) -> dict[str, Tensor]:
@@ -130,8 +138,8 @@ class Table:
         return {name: self[name] for name in self._columns}
 
     @torch.inference_mode(False)
-    def append(self, **rows: Tensor) -> Tensor:
-        """Append rows, one tensor (n, ...) per column, and return their ids (n,) int64.
+    def append(self, **rows: Shaped[Tensor, "_ ..."]) -> Int[Tensor, " R"]:
+        """Append rows, one tensor per column, and return their indices.
 
         Raises:
             ValueError: Columns do not fit the schema or each other.
@@ -145,8 +153,8 @@ class Table:
         return torch.arange(start, end, device=next(iter(rows.values())).device)
 
     @torch.inference_mode(False)
-    def keep(self, rows: Tensor) -> None:
-        """Keep the rows (n,) in this order and drop the others; memory is freed if most of it would be unused."""
+    def keep(self, rows: Int[Tensor, " R"]) -> None:
+        """Keep the rows in this order and remove the others; memory is freed if most of it would be unused."""
         for name, column in self._columns.items():
             kept = self[name][rows]
             if 2 * len(rows) < len(column):
@@ -156,7 +164,7 @@ class Table:
         self._size = len(rows)
 
     def truncate(self, size: int) -> None:
-        """Drop the rows from `size` on."""
+        """Remove the rows from `size` on."""
         self._size = min(size, self._size)
 
     def _check(self, rows: dict[str, Tensor]) -> None:

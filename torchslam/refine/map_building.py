@@ -84,9 +84,9 @@ def adjust_coarse_to_fine(
 def densify(slam_map: Map, camera: Camera, config: Config) -> None:
     """Add points along epipolar lines and observations by projection that the first matches missed; adjust the map."""
     for keyframe in range(slam_map.num_keyframes):
-        neighbors = slam_map.covisible(keyframe, 2 * config.mapping.num_partners)
+        neighbors = slam_map.covisible_keyframes(keyframe, 2 * config.mapping.num_partners)
         triangulate_against(slam_map, keyframe, neighbors[: config.mapping.num_partners], camera, config)
-        slam_map.refresh(slam_map.ids(keyframe))
+        slam_map.update_appearance(slam_map.index_tensor(keyframe))
         fuse(slam_map, keyframe, neighbors, camera, config)
     adjust_all(slam_map, camera, config.bundle_adjustment)
 

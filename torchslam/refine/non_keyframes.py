@@ -90,7 +90,7 @@ class FramePoser:
         away = (slam_map.keyframes["frame_index"] - view.index).abs()
         nearest = torch.argsort(away, stable=True)[:NUM_NEAREST]
         estimate = self.tracker.localizer.locate(
-            slam_map, view, self._candidates(slam_map, view, nearest), slam_map.points_seen_by(nearest)
+            slam_map, view, self._candidates(slam_map, view, nearest), slam_map.observed_points(nearest)
         )
         if estimate is not None:
             self.tracker.start_at_estimate(submap, view, estimate)
@@ -115,5 +115,5 @@ def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
     posed_frames = PosedFrames()
     for keyframe in range(slam_map.num_keyframes):
         T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
-        posed_frames.add(slam_map.view(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
+        posed_frames.add(slam_map.frame_features(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
     return posed_frames.graph(slam_map, camera)

@@ -225,6 +225,6 @@ def make_map(views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, points_w:
         ids[own] = made.add_points(points_w[own], descriptors, keyframe)
     for keyframe in range(len(views)):
         own = torch.nonzero(tracks.keyframe == keyframe)[:, 0]
-        made.observe(keyframe, tracks.keypoint[own], ids[tracks.track[own]])
-    made.refresh(torch.arange(len(views), device=points_w.device))
+        made.add_observations(keyframe, tracks.keypoint[own], ids[tracks.track[own]])
+    made.update_appearance(torch.arange(len(views), device=points_w.device))
     return made

@@ -22,7 +22,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
-from torchslam.map.file import Saved, pack, read_tensors, unpack, write_tensors
+from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
 from torchslam.system.front_end import FrontEnd
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
@@ -39,7 +39,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     submap = slam.submap
     if submap is None or not slam.can_checkpoint:
         raise ValueError("a checkpoint needs a submap that is followed and nothing that is held back")
-    tensors, about = pack(slam.atlas, slam.camera, slam.session.count, slam.atlas.num_created)
+    tensors, about = pack_submaps(slam.atlas, slam.camera, slam.session.count, slam.atlas.num_created)
     whole = {column.name: getattr(submap.tracking, column.name) for column in fields(TrackingState)}
     tracking = {TRACKING + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
@@ -87,7 +87,7 @@ def read_checkpoint(
             word = "configuration" if what == "config" else what
             raise ResultsError(f"{path}: a checkpoint of a run with another {word}")
     own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("run.")}
-    saved = unpack(path, tensors, about, device)
+    saved = unpack_submaps(path, tensors, about, device)
     slam = SLAM(saved.camera, config, extractor)
     try:
         so_far = RunProgress(run["next"], _results(own, run, device), run["skipped"])
@@ -114,7 +114,7 @@ def fingerprint(of: Sequence | Config) -> str:
 
 
 def _restore(
-    slam: SLAM, saved: Saved, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str
+    slam: SLAM, saved: SavedAtlas, tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str
 ) -> None:
     """Start the session of a checkpoint in a new system."""
     (submap,) = (submap for submap in saved.atlas if submap.number == run["submap"])

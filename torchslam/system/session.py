@@ -49,7 +49,7 @@ class Session:
         if not mapping and len(saved.atlas) == 0:
             raise ResultsError(f"{path}: there is no submap in it to localize in")
         for submap in saved.atlas if mapping else ():
-            submap.map.forget_frames()
+            submap.map.reset_last_seen()
         return cls(saved.camera, saved.atlas, saved.sessions, mapping)
 
     def save(self, path: str | Path) -> None:

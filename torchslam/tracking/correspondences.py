@@ -129,7 +129,7 @@ def match_points(slam_map: Map, ids: Tensor, view: FrameFeatures, settings: Matc
 
 def match_keyframe(slam_map: Map, keyframe: int, view: FrameFeatures, matcher: Matcher) -> MatchIndices:
     """Points of a keyframe and keypoints of a view, matched by the keyframe's own descriptors."""
-    seen = slam_map.view(keyframe)
+    seen = slam_map.frame_features(keyframe)
     point_ids = slam_map.keyframes["point_ids"][keyframe]
     pairs = run_matcher(matcher, replace(seen, mask=seen.mask & (point_ids >= 0)), view)
     return replace(pairs, first=point_ids[pairs.first])

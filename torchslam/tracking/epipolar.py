@@ -38,7 +38,7 @@ class FreeKeypoints:
         free = free[:, : int(free.sum(1).max())]
         rows = rows[:, : free.shape[1]]
         features = replace(slam_map.features(keyframes, rows), mask=free)
-        noise = slam_map.noise(keyframes[:, None], rows)
+        noise = slam_map.keypoint_noise(keyframes[:, None], rows)
         return cls(features, rows, normalize(features.keypoints), noise)
 
 

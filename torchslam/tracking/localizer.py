@@ -139,12 +139,12 @@ class Localizer:
         """The local points, or those around the matched points if these are elsewhere in the map."""
         if len(local_points) and _are_among(point_ids, local_points):
             return local_points
-        keyframe = int(slam_map.observers(point_ids).argmax())
-        return slam_map.points_seen_by(self.local_keyframes(slam_map, keyframe))
+        keyframe = int(slam_map.count_observed(point_ids).argmax())
+        return slam_map.observed_points(self.local_keyframes(slam_map, keyframe))
 
     def local_keyframes(self, slam_map: Map, keyframe: int) -> Tensor:
         """(k,) a keyframe and those that share most points with it."""
-        covisible = slam_map.covisible(keyframe, self.settings.local_keyframes)
+        covisible = slam_map.covisible_keyframes(keyframe, self.settings.local_keyframes)
         return torch.cat([covisible.new_tensor([keyframe]), covisible])
 
     def _refine(

@@ -42,7 +42,7 @@ class Relocalizer:
                 continue
             near = self.tracker.localizer.local_keyframes(submap.map, keyframe)
             estimate = self.tracker.localizer.locate(
-                submap.map, view, self._matches(submap.map, keyframe, view), submap.map.points_seen_by(near)
+                submap.map, view, self._matches(submap.map, keyframe, view), submap.map.observed_points(near)
             )
             if estimate is not None:
                 state = single_frame_state(submap.tracking, estimate)

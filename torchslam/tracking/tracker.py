@@ -66,7 +66,7 @@ class Tracker:
                 (last_seen > last_seen.max() - recent) & slam_map.points["is_valid"]
             )[:, 0]
         else:
-            local_points = slam_map.points_seen_by(local_keyframes)
+            local_points = slam_map.observed_points(local_keyframes)
         return TrackingState(
             T_cr=T_cw @ se3_inverse(slam_map.T_cw[keyframe]),
             reference=keyframe,
@@ -127,7 +127,7 @@ class Tracker:
         tracking.error += EMA_RATE * (estimate.error - tracking.error)
         tracking.explained_ratio += EMA_RATE * (estimate.explained_ratio - tracking.explained_ratio)
         self._update_last_seen(slam_map, view, estimate)
-        shared = slam_map.observers(estimate.point_ids, tracking.local_keyframes)
+        shared = slam_map.count_observed(estimate.point_ids, tracking.local_keyframes)
         best = int(tracking.local_keyframes[shared.argmax()])
         if best == tracking.reference:
             tracking.T_cr = estimate.T_cw @ se3_inverse(slam_map.T_cw[best])
@@ -142,7 +142,7 @@ class Tracker:
 
     def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Start the tracking state at a frame that was posed without one."""
-        best = int(submap.map.observers(estimate.point_ids).argmax())
+        best = int(submap.map.count_observed(estimate.point_ids).argmax())
         self._update_last_seen(submap.map, view, estimate)
         submap.tracking = replace(
             self._at_keyframe(submap.map, best, estimate.T_cw),

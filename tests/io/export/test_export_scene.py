@@ -76,7 +76,7 @@ def test_rows_of_the_map_may_stand_in_any_order(submap: Submap, camera: Camera) 
     facing(submap.map)
     before = scene_of(submap, camera, 0, keyframes_alone=True)
     submap.map.keyframes.keep(torch.tensor((2, 0, 1, 5, 3, 4)))
-    submap.map.reindex()
+    submap.map.mark_renumbered()
     after = scene_of(submap, camera, 0, keyframes_alone=True)
     for name in ("frame_ids", "T_cw", "points_w", "frame_index", "point_index", "pixels"):
         assert torch.equal(getattr(after, name), getattr(before, name)), name
@@ -85,7 +85,7 @@ def test_rows_of_the_map_may_stand_in_any_order(submap: Submap, camera: Camera) 
 def test_frames_between_bring_their_observations(submap: Submap, camera: Camera) -> None:
     facing(submap.map)
     point = torch.nonzero(submap.map.points["times_observed"] >= 2)[:1, 0]
-    view = replace(submap.map.view(0), index=29, timestamp=200.0)
+    view = replace(submap.map.frame_features(0), index=29, timestamp=200.0)
     eye = torch.eye(4, dtype=torch.float64)
     estimate = PoseEstimate(eye, point, torch.tensor([7]), 1, torch.eye(6), 1.0)
     submap.posed_frames.add(view, estimate, eye, 0)
