@@ -1,14 +1,13 @@
-"""The errors that torchslam raises on purpose. A message says what is wrong, where, and what to do."""
+"""The errors that torchslam raises. A message says what is wrong, where, and what to do."""
 
 LONGEST = 2000
-"""Characters of a message: what a file holds in place of a number may be of any length."""
+"""Largest number of characters of a message; what it quotes from a file may be of any length."""
 
 
 class TorchslamError(Exception):
-    """Base of every error that torchslam raises on purpose.
+    """Base of every error that torchslam raises.
 
-    As text it is one line that can be shown: what a file or its name holds of control characters is escaped, and the
-    middle of a message that is too long left out.
+    Its text is one printable line: control characters are escaped, and a long message is shortened in the middle.
     """
 
     def __str__(self) -> str:
@@ -45,7 +44,7 @@ class TrajectoryError(TorchslamError):
 
 
 class ResultsError(TorchslamError):
-    """A results folder or a map file is missing, incomplete or not of this program."""
+    """A results folder or a map file is missing, incomplete or not written by torchslam."""
 
 
 class DownloadError(TorchslamError):

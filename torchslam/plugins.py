@@ -1,11 +1,11 @@
-"""Parts of others, by name: PACKAGE:NAME, or what an installed package registered under an entry point.
+"""Plugins by name: PACKAGE:NAME, or a name that an installed package registered as an entry point.
 
     [project.entry-points."torchslam.front_ends"]
     mine = "my_package.features:MyFeatures"
 
-then `--features mine`, or `--features my_package.features:MyFeatures` without registering anything. A class is made
-with those of the configured arguments that it takes (num_keypoints, weights); anything else that can be called is the
-part itself. Importing it runs its code.
+Then use `--features mine`, or `--features my_package.features:MyFeatures` without registration. A class is instantiated
+with those of the configured arguments that it takes (num_keypoints, weights); any other callable is used as it is.
+Importing a plugin runs its code.
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ MATCHERS = "torchslam.matchers"
 
 @cache
 def registered(group: str) -> dict[str, EntryPoint]:
-    """What installed packages registered, by name."""
+    """Return the entry points of installed packages, by name."""
     return {point.name: point for point in entry_points(group=group)}
 
 
 def is_known(group: str, name: str) -> bool:
-    """Whether a name could be that of a part: registered, or of the form PACKAGE:NAME."""
+    """Test whether a name can be that of a plugin: registered, or of the form PACKAGE:NAME."""
     package, colon, attribute = name.partition(":")
     return bool(colon and package and attribute) or name in registered(group)
 
 
 def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
-    """The part of a name; of a class, one made with those of the arguments that it takes and that are not None.
+    """Load the plugin of a name; instantiate a class with those of the arguments that it takes and that are not None.
 
-    Raises ConfigError for a package or an attribute that there is not, one that fails, and what cannot be called.
+    Raises:
+        ConfigError: The package or the attribute does not exist or fails, or the plugin is not callable.
     """
     what = f"{group.rpartition('.')[2].rstrip('s').replace('_', ' ')} {name}"
     point = registered(group).get(name)
@@ -70,7 +71,7 @@ def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
 
 
 def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
-    """The front end of a name: one of torchslam's own, or as `load` finds it."""
+    """Return the front end of a name: one of torchslam's own, or a plugin."""
     from torchslam.features import EXTRACTORS, extractor
 
     if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
@@ -79,7 +80,7 @@ def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callab
 
 
 def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:
-    """The arguments that a class can be made with."""
+    """The arguments that the constructor of a class takes."""
     given = {name: value for name, value in arguments.items() if value is not None}
     parameters = signature(kind).parameters.values()
     if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters):

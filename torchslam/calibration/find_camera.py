@@ -82,9 +82,11 @@ def find_camera(
 def camera_remark(finished: Run, found: str) -> str:
     """Describe the camera of a run: how it was found, and whether the run contradicts its focal length.
 
+    Only a complete first session can contradict it.
+
     Args:
-        found: description by `find_camera`, empty for a given camera. Only a complete first session can
-            contradict it.
+        finished: The run.
+        found: Description by `find_camera`, empty for a given camera.
     """
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
@@ -137,7 +139,7 @@ def contradiction(given: Camera, estimate: IntrinsicsEstimate) -> str:
     """Describe how the images contradict a given focal length; empty if they do not.
 
     Args:
-        estimate: with only the focal length free
+        estimate: with only the focal length free.
     """
     was, focal = float(given.focal), float(estimate.camera.focal)
     off = abs(math.log(focal / was))

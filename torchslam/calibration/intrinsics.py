@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import Camera
@@ -116,17 +117,19 @@ def _fitted(num_radial: int) -> list[int]:
 
 
 def _propagate_held_parameters(
-    at: BundleProblem, fitted: list[int], inflation: float, rejected_k1: float | None, guess: Tensor | None
-) -> tuple[Tensor, list[float], float]:
-    """The parameters (K,), their standard errors, and that of the focal length given the held parameters.
+    at: BundleProblem,
+    fitted: list[int],
+    inflation: float,
+    rejected_k1: float | None,
+    guess: Float[Tensor, " 2"] | None,
+) -> tuple[Float[Tensor, " P"], list[float], float]:
+    """The parameters, their standard errors, and that of the focal length given the held parameters.
 
     Fitted parameters depend linearly on held ones; the principal point is the mean of its guess and its estimate,
     weighted by their information.
 
-    at:          the problem at its solution
-    inflation:   factor on the formal errors
-    rejected_k1: k1 of a fit that did not lower the cost enough, if any
-    guess:       (2,) prior of the principal point; None if it is given exactly
+    at: the problem at its solution; inflation: factor on the formal errors; rejected_k1: k1 of a fit that did not
+    lower the cost enough, if any; guess: prior of the principal point, None if it is given exactly
     """
     n, k, principal_point = len(fitted), int(rejected_k1 is not None), [CX, CY] if guess is not None else []
     which = fitted + [K1] * k + principal_point
@@ -210,8 +213,8 @@ def subproblem(problem: BundleProblem, start: int, stop: int) -> BundleProblem:
     )
 
 
-def frames_of(graph: ObservationGraph) -> Tensor:
-    """(n,) the keyframes of the graph's largest submap, by time, with other frames if they are few."""
+def frames_of(graph: ObservationGraph) -> Int[Tensor, " K"]:
+    """The keyframes of the graph's largest submap, by time, with other frames if they are few."""
     submap = torch.bincount(graph.submap).argmax()
     frames = (graph.submap == submap).nonzero().squeeze(-1)
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
@@ -224,8 +227,8 @@ def frames_of(graph: ObservationGraph) -> Tensor:
     return frames[keyframes]
 
 
-def directions(camera: Camera, which: list[int]) -> Tensor:
-    """Derivatives (K, n) of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
+def directions(camera: Camera, which: list[int]) -> Float[Tensor, "P D"]:
+    """Derivatives of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
     columns = camera.params.new_zeros(len(camera.params), 5)
     columns[:2, FOCAL] = camera.params[:2]
     columns[[2, 3], [CX, CY]] = float(camera.width)

@@ -358,9 +358,9 @@ def is_success(
     """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on one line.
 
     Args:
-        points: about their mean
-        size: of the image
-        threshold: of an inlier, pixels
+        points: about their mean.
+        size: of the image.
+        threshold: of an inlier, pixels.
     """
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
@@ -382,7 +382,7 @@ def find_absolute_pose(
     """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
 
     Args:
-        effort: seed, confidence and max_samples of `estimate_absolute_pose`
+        effort: seed, confidence and max_samples of `estimate_absolute_pose`.
     """
     with torch.inference_mode():  # less work per operation than without gradients only
         results = _Problem.of(points_w, pixels, camera, threshold, mask).solve(*effort)

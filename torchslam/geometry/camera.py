@@ -87,27 +87,27 @@ class Camera:
 
     @property
     def fx(self) -> Float[Tensor, "*batch"]:
-        """(...) focal length along x, pixels."""
+        """Focal length along x, pixels."""
         return self.params[..., 0]
 
     @property
     def fy(self) -> Float[Tensor, "*batch"]:
-        """(...) focal length along y, pixels."""
+        """Focal length along y, pixels."""
         return self.params[..., 1]
 
     @property
     def cx(self) -> Float[Tensor, "*batch"]:
-        """(...) x of the principal point, pixels."""
+        """x of the principal point, pixels."""
         return self.params[..., 2]
 
     @property
     def cy(self) -> Float[Tensor, "*batch"]:
-        """(...) y of the principal point, pixels."""
+        """y of the principal point, pixels."""
         return self.params[..., 3]
 
     @property
     def focal(self) -> Float[Tensor, "*batch"]:
-        """(...) the geometric mean of fx and fy, pixels."""
+        """Geometric mean of fx and fy, pixels."""
         return (self.fx * self.fy).sqrt()
 
     @property
@@ -122,14 +122,14 @@ class Camera:
 
     @property
     def K(self) -> Float[Tensor, "*batch 3 3"]:
-        """(..., 3, 3) calibration matrix, without the distortion."""
+        """Calibration matrix, without the distortion."""
         zero, one = torch.zeros_like(self.fx), torch.ones_like(self.fx)
         entries = (self.fx, zero, self.cx, zero, self.fy, self.cy, zero, zero, one)
         return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
     @cached_property
     def limit(self) -> Float[Tensor, "*batch"]:
-        """(...) extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
+        """Extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
         return self._distortion.limit(self.params.detach()[..., 4:])
 
     @property
@@ -172,12 +172,9 @@ class Camera:
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"]]:
         """Project points in the camera frame.
 
-        Args:
-            points_c: points.
-
         Returns:
-            Pixels (..., N, 2), always finite, and valid (..., N): in front of the camera and within the monotone
-            part of the distortion. Invalid points get the center of the image and no gradient.
+            Pixels, always finite, and valid: in front of the camera and within the monotone part of the distortion.
+            Invalid points get the center of the image and no gradient.
         """
         normalized, valid = self._normalize_points(points_c)
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
@@ -189,7 +186,7 @@ class Camera:
         """Project points, with the analytic derivative with respect to the points.
 
         Returns:
-            Pixels (..., N, 2), valid (..., N) and d pixels / d points_c (..., N, 2, 3), zero where invalid.
+            Pixels, valid and d pixels / d points_c, zero where invalid.
         """
         normalized, valid = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
@@ -217,8 +214,7 @@ class Camera:
         """Project points, with the analytic derivatives with respect to points and parameters.
 
         Returns:
-            Pixels (..., N, 2), valid (..., N), d pixels / d points_c (..., N, 2, 3) and d pixels / d params (...,
-            N, 2, P). Derivatives of invalid points are zero.
+            Pixels, valid, d pixels / d points_c and d pixels / d params. Derivatives of invalid points are zero.
         """
         pixels, valid, J_points = self.project_with_point_jacobians(points_c)
         normalized, _ = self._normalize_points(points_c)
@@ -282,7 +278,7 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """(..., P) from floats and tensors; float64 unless a tensor says otherwise."""
+    """Parameters from floats and tensors; float64 unless a tensor says otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = tensors[0].dtype if tensors else torch.float64
     device = tensors[0].device if tensors else None

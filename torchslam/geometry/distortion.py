@@ -26,12 +26,12 @@ class Distortion:
     """One model, as functions of undistorted coordinates xy and coefficients k.
 
     Attributes:
-        distort: (xy, k) -> distorted coordinates (..., N, 2)
-        slope: (xy, k) -> d distorted / d xy (..., N, 2, 2)
-        coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K)
-        undistort: (distorted, k, limit) -> xy
-        limit: (k) -> up to which `coordinate` the map is monotone (...)
-        coordinate: undistorted radius -> what the limit limits
+        distort: (xy, k) -> distorted coordinates (..., N, 2).
+        slope: (xy, k) -> d distorted / d xy (..., N, 2, 2).
+        coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K).
+        undistort: (distorted, k, limit) -> xy.
+        limit: (k) -> up to which `coordinate` the map is monotone (...).
+        coordinate: undistorted radius -> what the limit limits.
     """
 
     num_params: int
@@ -76,7 +76,7 @@ def _implicit_step(
 
 
 def length(xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Length of vectors (..., 2) -> (...), not differentiable at zero.
+    """Length of vectors, not differentiable at zero.
 
     Many times as fast as `norm` where each coordinate is in one piece of memory.
     """

@@ -42,8 +42,8 @@ def five_point(
         x_2: undistorted image coordinates in view 2.
 
     Returns:
-        E (R, 3, 3) of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample
-        (R,) of each, ascending.
+        E of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample of each,
+        ascending.
     """
     with torch.no_grad():
         basis = _null_space(x_1, x_2)
@@ -131,7 +131,7 @@ def _matrix_product(A: Tensor, B: Tensor) -> Tensor:
 
 
 def _elimination(constraints: Float[Tensor, "B 10 20"]) -> Float[Tensor, "B 3 3 5"]:
-    """Three equations in x, y, 1 with polynomials in z. (S, 10, 20) -> (S, 3, 3, 5), lowest power first."""
+    """Three equations in x, y, 1 with polynomials in z, lowest power first."""
     reduced = torch.linalg.solve_ex(constraints[..., :10], constraints[..., 10:])[0]
     # rows 4 to 9 are x^2 z, x^2, y^2 z, y^2, xyz, xy; each first minus z times the second cancels
     x, y, one = reduced[:, 4:, :3], reduced[:, 4:, 3:6], reduced[:, 4:, 6:]
@@ -161,7 +161,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _determinant(B: Float[Tensor, "B 3 3 5"]) -> Float[Tensor, "B 11"]:
-    """The determinant, a polynomial of degree ten. (S, 3, 3, 5) -> (S, 11), lowest power first."""
+    """The determinant, a polynomial of degree ten, lowest power first."""
     x, y, one = B[:, :, 0, :4], B[:, :, 1, :4], B[:, :, 2]
     minors = _product(y.roll(-1, 1), one.roll(-2, 1)) - _product(y.roll(-2, 1), one.roll(-1, 1))
     return _product(minors, x).sum(1)
@@ -229,7 +229,7 @@ def decompose_essential(
         E: essential matrices.
 
     Returns:
-        R (..., 2, 3, 3) and t (..., 3) of unit length: the poses are (R_i, t) and (R_i, -t).
+        R, and t of unit length: the poses are (R_i, t) and (R_i, -t).
     """
     gram = E @ E.mT
     half_trace = 0.5 * gram.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -261,11 +261,11 @@ def sampson_errors(
         E: essential matrices.
         x_1: undistorted image coordinates in view 1.
         x_2: undistorted image coordinates in view 2.
-        variance_1: of the coordinates in view 1; None: one.
-        variance_2: of the coordinates in view 2; None: one.
+        variance_1: of the coordinates in view 1.
+        variance_2: of the coordinates in view 2.
 
     Returns:
-        (..., N) first-order distances over both images together, in standard deviations.
+        First-order distances over both images together, in standard deviations.
     """
     one = torch.ones_like(x_1[..., :1])
     x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
@@ -293,10 +293,10 @@ def epipolar_offsets(
         camera_2: of view 2.
 
     Returns:
-        Twice (..., N), in pixels at the center of camera 2: the signed Sampson distance, and the disparity to a
-        point at infinity. For a point on its line at depth z in camera 2 the disparity is |e| / z, e being the
-        shift along the line by one unit of the translation; it is negative behind that camera. Both are zero at the
-        epipole and without a translation; the disparity also where infinity is behind camera 2.
+        The signed Sampson distance and the disparity to a point at infinity, in pixels at the center of camera 2.
+        For a point on its line at depth z in camera 2 the disparity is |e| / z, e being the shift along the line by
+        one unit of the translation; it is negative behind that camera. Both are zero at the epipole and without a
+        translation; the disparity also where infinity is behind camera 2.
     """
     x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
     R, t = T_21[..., :3, :3], T_21[..., None, :3, 3]

@@ -27,7 +27,7 @@ def homography_from_matches(
         x_2: coordinates in view 2.
 
     Returns:
-        (..., 3, 3); degenerate samples (three points on a line) give zeros, or anything.
+        The homographies; degenerate samples (three points on a line) give zeros, or anything.
     """
     x, y = x_1.unbind(-1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
@@ -66,9 +66,6 @@ def transfer_errors(
         H: homographies.
         x_1: coordinates in view 1.
         x_2: coordinates in view 2.
-
-    Returns:
-        (..., N, 2) differences.
     """
     mapped = x_1 @ H[..., :2].mT + H[..., None, :, 2]
     depth = mapped[..., 2:]
@@ -88,8 +85,8 @@ def decompose_homography(
         H: of any scale and sign.
 
     Returns:
-        R (..., 4, 3, 3), t (..., 4, 3) in units of the plane's distance, and unit normals (..., 4, 3) in the first
-        camera: H ~ R + t n^T. A pure rotation has t = 0 and any normal.
+        R, t in units of the plane's distance, and unit normals n in the first camera: H ~ R + t n^T. A pure rotation
+        has t = 0 and any normal.
     """
     with torch.no_grad():
         H = torch.where(torch.linalg.det(H)[..., None, None] < 0, -H, H)

@@ -77,7 +77,7 @@ def transform(
 
 @full_precision
 def so3_exp(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of rotation vectors. (..., 3) radians -> (..., 3, 3)."""
+    """Rotation matrices of rotation vectors in radians."""
     a, b, _, _ = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + a * W + b * (W @ W)
@@ -85,13 +85,13 @@ def so3_exp(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 @lru_cache(maxsize=16)
 def identity(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "D D"]:
-    """Identity matrix, cached: (size, size)."""
+    """Identity matrix, cached."""
     return torch.eye(size, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=16)
 def generators(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 3 3"]:
-    """The generators of SO(3), cached: (3, 3, 3)."""
+    """The generators of SO(3), cached."""
     return skew(torch.eye(3, dtype=dtype, device=device))
 
 
@@ -150,7 +150,7 @@ def matrix_from_quaternion(q_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "
 
 @full_precision
 def so3_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vectors, of length at most pi, of rotation matrices. (..., 3, 3) -> (..., 3) radians."""
+    """Rotation vectors, in radians, of length at most pi, of rotation matrices."""
     v, w = quaternion_from_matrix(R).split((3, 1), dim=-1)
     sine_squared = (v * v).sum(-1, keepdim=True)
     small = sine_squared < 1e-3
@@ -248,10 +248,7 @@ def _sim3_translation_matrix(
 
 @full_precision
 def sim3_exp(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 4 4"]:
-    """Similarities [sR t; 0 1] of tangent vectors [rho, omega, sigma], s = exp(sigma).
-
-    (..., 7) -> (..., 4, 4).
-    """
+    """Similarities [sR t; 0 1] of tangent vectors [rho, omega, sigma], s = exp(sigma)."""
     rho, omega, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
     t = (_sim3_translation_matrix(omega, sigma) @ rho[..., None]).squeeze(-1)
     return rigid(sigma.exp()[..., None, None] * so3_exp(omega), t)

@@ -94,7 +94,7 @@ def fit_models(
     """A homography and a pure rotation for matches that R, t explain.
 
     Args:
-        by_noise: skip the fit of samples that most matches contradict, as in a scene with depth
+        by_noise: skip the fit of samples that most matches contradict, as in a scene with depth.
     """
     essential = sampson_squared(views, R[:, None], t[:, None])[:, 0]
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
@@ -193,7 +193,7 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -
     by its size. But it puts as many matches behind the cameras as before them.
 
     Args:
-        variance: variance of the noise, by the essential matrix
+        variance: variance of the noise, by the essential matrix.
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     near = views.mask & (fits.squared[ESSENTIAL] < _FARTHEST**2 * variance)
@@ -269,7 +269,7 @@ def pose_of(
     """R, t and the normal of the plane, and whether a plane leaves two motions.
 
     Args:
-        by_noise: also if noise may be the reason why one of them explains the matches better
+        by_noise: also if noise may be the reason why one of them explains the matches better.
     """
     R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
     R_H, direction, normal, squared, possible = plane

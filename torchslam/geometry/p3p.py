@@ -27,8 +27,8 @@ def p3p(
         points: one point per row.
 
     Returns:
-        R (..., 4, 3, 3), t (..., 4, 3) and valid (..., 4) for up to four solutions. Invalid entries, and all
-        entries of degenerate samples (collinear points), may hold anything.
+        R, t and valid for up to four solutions. Invalid entries, and all entries of degenerate samples (collinear
+        points), may hold anything.
     """
     with torch.no_grad():
         # Inside, the samples are the last dimension: (sample row, coordinate, S).
@@ -93,7 +93,7 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
 def _depths(
     rays: Float[Tensor, "3 3 B"], points: Float[Tensor, "3 3 B"]
 ) -> tuple[Float[Tensor, "3 4 B"], Bool[Tensor, "4 B"]]:
-    """Depths (3, 4, S) along the rays (3, 3, S) to the points (3, 3, S), and which are real and positive (4, S)."""
+    """Depths along the rays to the points, and which are real and positive."""
     # of the pairs 12, 23, 31
     distance = (points - points.roll(-1, 0)).square_().sum(1)
     cosine = (rays * rays.roll(-1, 0)).sum(1)
@@ -139,7 +139,7 @@ def _line_pair(D: Float[Tensor, "2 6 B"]) -> tuple[Float[Tensor, "2 2 B"], Bool[
 def _intersections(
     lines: Float[Tensor, "2 2 B"], conic: Float[Tensor, "6 B"]
 ) -> tuple[Float[Tensor, "3 4 B"], Bool[Tensor, "4 B"]]:
-    """Intersections of two lines with a conic without entry 01: (2, 2, S), (6, S) -> (3, 4, S), real (4, S)."""
+    """Intersections of two lines with a conic without entry 01, and which are real."""
     p, q = lines
     xx, _, xz, yy, zz, yz = conic
     part = torch.addcmul(xz, xx, q)

@@ -56,9 +56,9 @@ class Tangent:
     """Derivatives and retraction of a mapping P (3, D) with T local parameters.
 
     Attributes:
-        constant, linear: the 3 (T + 1) D entries of T derivatives of P and of itself, as an affine function
-            of the entries of P
-        retract: (P,), step (problems, T) -> (P,)
+        constant: the 3 (T + 1) D entries of T derivatives of P and of P itself, where P is zero.
+        linear: their derivatives with respect to the entries of P.
+        retract: (P,), step (B, T) -> (P,).
     """
 
     constant: Float[Tensor, " entries"]

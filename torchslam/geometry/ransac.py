@@ -65,7 +65,7 @@ def in_chunks(
     """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
 
     Args:
-        numbers: values of the function's largest intermediate result per problem
+        numbers: values of the function's largest intermediate result per problem.
     """
     size = max(1, _MAX_VALUES_AT_ONCE // numbers)
     if len(tensors[0]) <= size:
@@ -145,7 +145,7 @@ def best_models(
     """Indices of the best of many models, which first have to do well on a random part of the rows.
 
     Args:
-        score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
+        score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K).
     """
     few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
     if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
@@ -183,7 +183,7 @@ def truncated_score(squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"]) 
     Source: Torr and Zisserman, "MLESAC", 2000.
 
     Args:
-        squared: squared residuals in units of the threshold; NaN counts as an outlier
+        squared: squared residuals in units of the threshold; NaN counts as an outlier.
     """
     weights = mask.to(squared.dtype)[..., None]
     cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
@@ -261,9 +261,11 @@ def is_significant(
     Source: Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images", 2004.
 
     Args:
-        inliers, available: counts
-        chance: probability that a wrong row fits a model
-        solutions: models per minimal sample of `size` rows
+        inliers: number of inliers.
+        available: number of rows in use.
+        size: of a minimal sample.
+        chance: probability that a wrong row fits a model.
+        solutions: models per minimal sample.
     """
     problems = zip(inliers.tolist(), available.tolist(), chance.tolist(), strict=True)
     logs = [_log_false_alarms(k, n, size, p, solutions) for k, n, p in problems]

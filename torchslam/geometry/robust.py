@@ -31,9 +31,9 @@ class Robustified(NamedTuple):
     """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
 
     Attributes:
-        rho: the cost, twice the contribution of the residual to the objective
-        weight: rho', the weight of the residual in iteratively reweighted least squares, in [0, 1]
-        curvature: rho'', never positive
+        rho: the cost, twice the contribution of the residual to the objective.
+        weight: rho', the weight of the residual in iteratively reweighted least squares, in [0, 1].
+        curvature: rho'', never positive.
     """
 
     rho: Float[Tensor, "*batch"]
@@ -90,11 +90,11 @@ def robustify(
     Differentiable in both, except on the boundary of "huber" (rho'') and "truncated".
 
     Args:
-        squared: not negative
-        scale: positive, broadcastable to `squared`
+        squared: not negative.
+        scale: positive, broadcastable to `squared`.
 
     Raises:
-        ValueError: for an unknown kernel
+        ValueError: for an unknown kernel.
     """
     if kernel not in _KERNELS:
         raise ValueError(f"unknown kernel {kernel!r}; known are {', '.join(get_args(Kernel))}")

@@ -51,7 +51,7 @@ def umeyama(
         with_scale: False fixes the scale to one.
 
     Returns:
-        Scale (...), rotation (..., 3, 3) and translation (..., 3).
+        Scale, rotation and translation.
     """
     w = torch.ones_like(source[..., 0]) if weights is None else weights.to(source.dtype)
     used = (w > 0)[..., None]
@@ -199,9 +199,9 @@ def estimate_similarity(
 
 @dataclass(frozen=True)
 class _View:
-    """One direction: points of the other camera, (B, N, 3), and where this one saw them, pixels (B, N, 2).
+    """One direction: points of the other camera, and where this one saw them.
 
-    sigmas: thresholds in pixels; normalized: (B, N, 2) undistorted; scale: (B, N, 2) thresholds per unit of it
+    sigmas: thresholds in pixels; normalized: undistorted pixels; scale: thresholds per unit of `normalized`
     """
 
     points: Float[Tensor, "B N 3"]
@@ -228,7 +228,7 @@ class _View:
     def undistorted_errors(
         self, P: Float[Tensor, "B K 3 4"], rows: Int[Tensor, "B n"] | None = None
     ) -> Float[Tensor, "B K _"]:
-        """Squared errors of many mappings (B, M, 3, 4) in thresholds; infinite or NaN behind. (B, M, N)."""
+        """Squared errors of many mappings in thresholds; infinite or NaN behind the camera."""
         points, x, scale = self.points, self.normalized, self.scale
         if rows is not None:
             points, x, scale = (gather_rows(values, rows) for values in (points, x, scale))
@@ -238,9 +238,7 @@ class _View:
     def residuals(
         self, P: Float[Tensor, "B 3 4"]
     ) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 2"], Float[Tensor, "B N 2 3"], Bool[Tensor, "B N"]]:
-        """One mapping (B, 3, 4) each, through the distortion: moved points (B, N, 3), residuals (B, N, 2) in
-        thresholds and their derivatives (B, N, 2, 3) in the moved points, and validity (B, N).
-        """
+        """Moved points, residuals in thresholds, their derivatives in the moved points, and validity."""
         moved = transform(P, self.points)
         projected, valid, J = self.camera.project_with_point_jacobians(moved)
         inverse = 1 / self.sigmas[..., None]
@@ -249,7 +247,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The data of the search: camera 1's points in camera 2, and the reverse; mask (B, N).
+    """The data of the search: camera 1's points in camera 2, and the reverse.
 
     depth_sigma: threshold of relative differences in depth
     """
@@ -268,7 +266,7 @@ class _Problem:
     def solve(
         self, seed: int, confidence: float, max_samples: int
     ) -> tuple[Float[Tensor, "B 4 4"], Bool[Tensor, " B"], Float[Tensor, "B N"], Float[Tensor, " B"]]:
-        """S_21 (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,)."""
+        """S_21, success, squared errors in thresholds and score."""
         generator = torch.Generator().manual_seed(seed)
         (P,) = search(
             lambda rows, count: self.select(rows).propose(count, generator),
@@ -314,7 +312,7 @@ class _Problem:
         return truncated_score(torch.maximum(there, back), mask)
 
     def larger_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
-        """The larger of both squared errors in thresholds; infinite where a point cannot be seen. (B, N)."""
+        """The larger of both squared errors in thresholds; infinite where a point cannot be seen."""
         squared = []
         for view, mapping in ((self.forward, P), (self.backward, _inverse(P))):
             _, residual, _, valid = view.residuals(mapping)
@@ -324,7 +322,7 @@ class _Problem:
     def fit(
         self, P: Float[Tensor, "B 3 4"], iterations: int, width: float
     ) -> tuple[Float[Tensor, "B 3 4"], Float[Tensor, " B"]]:
-        """Similarities (B, 3, 4) of least truncated squared error in both images and in depth, and their costs (B,)."""
+        """Similarities of least truncated squared error in both images and in depth, and their costs."""
         dims = 7 if self.with_scale else 6
 
         def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
@@ -351,8 +349,9 @@ class _Problem:
     def depths(
         self, moved: Float[Tensor, "B N 3"]
     ) -> tuple[Float[Tensor, "B N 1"], Float[Tensor, "B N 1 3"]]:
-        """Differences (B, N, 1) of the logarithms of depths in camera 2, in thresholds, and their derivatives
-        (B, N, 1, 3) in the moved points (B, N, 3); zero where a depth is not positive.
+        """Differences of the logarithms of depths in camera 2, in thresholds, and their derivatives in the points.
+
+        Both are zero where a depth is not positive.
         """
         front = (moved[..., 2:] > 0) & (self.backward.points[..., 2:] > 0)
         depth, known = (torch.where(front, x[..., 2:], 1.0) for x in (moved, self.backward.points))
@@ -360,7 +359,7 @@ class _Problem:
         return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
 
     def is_success(self, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
-        """Test whether the inliers are significant and fix the similarity: four or more, not on one line. (B,)."""
+        """Test whether the inliers are significant and fix the similarity: four or more, not on one line."""
         weights = inliers[..., None].to(self.forward.points.dtype)
         count = self.mask.sum(-1)
         # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.

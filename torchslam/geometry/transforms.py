@@ -34,24 +34,24 @@ from torchslam.geometry.lie import (
 def pose_distance(
     T_cw: Float[Tensor, "4 4"], T_kw: Float[Tensor, "K 4 4"], depth: Float[Tensor, ""] | float
 ) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-    """Distances of cameras T_kw (k, 4, 4) from T_cw (4, 4): (k,) in units of a depth, and (k,) degrees."""
+    """Distances of cameras T_kw from T_cw, in units of a depth and in degrees."""
     T_ck = T_cw @ se3_inverse(T_kw)
     translation = torch.linalg.vector_norm(T_ck[:, :3, 3], dim=-1) / depth
     return translation, torch.rad2deg(rotation_angle(T_ck[:, :3, :3]))
 
 
 def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Angles of rotation matrices, to decide by: without a gradient at 0 and pi. (..., 3, 3) -> (...) radians."""
+    """Angles of rotation matrices in radians, for decisions: without a gradient at 0 and pi."""
     sine = torch.linalg.vector_norm(R - R.mT, dim=(-2, -1)) / math.sqrt(8)
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.atan2(sine, cosine)
 
 
 def reorthonormalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Reorthonormalize the rotations of nearly rigid transforms (..., 4, 4), to machine precision.
+    """Reorthonormalize the rotations of nearly rigid transforms, to machine precision.
 
-    Where a pose is predicted from those before it, with transposes for inverses, what they lack of a rotation grows by
-    1 + sqrt(2) from frame to frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
+    If poses are predicted from earlier ones, with transposes for inverses, the deviation from a rotation grows by a
+    factor of 1 + sqrt(2) per frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
     """
     R = T[..., :3, :3]
     return rigid(1.5 * R - 0.5 * R @ (R.mT @ R), T[..., :3, 3])
@@ -78,12 +78,12 @@ def carry_points(
 def with_unit(
     T: Float[Tensor, "*#batch 4 4"], unit: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*#batch 4 4"]:
-    """Rigid transforms (..., 4, 4) in a unit of length that is (...) times as long."""
+    """Rigid transforms in a unit of length that is `unit` times as long."""
     return rigid(T[..., :3, :3], T[..., :3, 3] / unit[..., None])
 
 
 def without_scale(S_cw: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The pose (..., 4, 4) of the camera of a similarity: its rotation and its center, in the unit of the world."""
+    """The pose of the camera of a similarity: its rotation and its center, in the unit of the world."""
     scale = sim3_scale(S_cw)
     return rigid(S_cw[..., :3, :3] / scale[..., None, None], S_cw[..., :3, 3] / scale[..., None])
 
@@ -91,7 +91,7 @@ def without_scale(S_cw: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 
 def covariances_with_unit(
     covariances: Float[Tensor, "*#batch 6 6"], unit: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*#batch 6 6"]:
-    """Covariances (..., 6, 6) of poses, translation first, in a unit of length that is (...) times as long."""
+    """Covariances of poses, translation first, in a unit of length that is `unit` times as long."""
     units = torch.ones_like(covariances[..., 0])
     units[..., :3] = 1 / unit[..., None]
     return units[..., :, None] * covariances * units[..., None, :]
@@ -101,7 +101,7 @@ HALF_PIXEL = 0.5  # from an origin at the center of the top left pixel to one at
 
 
 def corner_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-    """Pixels (..., 2) from the corner of the image, not from the center of its first pixel."""
+    """Pixels from the corner of the image, not from the center of its first pixel."""
     return pixels + HALF_PIXEL
 
 
@@ -113,17 +113,17 @@ def corner_camera(camera: Camera) -> Camera:
 
 
 def opengl(T_wc: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Convert camera-to-world (..., 4, 4) to camera axes x right, y up, z backward."""
+    """Convert camera-to-world transforms to camera axes x right, y up, z backward."""
     return T_wc * T_wc.new_tensor((1.0, -1.0, -1.0, 1.0))
 
 
 def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions (..., 4), w first and not negative, of rotation matrices (..., 3, 3)."""
+    """Unit quaternions, w first and not negative, of rotation matrices."""
     return quaternion_from_matrix(R).roll(1, dims=-1)
 
 
 def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
-    """Rotation (3, 3) from the world to one whose z is up and whose x is as close to the world's x as possible.
+    """Rotation from the world to one whose z is up and whose x is as close to the world's x as possible.
 
     Gravity is not known: up is the mean up direction of the cameras. If that is zero (half of the cameras are
     upside down), up is -y.

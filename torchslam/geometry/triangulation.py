@@ -81,10 +81,10 @@ def triangulate(
         camera_1: of view 1.
         camera_2: of view 2.
         mask: matches in use; rows outside it may hold anything.
-        normalized: the pixels undistorted, twice (..., N, 2), if the caller has them already.
+        normalized: the undistorted coordinates of both pixels, if the caller has them already.
 
     Returns:
-        The points, and what their quality can be judged by.
+        The points and measures of their quality.
     """
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     mask = finite if mask is None else mask & finite
@@ -133,13 +133,13 @@ def triangulation_covariance(
         T_1w: world to camera 1.
         T_2w: world to camera 2.
         points_w: points.
-        sigmas_1: standard deviations of the pixels in view 1, or (..., N, 2, 2) their covariances.
-        sigmas_2: or (..., N, 2, 2), of view 2.
+        sigmas_1: standard deviations of the pixels in view 1, or their covariances.
+        sigmas_2: of the pixels in view 2.
         camera_1: of view 1.
         camera_2: of view 2.
 
     Returns:
-        (..., N, 3, 3); zero where the views do not determine a point: no parallax, or not in front of both.
+        The covariances; zero where the views do not determine a point: no parallax, or not in front of both.
     """
     information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
     determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
@@ -211,7 +211,7 @@ def triangulate_many(
         iterations: of Gauss-Newton.
 
     Returns:
-        The points, and what their quality can be judged by.
+        The points and measures of their quality.
     """
     seen = torch.isfinite(pixels).all(-1)
     seen = seen if mask is None else seen & mask

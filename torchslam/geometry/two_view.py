@@ -259,7 +259,7 @@ def score_essential(views: TwoViews, E: Float[Tensor, "B K 3 3"], soft: bool = F
 
     Args:
         soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of
-            `truncated_score`
+            `truncated_score`.
     """
     constraint, variance = views.epipolar_float
     squared = (E.flatten(-2).float() @ constraint).square_()
@@ -277,7 +277,7 @@ def propose_essential(
 
     Args:
         by_noise: matches count the more the closer they are, in units of the noise that the best sample
-            shows; those that lie behind a camera count as wrong
+            shows; those that lie behind a camera count as wrong.
     """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)
