@@ -28,7 +28,7 @@ def camera() -> Camera:
 
 @pytest.fixture
 def trajectory() -> Trajectory:
-    """An arc around the origin, cameras upright in a world whose y points down, looking ahead."""
+    """An arc around the origin, cameras upright in a frame whose y points down, looking ahead."""
     angles = torch.linspace(0.0, 2.0, FRAMES, dtype=torch.float64)
     centers_w = torch.stack([2 * angles.cos(), 0.1 * angles, 2 * angles.sin()], dim=-1)
     R_wc = so3_exp(torch.stack([torch.zeros_like(angles), -angles, torch.zeros_like(angles)], dim=-1))
@@ -37,7 +37,7 @@ def trajectory() -> Trajectory:
 
 @pytest.fixture
 def slam_map(trajectory: Trajectory, generator: torch.Generator) -> Map:
-    """Keyframes on the trajectory; each sees twenty points of its own and ten of the one before; one point is dead."""
+    """Keyframes with twenty points of their own and ten of the one before; one point is invalid."""
     made = Map()
     for index in range(0, FRAMES, EVERY):
         keyframe = made.add_keyframe(_view(index, trajectory, generator), se3_inverse(trajectory.T_wc[index]))
@@ -69,7 +69,7 @@ def submap(slam_map: Map, trajectory: Trajectory, results: list[StepResult]) -> 
 
 @pytest.fixture
 def run(submap: Submap, camera: Camera, results: list[StepResult]) -> Run:
-    """A run with one world."""
+    """A run with one submap."""
     return Run(
         submaps=(submap,),
         camera=camera,
@@ -83,7 +83,7 @@ def run(submap: Submap, camera: Camera, results: list[StepResult]) -> Run:
 
 @pytest.fixture
 def results() -> list[StepResult]:
-    """Initialising, tracking with keyframes, lost for a while, tracking again."""
+    """Initializing, tracking with keyframes, lost for a while, tracking again."""
     states = [State.INITIALIZING] * 3 + [State.TRACKING] * 15 + [State.LOST] * 4 + [State.TRACKING] * 8
     return [_result(index, state) for index, state in enumerate(states)]
 

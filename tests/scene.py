@@ -1,4 +1,4 @@
-"""A scene of points that cameras look at, and worlds that hold exactly what is there: every answer is known.
+"""A scene of points seen by cameras, and submaps that hold it exactly, so that every answer is known.
 
 Rows are shuffled wherever they can be, so that a keypoint's number, a point's row and its place in the scene differ.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tests.map.simulated import tracked_at
+from tests.map.simulated import estimate_at
 from torchslam.config import Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
 from torchslam.map.atlas import Submap
@@ -18,16 +18,16 @@ from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
-UNTOUCHED = torch.eye(4, dtype=torch.float64)
+IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
 def pose(*tangent: float) -> Tensor:
-    """(4, 4) from translation and rotation; what is left out is zero."""
+    """(4, 4) from translation and rotation; omitted numbers are zero."""
     return se3_exp(torch.tensor([*tangent, *[0.0] * (6 - len(tangent))], dtype=torch.float64))
 
 
 def sideways(count: int, step: float = 0.15, start: float = 0.0) -> Tensor:
-    """(K, 4, 4) T_cw of cameras that look ahead, the one after the other a step to the right."""
+    """(K, 4, 4) T_cw of cameras that look ahead, each a step to the right of the one before."""
     T_cw = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     T_cw[:, 0, 3] = -(start + step * torch.arange(count, dtype=torch.float64))
     return T_cw
@@ -43,7 +43,7 @@ class Scene:
 
     @classmethod
     def of(cls, count: int = 200, seed: int = 0, depth: float = 4.0, width: float = 8.0) -> Scene:
-        """Points in a slab in front of the origin, of scales 1 to 3 px from there."""
+        """Draw points in a slab in front of the origin, of scales 1 to 3 px from there."""
         generator = torch.Generator().manual_seed(seed)
         draw = torch.rand(count, 4, generator=generator, dtype=torch.float64)
         extent = draw.new_tensor([width, 0.9 * depth, 0.5 * depth])
@@ -55,15 +55,15 @@ class Scene:
         return len(self.points_w)
 
     def shows(self, index: int) -> Tensor:
-        """(P,) which point each keypoint of a view shows."""
+        """(P,) the point of each keypoint of a view."""
         return torch.randperm(len(self), generator=torch.Generator().manual_seed(1000 + index))
 
     def at(self, index: int) -> Tensor:
-        """(P,) at which keypoint of a view each point is."""
+        """(P,) the keypoint of each point in a view."""
         return torch.argsort(self.shows(index))
 
     def view(self, index: int, T_cw: Tensor, *, noise: float = 0.0, session: int = 0) -> FrameFeatures:
-        """What a camera at T_cw (4, 4) sees: a keypoint for each point in the image, `noise` times its scale off."""
+        """The features of a camera at T_cw (4, 4): a keypoint per visible point, with noise in units of its scale."""
         order = self.shows(index)
         points_c = transform(T_cw, self.points_w[order])
         pixels, valid = CAMERA.project(points_c)
@@ -88,21 +88,21 @@ def rows_of(scene: Scene, seed: int = 0) -> Tensor:
     return torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed + 77))
 
 
-def world_in(
+def submap_of_scene(
     scene: Scene,
     T_cw: Tensor,
     *,
-    S_ws: Tensor = UNTOUCHED,
+    S_ws: Tensor = IDENTITY,
     first: int = 0,
     number: int = 0,
     noise: float = 0.0,
     seen: Tensor | None = None,
 ) -> Submap:
-    """A world of keyframes at T_cw (K, 4, 4) of the scene, frames first, first + 1, ..., that holds the scene's points.
+    """Make a submap of the scene with keyframes at T_cw (K, 4, 4), frames first, first + 1, ....
 
-    S_ws:  (4, 4) similarity from the scene to the world
-    seen:  (P,) bool, points that the map has; all without it. Row r of the map is point argsort(rows_of)[r].
-    The camera is followed from the last keyframe.
+    S_ws:  (4, 4) similarity from the scene to the submap
+    seen:  (P,) bool, points that the map has; by default all. Row r of the map is point argsort(rows_of)[r].
+    The tracker continues from the last keyframe.
     """
     submap = Submap.empty(number, CAMERA.params)
     rows = rows_of(scene)
@@ -118,8 +118,8 @@ def world_in(
             )
         at = torch.nonzero(view.mask & known[scene.shows(first + offset)])[:, 0]
         submap.map.add_observations(keyframe, at, rows[scene.shows(first + offset)[at]])
-        estimate = tracked_at(submap.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
-        submap.posed_frames.add(view, estimate, UNTOUCHED, keyframe)
+        estimate = estimate_at(submap.map.T_cw[keyframe], rows[scene.shows(first + offset)[at]], at)
+        submap.posed_frames.add(view, estimate, IDENTITY, keyframe)
     submap.map.update_appearance(torch.arange(len(T_cw)))
     lonely = torch.nonzero(submap.map.points["times_observed"] == 0)[:, 0]
     submap.map.remove_points(lonely)
@@ -128,14 +128,14 @@ def world_in(
 
 
 def moved(T_cw: Tensor, S_ws: Tensor) -> Tensor:
-    """(..., 4, 4) the pose of a camera in a world that a similarity S_ws (4, 4) makes of the scene."""
+    """(..., 4, 4) the pose of a camera in a submap to which S_ws (4, 4) maps the scene."""
     S_cw = T_cw @ sim3_inverse(S_ws)
     scale = sim3_scale(S_cw)[..., None]
     return rigid(S_cw[..., :3, :3] / scale[..., None], S_cw[..., :3, 3] / scale)
 
 
-def centre(T_cw: Tensor) -> Tensor:
-    """(..., 3) where a camera is."""
+def camera_center(T_cw: Tensor) -> Tensor:
+    """(..., 3) centers of cameras."""
     return se3_inverse(T_cw)[..., :3, 3]
 
 

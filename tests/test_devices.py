@@ -88,9 +88,7 @@ def test_results_of_a_run_elsewhere_are_written(device: torch.device, tmp_path: 
     assert (tmp_path / "plots" / "top_view.png").exists()
 
 
-def test_the_command_names_devices_that_cannot_be_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_names_unusable_devices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("quark", "meta"):
         with pytest.raises(SystemExit):
             main(["run", "synthetic:room", "--device", name, "-o", str(tmp_path)])

@@ -35,7 +35,7 @@ def _moved(T_wc: Tensor, scale: float) -> Tensor:
     return rigid(R @ T_wc[:, :3, :3], scale * T_wc[:, :3, 3] @ R.T + t)
 
 
-def test_a_similar_path_has_no_error(generator: torch.Generator) -> None:
+def test_a_path_that_differs_by_a_similarity_has_no_error(generator: torch.Generator) -> None:
     T_wc = _poses(generator, 40)
     groundtruth = Trajectory(_times(40), T_wc)
     evaluation = evaluate(Trajectory(_times(40), _moved(T_wc, 0.25)), groundtruth)
@@ -52,7 +52,7 @@ def test_a_similar_path_has_no_error(generator: torch.Generator) -> None:
     torch.testing.assert_close(S[:3, :3] @ S[:3, :3].T, 16 * torch.eye(3, dtype=torch.float64))
 
 
-def test_known_errors() -> None:
+def test_errors_have_known_values() -> None:
     # A square of side 2 with its corners moved out and in by 0.1: the best similarity is the identity.
     square = torch.tensor([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], dtype=torch.float64)
     signs = torch.tensor([1.0, -1, 1, -1], dtype=torch.float64)[:, None]
@@ -106,7 +106,7 @@ def test_too_few_poses_in_common(generator: torch.Generator) -> None:
         evaluate(Trajectory(_times(0), T_wc[:0]), groundtruth)
 
 
-def test_parts_in_frames_of_their_own_are_aligned_each_by_itself(generator: torch.Generator) -> None:
+def test_parts_with_their_own_frames_are_aligned_separately(generator: torch.Generator) -> None:
     truth = Trajectory(_times(40), _poses(generator, 40))
     first = Trajectory(truth.timestamps[:10], _moved(truth.T_wc[:10], 0.25))
     second = Trajectory(truth.timestamps[10:], truth.T_wc[10:])
@@ -119,7 +119,7 @@ def test_parts_in_frames_of_their_own_are_aligned_each_by_itself(generator: torc
     assert ate_apart(noisy[:1], truth) == pytest.approx(errors[0])
 
 
-def test_parts_that_fit_any_path_are_left_out(generator: torch.Generator) -> None:
+def test_parts_that_fit_any_path_are_excluded(generator: torch.Generator) -> None:
     truth = Trajectory(_times(20), _poses(generator, 20))
     part = Trajectory(truth.timestamps[:10], _noisy(truth.T_wc[:10], generator))
     late = Trajectory(truth.timestamps[17:] + 0.2, truth.T_wc[17:])  # of its three poses, two have a true one
@@ -174,7 +174,7 @@ def test_masked_rows_do_not_matter(generator: torch.Generator) -> None:
     torch.testing.assert_close(rpe(broken, truth, 1, mask), rpe(T_cw[:7], truth[:7], 1))
 
 
-def test_batch_is_a_loop(generator: torch.Generator, device: torch.device, dtype: torch.dtype) -> None:
+def test_a_batch_equals_a_loop(generator: torch.Generator, device: torch.device, dtype: torch.dtype) -> None:
     T_cw = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
     truth = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
     errors, (translation, rotation) = ate(T_cw, truth), rpe(T_cw, truth)
@@ -285,7 +285,7 @@ def test_too_few_poses_have_no_error(generator: torch.Generator) -> None:
     assert torch.stack(alone).isnan().all()
 
 
-def test_the_error_has_derivatives_in_both_directions_once(generator: torch.Generator) -> None:
+def test_the_error_has_first_derivatives_in_both_modes(generator: torch.Generator) -> None:
     poses, truth = _poses(generator, 5), _poses(generator, 5)
     reverse, forward = (transform(lambda x: ate(x, truth))(poses) for transform in (jacrev, jacfwd))
     torch.testing.assert_close(forward, reverse, rtol=0, atol=1e-12)

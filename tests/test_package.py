@@ -84,7 +84,7 @@ def test_a_checkout_has_no_copy_of_the_configurations() -> None:
     assert config.FOLDER == ROOT / "configs"
 
 
-def test_the_metadata_say_what_strangers_look_for(unpacked: Path) -> None:
+def test_the_metadata_have_classifiers_and_links(unpacked: Path) -> None:
     (file,) = unpacked.glob("*.dist-info/METADATA")
     text = file.read_text(encoding="utf-8")
     for extra in ("bags", "docs", "ray", "rerun"):

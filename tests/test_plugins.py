@@ -34,7 +34,7 @@ def answer(images: Tensor) -> Features:
 
 
 class Broken:
-    """A front end that gives what it was told to."""
+    """A front end with configured outputs."""
 
     changes: dict[str, Any] = {}  # noqa: RUF012 - set by a test
 
@@ -55,7 +55,7 @@ number = 7
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_the_example_is_a_screen_long_and_runs(tmp_path: Path) -> None:
+def test_the_example_is_short_and_runs(tmp_path: Path) -> None:
     """From the command line, both parts its own."""
     body = EXAMPLE.read_text().split('"""', 2)[2].splitlines()
     assert len([line for line in body if line.strip()]) <= 30
@@ -141,14 +141,14 @@ rows = torch.ones(1, 20)
         ({"information": torch.nan * rows}, "information must be positive"),
     ],
 )
-def test_a_wrong_answer_of_a_front_end_is_named(changes: dict[str, Any], words: str) -> None:
+def test_an_invalid_output_of_a_front_end_is_named(changes: dict[str, Any], words: str) -> None:
     Broken.changes = changes
     extract = image_extractor(load_config(None, [f"features.kind={HERE}:Broken"]))
     with pytest.raises(ConfigError, match=f"front end {HERE}:Broken: {words}"):
         extract(Frame(0, 0.0, torch.zeros(1, 1, 100, 100)))
 
 
-def test_what_a_package_registers_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_registered_plugin_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = EntryPoint("mine", f"{HERE}:answer", plugins.FRONT_ENDS)
     monkeypatch.setattr(
         plugins, "registered", lambda group: {"mine": mine} if group == plugins.FRONT_ENDS else {}
@@ -161,7 +161,7 @@ def test_what_a_package_registers_has_a_name(monkeypatch: pytest.MonkeyPatch) ->
         load_config(None, ["matching.matcher=mine"])
 
 
-def test_information_follows_images_that_were_reduced() -> None:
+def test_information_is_scaled_with_reduced_images() -> None:
     """Stated for the reduced image, where a pixel is two of the large one."""
 
     def says(images: Tensor) -> Features:
@@ -190,7 +190,7 @@ def view(dim: int, seed: int) -> FrameFeatures:
     return FrameFeatures(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
 
 
-def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
+def test_lightglue_works_as_a_matcher(tmp_path: Path) -> None:
     """With weights of chance: what it says is nothing, how it says it is what is tested."""
     from torchslam.tracking.matcher import run_matcher
 
@@ -215,7 +215,7 @@ def test_lightglue_fits_the_hook(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_optical_flow_brings_its_own_samples_to_a_whole_run(tmp_path: Path) -> None:
+def test_an_optical_flow_matcher_runs_with_its_own_samples(tmp_path: Path) -> None:
     """A dense matcher from end to end, as the example's docstring has it."""
     names = ["--features", "examples.optical_flow:Samples", "--matcher", "examples.optical_flow:same"]
     assert main(["run", ROOM, "-o", str(tmp_path), *names, "--set", "features.num_keypoints=500"]) == 0
@@ -224,7 +224,7 @@ def test_optical_flow_brings_its_own_samples_to_a_whole_run(tmp_path: Path) -> N
     assert metrics["ate_m"] < 0.05
 
 
-def test_samples_keep_their_names_along_the_flow() -> None:
+def test_samples_keep_their_identity_along_the_flow() -> None:
     from examples.optical_flow import Samples, same
 
     room, samples = open_sequence(ROOM), Samples(300)

@@ -31,12 +31,12 @@ def arc(frames: int, length: float = 3.0) -> Tensor:
     """(F, 4, 4) T_wc of a walk sideways along an arc, turning with it."""
     s = torch.linspace(0, 1, frames, dtype=torch.float64)
     zero = torch.zeros_like(s)
-    centres = torch.stack([length * s, 0.2 * torch.sin(6 * s), 0.4 * length * s * (1 - s)], -1)
-    return rigid(so3_exp(torch.stack([0.05 * torch.sin(4 * s), -0.4 * s, zero], -1)), centres)
+    centers = torch.stack([length * s, 0.2 * torch.sin(6 * s), 0.4 * length * s * (1 - s)], -1)
+    return rigid(so3_exp(torch.stack([0.05 * torch.sin(4 * s), -0.4 * s, zero], -1)), centers)
 
 
-def there_and_elsewhere(first: int = 16, later: int = 42) -> Tensor:
-    """(F, 4, 4) T_wc of a camera that walks to the right, is suddenly far off, and walks back to where it began."""
+def walk_with_jump(first: int = 16, later: int = 42) -> Tensor:
+    """(F, 4, 4) T_wc of a camera that walks to the right, jumps far away, and walks back to its start."""
     x = torch.cat([torch.linspace(0, 1.0, first), torch.linspace(3.6, 0.5, later)]).double()
     turns = torch.stack([torch.zeros_like(x), 0.05 * torch.sin(3 * x), torch.zeros_like(x)], -1)
     return rigid(so3_exp(turns), torch.stack([x, 0.1 * torch.sin(4 * x), 0.1 * torch.cos(5 * x)], -1))

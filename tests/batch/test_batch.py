@@ -47,7 +47,7 @@ def test_the_table_has_a_row_for_each_sequence_with_status_and_error(whole: Path
     assert {path.name for path in (whole / RUNS).iterdir()} == {"one", "two", "five"}
 
 
-def test_parquet_says_the_same(whole: Path) -> None:
+def test_the_parquet_table_has_the_same_values(whole: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = parquet.read_table(whole / "table.parquet").to_pylist()
     assert [row["status"] for row in rows] == STATUSES
@@ -76,7 +76,7 @@ def test_times_are_in_files_of_their_own(whole: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_the_results_are_those_of_a_run(whole: Path, tmp_path: Path) -> None:
+def test_the_results_equal_those_of_a_run(whole: Path, tmp_path: Path) -> None:
     settings = [part for setting in SETTINGS for part in ("--set", setting)]
     assert main(["run", ROOM, "--output", str(tmp_path), *settings]) == 0
     for name in (
@@ -95,13 +95,13 @@ def test_plot_draws_what_a_batch_wrote(whole: Path, tmp_path: Path) -> None:
     assert main(["plot", str(tmp_path / "one")]) == 0
     drawn = {path.name for path in (tmp_path / "one" / "plots").iterdir()}
     assert "scene.png" in drawn
-    assert "stages.png" not in drawn  # whose times nobody wrote there
+    assert "stages.png" not in drawn  # its times were not written there
 
 
 # --- what is done is not done again --------------------------------------------------------------------------
 
 
-def test_what_is_done_is_not_done_again(
+def test_finished_rows_are_not_repeated(
     whole: Path, listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     again = tmp_path / "again"
@@ -114,7 +114,7 @@ def test_what_is_done_is_not_done_again(
     assert content(again) == content(whole)
 
 
-def test_what_failed_is_tried_again(whole: Path, tmp_path: Path) -> None:
+def test_failed_rows_are_retried(whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole, tmp_path / "again")
     listed = tmp_path / "list.csv"
     listed.write_text(LIST)
@@ -125,7 +125,7 @@ def test_what_failed_is_tried_again(whole: Path, tmp_path: Path) -> None:
     assert [row["status"] for row in table(tmp_path / "again")] == ["no map"]
 
 
-def test_other_settings_need_overwrite(tmp_path: Path) -> None:
+def test_changed_settings_need_overwrite(tmp_path: Path) -> None:
     assert run_row(task(tmp_path).as_dict())["is_new"]
     before = content(tmp_path)
     other = Task(Row("mine", ROOM, overrides=(*SETTINGS, "seed=9")), str(tmp_path), plots=False)
@@ -140,7 +140,7 @@ def test_other_settings_need_overwrite(tmp_path: Path) -> None:
     assert list((tmp_path / ERRORS).iterdir()) == []
 
 
-def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
+def test_an_unrelated_folder_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / RUNS / "mine").mkdir(parents=True)
     (tmp_path / RUNS / "mine" / "thesis.tex").write_text("years of work")
     refused = run_row(Task(task(tmp_path).row, str(tmp_path), overwrite=True, plots=False).as_dict())
@@ -155,7 +155,7 @@ def test_a_damaged_record_is_an_error(tmp_path: Path) -> None:
         assert RECORD in run_row(task(tmp_path).as_dict())["error"]
 
 
-def test_the_files_of_a_sequence_are_known_by_name_size_and_time(tmp_path: Path) -> None:
+def test_files_of_a_sequence_are_fingerprinted_by_name_size_and_time(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     (folder / "rgb").mkdir(parents=True)
     (folder / "rgb" / "0.png").write_bytes(b"1")
@@ -175,7 +175,7 @@ def test_the_files_of_a_sequence_are_known_by_name_size_and_time(tmp_path: Path)
 # --- shards, kills -------------------------------------------------------------------------------------------
 
 
-def test_shards_together_are_the_whole(whole: Path, listed: Path, tmp_path: Path) -> None:
+def test_shards_together_equal_the_whole(whole: Path, listed: Path, tmp_path: Path) -> None:
     statuses = []
     for shard in ("2/3", "0/3", "1/3"):
         batch(listed, tmp_path, ["--shard", shard])
@@ -185,7 +185,7 @@ def test_shards_together_are_the_whole(whole: Path, listed: Path, tmp_path: Path
     assert content(tmp_path) == content(whole)
 
 
-def test_the_last_to_write_the_table_has_seen_all(
+def test_the_final_table_has_the_rows_of_all_shards(
     whole: Path, listed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another shard finishes a row, and writes the table, between this one's look at the results and its writing."""
@@ -209,7 +209,7 @@ def until(happens: object, patience: float = 120.0) -> None:
         time.sleep(0.01)
 
 
-def test_killed_and_started_again(whole: Path, listed: Path, tmp_path: Path) -> None:
+def test_a_killed_batch_can_be_restarted(whole: Path, listed: Path, tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
@@ -233,7 +233,7 @@ def test_killed_and_started_again(whole: Path, listed: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
+def test_an_interrupt_keeps_finished_rows_only(
     whole: Path,
     listed: Path,
     tmp_path: Path,
@@ -265,7 +265,7 @@ def test_a_wish_to_stop_leaves_what_is_done_and_nothing_half_done(
         (["--set", "seed=-1"], "seed must be"),
     ],
 )
-def test_what_no_row_can_help_is_one_line_and_status_2(
+def test_errors_of_the_batch_are_one_line_with_status_2(
     listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
 ) -> None:
     assert batch(listed, tmp_path, more) == 2
@@ -273,7 +273,7 @@ def test_what_no_row_can_help_is_one_line_and_status_2(
     assert not (tmp_path / RUNS).exists()
 
 
-def test_ray_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'torchslam\[ray\]'"):
         list(Engine("ray").each(run_row, [{}]))

@@ -21,7 +21,7 @@ def test_same_bytes_with_one_worker_or_two(whole: Path, listed: Path, tmp_path: 
     assert content(tmp_path) == content(whole)
 
 
-def test_a_worker_that_dies_takes_its_row_alone() -> None:
+def test_a_dying_worker_fails_only_its_row() -> None:
     found = dict(Engine("ray", workers=1).each(answer, [{"number": number} for number in range(3)]))
     expected = {number: {"twice": 2 * number, "nothing": None} for number in (0, 2)}
     assert found == {**expected, 1: None}

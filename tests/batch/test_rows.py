@@ -11,7 +11,7 @@ from torchslam.batch.rows import COLUMNS, MAX_NAME
 from torchslam.errors import ConfigError, SequenceError
 
 
-def test_a_text_has_a_path_on_each_line(tmp_path: Path) -> None:
+def test_a_text_list_has_one_path_per_line(tmp_path: Path) -> None:
     (tmp_path / "l.txt").write_text(
         "# mine\n\nmonday/rgb\ntuesday.mp4  # the second\nsynthetic:room?frames=3\n"
     )
@@ -22,7 +22,7 @@ def test_a_text_has_a_path_on_each_line(tmp_path: Path) -> None:
     assert rows[2].path(rows[2].sequence) == "synthetic:room?frames=3"
 
 
-def test_a_csv_file_has_a_column_for_everything(tmp_path: Path) -> None:
+def test_a_csv_list_has_a_column_per_option(tmp_path: Path) -> None:
     cells = {
         "name": "first",
         "sequence": "a,b",
@@ -82,9 +82,7 @@ def test_a_csv_file_has_a_column_for_everything(tmp_path: Path) -> None:
         ("l.txt", "a" * 70_000, "l.txt:1: sequence"),
     ],
 )
-def test_what_is_wrong_is_named_by_file_and_line(
-    tmp_path: Path, name: str, content: str, message: str
-) -> None:
+def test_errors_are_named_by_file_and_line(tmp_path: Path, name: str, content: str, message: str) -> None:
     (tmp_path / name).write_text(content)
     with pytest.raises(SequenceError) as caught:
         read_list(tmp_path / name)
@@ -97,14 +95,14 @@ def test_missing_lists_and_endless_ones(tmp_path: Path) -> None:
             read_list(path)
 
 
-def test_rows_without_a_name_get_one_that_no_other_has() -> None:
+def test_unnamed_rows_get_unique_names() -> None:
     rows = assign_names(
         [Row("", "a/rgb"), Row("rgb-2", "b"), Row("", "c/RGB/"), Row("", "..."), Row("", "d/ä ö.mp4")]
     )
     assert [row.name for row in rows] == ["rgb", "rgb-2", "RGB-3", "sequence", "sequence-2"]
 
 
-def test_defaults_come_before_what_a_row_says() -> None:
+def test_row_options_override_defaults() -> None:
     row = Row("a", "a", overrides=("seed=2",), limit=3)
     done = row.completed({"limit": 9, "stride": 2, "overrides": ("seed=1",), "camera": None})
     assert (done.limit, done.stride, done.overrides, done.camera) == (3, 2, ("seed=1", "seed=2"), None)
@@ -147,6 +145,6 @@ def test_shards(text: str, environment: dict[str, str], expected: Shard) -> None
         ("auto", {"JOB_COMPLETION_INDEX": "3"}, "JOB_COMPLETIONS is not set"),
     ],
 )
-def test_what_is_no_shard(text: str, environment: dict[str, str], message: str) -> None:
+def test_invalid_shards_are_refused(text: str, environment: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         parse_shard(text, environment)

@@ -18,13 +18,13 @@ from torchslam.batch.result_store import ERRORS, RUNS, run_or_reuse
 from torchslam.data import read_trajectory, write_trajectory
 
 
-def test_a_task_survives_a_way_through_text_and_pickle(tmp_path: Path) -> None:
+def test_a_task_round_trips_through_text_and_pickle(tmp_path: Path) -> None:
     first = task(tmp_path, limit=3)
     assert Task.from_dict(json.loads(json.dumps(first.as_dict()))) == first
     assert pickle.loads(pickle.dumps(run_row)) is run_row
 
 
-def test_a_row_computes_on_one_thread_and_leaves_the_threads_alone(tmp_path: Path) -> None:
+def test_a_row_uses_one_thread_and_restores_the_setting(tmp_path: Path) -> None:
     seen: list[int] = []
 
     def work(folder: Path) -> dict[str, object]:
@@ -43,7 +43,7 @@ def test_a_row_computes_on_one_thread_and_leaves_the_threads_alone(tmp_path: Pat
     assert seen == [1]
 
 
-def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
+def test_a_row_catches_errors_but_not_interrupts(tmp_path: Path) -> None:
     def bug(folder: Path) -> dict[str, object]:
         (folder / "half").write_text("written")
         raise ZeroDivisionError("float division\nby zero")
@@ -61,7 +61,7 @@ def test_no_error_leaves_a_row_but_a_wish_to_stop_does(tmp_path: Path) -> None:
     assert list((tmp_path / RUNS).iterdir()) == []
 
 
-def test_an_error_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_write_error_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     columns = run_row(task(tmp_path / "file").as_dict())
     assert columns["status"] == "error"
@@ -83,7 +83,7 @@ def test_corrupt_images_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("setting", ["features.weights", "matching.weights"])
-def test_results_are_those_of_the_content_of_the_weights(
+def test_the_fingerprint_depends_on_the_content_of_the_weights(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.batch.task._run", lambda todo, folder: {"status": "done"})

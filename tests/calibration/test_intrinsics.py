@@ -24,7 +24,7 @@ def straight(camera: Camera, factor: float = 1.0) -> Camera:
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
-def test_exact_pixels_give_the_camera(simulated: Make, truth: Camera, factor: float) -> None:
+def test_exact_pixels_recover_the_camera(simulated: Make, truth: Camera, factor: float) -> None:
     """Focal length and both coefficients from none, the ratio of fx to fy and the rest as they are."""
     params = torch.cat([factor * truth.params[:2], truth.params[2:4], torch.zeros(2), truth.params[6:]])
     start = truth.with_params(params.double())
@@ -34,7 +34,7 @@ def test_exact_pixels_give_the_camera(simulated: Make, truth: Camera, factor: fl
     assert estimate.cost < 1e-3 * estimate.initial_cost
 
 
-def test_exact_pixels_leave_nothing_to_be_done(simulated: Make, truth: Camera) -> None:
+def test_a_correct_camera_converges_at_once(simulated: Make, truth: Camera) -> None:
     """Started at the answer, where all that is left of the cost is rounding."""
     problem = problem_of(simulated())
     for which in ([], [FOCAL], [FOCAL, K1]):
@@ -52,7 +52,7 @@ def test_exact_pixels_leave_nothing_to_be_done(simulated: Make, truth: Camera) -
     assert contradiction(truth, estimate) == ""
 
 
-def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make, truth: Camera) -> None:
+def test_distortion_is_estimated_only_where_residuals_need_it(simulated: Make, truth: Camera) -> None:
     pinhole = straight(truth)
     estimate = estimate_intrinsics(
         replace(simulated(pinhole, noise=0.5), camera=straight(truth, 0.9)), pinhole, radial=2
@@ -67,14 +67,14 @@ def test_distortion_comes_in_only_where_the_residuals_ask_for_it(simulated: Make
     assert estimate_intrinsics(bent, pinhole, radial=1).num_radial == 1
 
 
-def test_distortion_stays_as_given_where_it_is_not_free(simulated: Make, truth: Camera) -> None:
+def test_fixed_distortion_is_kept(simulated: Make, truth: Camera) -> None:
     estimate = estimate_intrinsics(simulated(noise=0.3))
     torch.testing.assert_close(estimate.camera.params[2:], truth.params[2:])
     assert estimate.focal_std == pytest.approx(estimate.conditional_focal_std)
 
 
 @pytest.mark.parametrize("frames", [8, 24])
-def test_formal_errors_are_those_of_many_trials(simulated: Make, truth: Camera, frames: int) -> None:
+def test_formal_errors_agree_with_monte_carlo(simulated: Make, truth: Camera, frames: int) -> None:
     """Where the noise is what the error assumes it is about right, and in a short way on the safe side."""
     off, stds = [], []
     for seed in range(12):
@@ -85,7 +85,7 @@ def test_formal_errors_are_those_of_many_trials(simulated: Make, truth: Camera, 
     assert 0.2 < rms / (sum(stds) / len(stds)) < 1.5
 
 
-def test_a_guessed_center_moves_as_far_as_the_images_are_sure(simulated: Make, truth: Camera) -> None:
+def test_a_guessed_center_moves_within_its_prior(simulated: Make, truth: Camera) -> None:
     """To the true one where the pixels are good, hardly at all where they say nothing, and the error knows."""
     off = straight(truth).params + torch.tensor([0, 0, 6.0, -5.0], dtype=torch.float64)
     guess = Camera.pinhole(*off.tolist(), size=truth.size)
@@ -104,7 +104,7 @@ def test_a_guessed_center_moves_as_far_as_the_images_are_sure(simulated: Make, t
     torch.testing.assert_close(held.camera.params[2:4], off[2:4])
 
 
-def test_parts_of_the_way_that_disagree_make_it_less_certain(simulated: Make, truth: Camera) -> None:
+def test_disagreeing_parts_of_the_path_increase_the_uncertainty(simulated: Make, truth: Camera) -> None:
     graph = simulated(straight(truth), noise=0.2, frames=24)
     principal_point = straight(truth).params[2:4]
     later = (graph.frame_index >= 12)[:, None]
@@ -115,7 +115,7 @@ def test_parts_of_the_way_that_disagree_make_it_less_certain(simulated: Make, tr
     )
 
 
-def test_a_straight_way_without_turns_leaves_it_open(simulated: Make, truth: Camera) -> None:
+def test_a_straight_path_does_not_determine_the_camera(simulated: Make, truth: Camera) -> None:
     twists = torch.zeros(16, 6, dtype=torch.float64)
     twists[:, 2] = torch.linspace(0, 1.5, 16)
     graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
@@ -127,7 +127,7 @@ def test_a_straight_way_without_turns_leaves_it_open(simulated: Make, truth: Cam
     assert turning.is_determined
 
 
-def test_a_plane_seen_from_straight_ahead_leaves_it_open(simulated: Make, truth: Camera) -> None:
+def test_a_frontal_plane_does_not_determine_the_camera(simulated: Make, truth: Camera) -> None:
     """Along a wall and towards it, with the turns that a hand makes; turned to its sides, it tells the focal length."""
     way = torch.linspace(0, 1, 12, dtype=torch.float64)
     twists = 1e-2 * torch.randn(12, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -148,7 +148,7 @@ def test_a_plane_seen_from_straight_ahead_leaves_it_open(simulated: Make, truth:
     assert abs(math.log(float(estimate.camera.focal / truth.focal))) < 3 * estimate.focal_std
 
 
-def test_few_keyframes_have_frames_between_them_counted(simulated: Make, truth: Camera) -> None:
+def test_few_keyframes_are_complemented_by_frames(simulated: Make, truth: Camera) -> None:
     graph = simulated(straight(truth), frames=40)
     few = replace(graph, is_keyframe=torch.arange(40) % 13 == 0)
     frames = frames_of(few)
@@ -159,7 +159,7 @@ def test_few_keyframes_have_frames_between_them_counted(simulated: Make, truth: 
     assert frames_of(many).tolist() == list(range(30))
 
 
-def test_the_largest_world_is_asked(simulated: Make, truth: Camera) -> None:
+def test_the_largest_submap_is_used(simulated: Make, truth: Camera) -> None:
     graph = simulated(straight(truth), frames=40)
     submaps = replace(graph, submap=(torch.arange(40) >= 10).long())
     assert frames_of(submaps).tolist() == list(range(10, 40))

@@ -28,7 +28,7 @@ def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
     return unknown, config
 
 
-def test_the_focal_length_is_found_from_nothing() -> None:
+def test_the_focal_length_is_estimated_without_a_guess() -> None:
     unknown, config = walk(arc(22, 2.2))
     rounds: list[CalibrationRound] = []
     found = calibrate(unknown, config, on_progress=rounds.append)
@@ -51,7 +51,7 @@ def test_a_given_camera_is_refined_without_guessing() -> None:
     assert len(found.rounds) < 4
 
 
-def test_a_camera_that_only_turns_stays_unknown() -> None:
+def test_a_rotating_camera_is_not_calibrated() -> None:
     unknown, config = walk(turn(14))
     found = calibrate(unknown, config)
     assert not found.is_determined
@@ -67,7 +67,7 @@ def refinement(focal: float, std: float, drop: float = 0.0) -> IntrinsicsEstimat
 @pytest.mark.parametrize(
     ("focal", "std", "drop", "said"),
     [
-        (200.5, 1e-5, 0.0, ""),  # certain, but nobody minds
+        (200.5, 1e-5, 0.0, ""),  # certain, but the difference is negligible
         (204.0, 0.005, 0.0, "better with a focal length of 204 ± 1 px than with 200"),
         (205.0, 0.01, 0.01, ""),  # within the error
         # so far off, the run's own choices hide how much further it is
@@ -96,13 +96,13 @@ def refinement(focal: float, std: float, drop: float = 0.0) -> IntrinsicsEstimat
         (240.0, 0.3, 0.01, ""),
     ],
 )
-def test_a_contradicted_camera_is_named(focal: float, std: float, drop: float, said: str) -> None:
+def test_a_contradicted_calibration_is_reported(focal: float, std: float, drop: float, said: str) -> None:
     words = contradiction(CAMERA, refinement(focal, std, drop))
     assert said in words
     assert bool(said) == bool(words)
 
 
-def test_words_for_what_is_not_determined() -> None:
+def test_undetermined_parameters_are_reported() -> None:
     vague = refinement(200.0, 0.12)
     found = CalibrationResult(vague.camera, vague, [])
     assert not found.is_determined

@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_images_without_a_calibration(
+def test_images_without_a_calibration_are_calibrated(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They decide, the run says so and how certain it is, and the file it leaves is read by the next command."""
@@ -52,7 +52,7 @@ def test_images_without_a_calibration(
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_a_given_camera_that_is_wrong(
+def test_a_wrong_calibration_is_reported(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The summary names the better focal length, on the way to the true one of 500 px, and what helps."""
@@ -66,7 +66,7 @@ def test_a_given_camera_that_is_wrong(
     assert said.endswith("--refine-camera looks for a better one")
 
 
-def test_a_calibration_that_is_not_ours_stays(
+def test_a_calibration_file_of_the_user_is_not_overwritten(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "calibration.txt").write_text("1 1 1 1\n")
@@ -82,7 +82,7 @@ def test_a_calibration_that_is_not_ours_stays(
         (["--refine-camera", "--map", "nothing"], "--refine-camera cannot be combined with --map"),
     ],
 )
-def test_what_does_not_go_together(
+def test_conflicting_options_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], message: str
 ) -> None:
     assert main(["run", str(folder), "-o", str(tmp_path / "x"), "--camera", "auto", *extra]) == 2
@@ -97,7 +97,7 @@ def test_what_does_not_go_together(
         Camera.fisheye(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
     ],
 )
-def test_the_file_is_read_as_it_was_written(camera: Camera, tmp_path: Path) -> None:
+def test_the_calibration_file_round_trips(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "calibration.txt"
     check_replaceable(path)
     write_calibration(path, camera, ["focal length 1.5 ± 0.1 px"])

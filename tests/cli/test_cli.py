@@ -112,7 +112,7 @@ def test_plot_draws_again_from_the_files_alone(
         assert (copy / "plots" / name).read_bytes() == (finished / "plots" / name).read_bytes()
 
 
-def test_eval_prints_a_table_or_json(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_a_table_or_json(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [str(finished / "trajectory.txt"), str(finished / "groundtruth.txt")]
     status, out, _ = run_and_read(capsys, "eval", *files)
     assert status == 0
@@ -123,14 +123,14 @@ def test_eval_prints_a_table_or_json(finished: Path, capsys: pytest.CaptureFixtu
     assert run_and_read(capsys, "eval", str(finished), files[1], "--json")[:2] == (0, out)
 
 
-def test_info_says_what_would_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_describes_the_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run_and_read(capsys, "info", str(write_tum_folder(tmp_path / "tum")))
     assert status == 0
     for part in ("6", "640x480", "20.00 Hz", "pinhole 500 500 319.5 239.5", "none"):
         assert part in out
 
 
-def test_demo_shares_the_way_of_run(
+def test_demo_writes_the_results_of_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.cli.demo.SEQUENCE", ROOM)
@@ -164,7 +164,9 @@ def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
     assert figures["scale"] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_standstill_is_no_map_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_static_camera_gives_no_map_and_a_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     status, _, err = run_and_read(
         capsys, "run", "synthetic:standstill?frames=8", "--output", str(tmp_path), *FAST
     )
@@ -175,7 +177,7 @@ def test_standstill_is_no_map_and_says_why(tmp_path: Path, capsys: pytest.Captur
     assert main(["plot", str(tmp_path)]) == 0
 
 
-def test_interrupt_writes_what_there_is(
+def test_an_interrupt_writes_partial_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = SyntheticSequence.image
@@ -249,7 +251,7 @@ BAD_ARGUMENTS = [
 @pytest.mark.parametrize(
     ("arguments", "expected"), BAD_ARGUMENTS, ids=[" ".join(a) for a, _ in BAD_ARGUMENTS]
 )
-def test_errors_are_one_line_and_status_2(
+def test_errors_are_one_line_with_status_2(
     arguments: list[str],
     expected: str,
     tmp_path: Path,
@@ -340,13 +342,13 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
     assert f"usage: torchslam {command}" in capsys.readouterr().out
 
 
-def test_the_list_of_commands_says_what_each_of_them_says() -> None:
+def test_the_command_list_shows_each_commands_summary() -> None:
     for home, summary in COMMANDS.values():
         first = (import_module(f"torchslam.cli.{home}").__doc__ or "").split("\n")[0].rstrip(".")
         assert summary == first[0].lower() + first[1:]
 
 
-def test_public_names_are_imported_when_they_are_asked_for() -> None:
+def test_public_names_are_imported_lazily() -> None:
     names = [name for home in torchslam.HOMES.values() for name in home.split()]
     assert sorted(names) == sorted(torchslam.__all__)
     for name in names:

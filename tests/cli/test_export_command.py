@@ -72,7 +72,7 @@ def test_colors_are_those_of_the_images(results: Path, tmp_path: Path) -> None:
     assert float(slam_map.points["colors"].float().std()) > 40
 
 
-def test_a_rerun_shows_every_frame(results: Path, tmp_path: Path) -> None:
+def test_a_rerun_recording_has_every_frame(results: Path, tmp_path: Path) -> None:
     chunks = pytest.importorskip(
         "rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'"
     )
@@ -85,9 +85,7 @@ def test_a_rerun_shows_every_frame(results: Path, tmp_path: Path) -> None:
     assert poses == len(read_trajectory(results / "trajectory.txt"))
 
 
-def test_everything_goes_into_the_folder_of_results(
-    results: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exports_default_to_the_results_folder(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for to, name in {
         "colmap": "colmap/sparse/0/points3D.bin",
         "nerfstudio": "nerfstudio/transforms.json",
@@ -143,7 +141,7 @@ def change(folder: Path, **figures: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | figures))
 
 
-def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_images_are_reported(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(copy, source=str(tmp_path / "moved.mp4"))
     assert export(copy, "colmap", tmp_path / "a") == 2
     error = capsys.readouterr().err
@@ -157,7 +155,9 @@ def test_images_that_are_gone(copy: Path, tmp_path: Path, capsys: pytest.Capture
     assert "the location of the images is unknown" in capsys.readouterr().err
 
 
-def test_other_worlds(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_submaps_can_be_exported(
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     saved = read_atlas(copy / "map.safetensors")
     (submap,) = saved.atlas
     submap.number = 2
@@ -174,7 +174,7 @@ def test_other_worlds(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "contains no map: the camera stood still" in capsys.readouterr().err
 
 
-def test_a_run_that_only_localized_has_its_trajectory(
+def test_a_localization_run_has_its_trajectory(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(copy, session=1)
@@ -184,7 +184,7 @@ def test_a_run_that_only_localized_has_its_trajectory(
 
 
 @pytest.mark.parametrize("to", ["ply", "tum", "kitti"])
-def test_there_is_nothing_to_undistort(
+def test_formats_without_images_cannot_be_undistorted(
     results: Path, to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(results, to, tmp_path / "a", "--undistort") == 2

@@ -73,7 +73,7 @@ def write(kind: str, given: Tensor, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["tum", "nerfstudio", "colmap"])
-def test_poses_come_back_as_they_came(
+def test_refined_poses_keep_the_format_of_the_input(
     kind: str, folder: Path, given: Tensor, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses, results = write(kind, given, tmp_path), tmp_path / "results"
@@ -121,7 +121,7 @@ def shape_errors(T_cw: Tensor, truth: Tensor) -> float:
     return float((centers - se3_inverse(truth)[:, :3, 3]).square().sum(-1).mean().sqrt())
 
 
-def test_what_users_get_wrong(
+def test_invalid_arguments_are_one_line_with_status_2(
     folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses, output = write("tum", given, tmp_path), str(tmp_path / "results")
@@ -144,7 +144,7 @@ def test_what_users_get_wrong(
     assert "are not those of the images" in capsys.readouterr().err
 
 
-def test_images_that_make_no_map(folder: Path, given: Tensor, tmp_path: Path) -> None:
+def test_images_without_a_map_are_reported(folder: Path, given: Tensor, tmp_path: Path) -> None:
     """The results say why, there are no refined poses, and the status is 3."""
     poses = write("tum", given, tmp_path)
     arguments = [

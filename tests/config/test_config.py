@@ -40,21 +40,21 @@ def test_resolved_toml_reads_back_as_the_same_configuration(tmp_path: Path) -> N
     assert config != Config()
 
 
-def test_every_character_of_a_string_is_written_so_that_it_reads_back(tmp_path: Path) -> None:
+def test_every_character_of_a_string_round_trips(tmp_path: Path) -> None:
     weights = "".join(map(chr, range(0x100))) + "\u2028\U0001f600"
     file = tmp_path / "config.toml"
     file.write_text(to_toml(Config(features=FeaturesConfig(weights=weights))), encoding="utf-8")
     assert load_config(file).features.weights == weights
 
 
-def test_overrides_win_over_the_file(tmp_path: Path) -> None:
+def test_overrides_take_precedence_over_the_file(tmp_path: Path) -> None:
     file = tmp_path / "config.toml"
     file.write_text("[features]\nnum_keypoints = 500\nkind = 'opencv-orb'\n")
     config = load_config(file, ["features.num_keypoints=750"])
     assert (config.features.num_keypoints, config.features.kind) == (750, "opencv-orb")
 
 
-def test_an_integer_serves_as_a_float() -> None:
+def test_an_integer_is_accepted_as_a_float() -> None:
     assert load_config(None, ["tracking.search_radius_px=20"]).tracking.search_radius_px == 20.0
 
 
@@ -94,7 +94,7 @@ def test_an_integer_serves_as_a_float() -> None:
         ("seed", "section.key=value"),
     ],
 )
-def test_a_wrong_override_is_named(override: str, message: str) -> None:
+def test_an_invalid_override_is_rejected_by_name(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(None, [override])
 
@@ -108,7 +108,7 @@ def test_an_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
         load_config(file)
 
 
-def test_a_missing_and_a_broken_file(tmp_path: Path) -> None:
+def test_a_missing_and_a_malformed_file_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         load_config(tmp_path / "none.toml")
     broken = tmp_path / "broken.toml"
@@ -136,7 +136,7 @@ def test_every_section_is_written_out() -> None:
         assert section.name in text
 
 
-def test_what_is_explained_reads_back(tmp_path: Path) -> None:
+def test_the_commented_toml_reads_back(tmp_path: Path) -> None:
     config = load_config(None, ["seed=7", "features.max_image_pixels=0", "matching.max_ratio=0.7"])
     text = to_commented_toml(config)
     (tmp_path / "c.toml").write_text(text)
@@ -154,7 +154,7 @@ max_image_pixels = 0
 
 
 @pytest.mark.parametrize("kind", [Config, *SECTIONS.values()], ids=lambda kind: kind.__name__)
-def test_every_setting_says_what_it_is_and_has_an_end(kind: type[Settings]) -> None:
+def test_every_setting_has_a_description_and_a_range(kind: type[Settings]) -> None:
     for declared in fields(kind):
         if declared.type in ("int", "float"):
             assert declared.metadata["allowed"].high < math.inf, declared.name
@@ -163,12 +163,12 @@ def test_every_setting_says_what_it_is_and_has_an_end(kind: type[Settings]) -> N
             assert declared.metadata["about"], declared.name
 
 
-def test_what_grows_stays_in_its_range() -> None:
+def test_scaled_settings_stay_in_their_range() -> None:
     config = load_config(None, ["tracking.threshold_px=9000"]).for_size((4000, 3000))
     assert config.tracking.threshold_px == 10_000
 
 
-def test_files_that_take_time(tmp_path: Path) -> None:
+def test_a_slow_or_large_file_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "hostile.toml"
     for text, message in (
         ("a" + ".a" * 20_000 + " = 1", "a line of 40005 characters, more than the 4096"),
@@ -189,7 +189,7 @@ def test_files_that_take_time(tmp_path: Path) -> None:
         load_config(tmp_path / "pipe")
 
 
-def test_choices_have_one_source() -> None:
+def test_the_choices_of_settings() -> None:
     assert CHOICES == {
         "scale": ("unit", "groundtruth"),
         "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
@@ -232,7 +232,7 @@ def test_choices_have_one_source() -> None:
         ),
     ],
 )
-def test_a_wrong_value_in_python_is_named(build: Any, message: str) -> None:
+def test_an_invalid_value_in_python_is_rejected_by_name(build: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build()
 
@@ -270,7 +270,9 @@ def test_a_wrong_value_in_python_is_named(build: Any, message: str) -> None:
         ("bundle_adjustment.local_iterations", 1, 0),
     ],
 )
-def test_the_ends_of_the_ranges(key: str, accepted: float, refused: float) -> None:
+def test_range_limits_are_inclusive_or_exclusive_as_documented(
+    key: str, accepted: float, refused: float
+) -> None:
     load_config(None, [f"{key}={accepted}"])
     with pytest.raises(ConfigError, match=f"{key} must be "):
         load_config(None, [f"{key}={refused}"])
@@ -348,7 +350,7 @@ def test_any_valid_configuration_reads_back(tmp_path_factory: pytest.TempPathFac
 
 @settings(max_examples=300, deadline=None)
 @given(place=st.sampled_from(KEYS), data=st.data())
-def test_any_broken_value_is_named(
+def test_any_invalid_value_is_rejected_by_name(
     tmp_path_factory: pytest.TempPathFactory, place: tuple[type[Settings], str, str], data: st.DataObject
 ) -> None:
     kind, section, key = place
@@ -364,7 +366,7 @@ def test_any_broken_value_is_named(
             load_config(file)
 
 
-def test_a_section_says_what_it_allows_in_words() -> None:
+def test_a_section_describes_its_allowed_values() -> None:
     @dataclass(frozen=True)
     class Own(Settings, section="own"):
         below: float = setting(-1.0, low=-2, high=0)
@@ -379,7 +381,7 @@ def test_a_section_says_what_it_allows_in_words() -> None:
         Own(plain=-1)
 
 
-def test_a_name_is_a_configuration_that_comes_with_torchslam_and_a_path_is_a_file(
+def test_a_name_selects_a_bundled_configuration_and_a_path_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

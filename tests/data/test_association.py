@@ -14,7 +14,7 @@ TIMES = st.lists(st.floats(-100, 100), min_size=1, max_size=20, unique=True).map
 
 
 @given(TIMES, TIMES)
-def test_nearest_is_brute_force(times: list[float], reference: list[float]) -> None:
+def test_nearest_equals_brute_force(times: list[float], reference: list[float]) -> None:
     a, b = torch.tensor(times, dtype=torch.float64), torch.tensor(reference, dtype=torch.float64)
     indices, distances = nearest(a, b)
     expected = (a[:, None] - b).abs().min(dim=1).values
@@ -37,7 +37,7 @@ def test_constant_motion_is_interpolated_exactly() -> None:
     torch.testing.assert_close(T_wc, se3_exp(xi), atol=1e-12, rtol=0)
 
 
-def test_own_times_give_own_poses_bit_by_bit() -> None:
+def test_interpolation_at_the_samples_returns_them_exactly() -> None:
     trajectory = _turning(9)
     T_wc, valid = interpolate_poses(trajectory, trajectory.timestamps, tolerance=0.0)
     assert valid.all()

@@ -59,7 +59,7 @@ def test_bad_numbers(tmp_path: Path, text: str, message: str) -> None:
         read_calibration(file)
 
 
-def test_distortion_beside_the_calibration(tmp_path: Path) -> None:
+def test_distortion_in_a_file_next_to_the_calibration(tmp_path: Path) -> None:
     (tmp_path / "calibration.txt").write_text("500 501 320 240\n")
     (tmp_path / "distortion.txt").write_text("# k1 k2 p1 p2 k3\n-0.28 0.07 0.0002 1.7e-05 0.0\n")
     calibration = read_calibration(tmp_path / "calibration.txt")

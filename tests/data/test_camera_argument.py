@@ -201,7 +201,7 @@ def test_files(tmp_path: Path, name: str, text: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml"])
-def test_what_opencv_writes(tmp_path: Path, suffix: str) -> None:
+def test_opencv_calibration_files_are_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"camera.{suffix}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 640)
@@ -236,7 +236,7 @@ def test_what_opencv_writes(tmp_path: Path, suffix: str) -> None:
         ("RADIAL_FISHEYE 640 480 500 320 240 1 2", "fisheye", [500, 500, 319.5, 239.5, 1, 2, 0, 0]),
     ],
 )
-def test_models_of_colmap(tmp_path: Path, line: str, model: str, params: list[float]) -> None:
+def test_colmap_camera_models_are_read(tmp_path: Path, line: str, model: str, params: list[float]) -> None:
     (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
     calibration = read_calibration(tmp_path / "cameras.txt")
     assert (calibration.model, calibration.size) == (model, VGA)
@@ -246,7 +246,7 @@ def test_models_of_colmap(tmp_path: Path, line: str, model: str, params: list[fl
 @pytest.mark.parametrize(
     "line", ["OPENCV 640 480 500 501 320 240 .1 -.2 .01 .02", "SIMPLE_RADIAL 640 480 500 320 240 .1"]
 )
-def test_pixels_are_half_a_pixel_from_those_of_colmap(tmp_path: Path, line: str) -> None:
+def test_colmap_pixels_are_shifted_by_half_a_pixel(tmp_path: Path, line: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
     model, width, height, *params = line.split()

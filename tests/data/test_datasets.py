@@ -158,14 +158,14 @@ def test_kitti_raw(kitti_raw: Callable[..., Path]) -> None:
     torch.testing.assert_close(position, torch.tensor([0, -0.5, 0], dtype=torch.float64), atol=1e-9, rtol=0)
 
 
-def test_right_of_the_first_camera(kitti_raw: Callable[..., Path]) -> None:
+def test_poses_of_the_right_camera_are_relative_to_the_first(kitti_raw: Callable[..., Path]) -> None:
     """P_rect_02 puts its camera half a meter to the right of camera 0: east, on the way north."""
     sequence = open_sequence(kitti_raw(camera="02"))
     position = sequence.groundtruth.positions_w[0]
     torch.testing.assert_close(position, torch.tensor([0.5, -0.5, 0], dtype=torch.float64), atol=1e-9, rtol=0)
 
 
-def test_kitti_raw_as_it_was_taken(kitti_raw: Callable[..., Path]) -> None:
+def test_kitti_raw_unsynchronized(kitti_raw: Callable[..., Path]) -> None:
     camera = open_sequence(kitti_raw("extract")).camera
     assert isinstance(camera, Camera)
     assert camera.params.tolist() == [70, 71, 32, 24, -0.3, 0.2, 0.001, 0.002, -0.07]

@@ -24,7 +24,7 @@ from torchslam.errors import DownloadError, SequenceError
 
 @dataclass
 class Server:
-    """What the server offers, how it misbehaves and what it was asked for.
+    """What the server offers, how it misbehaves and which requests it received.
 
     cut: bytes after which a transfer breaks off; the number of transfers it does so for
     length: what it says instead of the length; None: nothing; pause: seconds after every byte
@@ -125,7 +125,7 @@ def test_download_unpack_open(server: Server, archive: bytes, tmp_path: Path) ->
     assert server.requests == [None]  # not fetched again
 
 
-def test_broken_transfer_goes_on_in_the_same_call(server: Server, archive: bytes, tmp_path: Path) -> None:
+def test_a_broken_transfer_resumes_in_the_same_call(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     server.cut, server.cuts_left = 1000, 2
     folder = download("eth3d/plant_1", tmp_path, server.url, progress=False)
@@ -133,7 +133,7 @@ def test_broken_transfer_goes_on_in_the_same_call(server: Server, archive: bytes
     assert len(open_sequence(folder)) == 3
 
 
-def test_broken_transfer_goes_on_in_the_next_call(server: Server, archive: bytes, tmp_path: Path) -> None:
+def test_a_broken_transfer_resumes_in_the_next_call(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     server.cut, server.cuts_left = 500, 5
     with pytest.raises(DownloadError, match=rf"broke off after 2500 of {len(archive)} bytes; run the same"):
@@ -144,22 +144,22 @@ def test_broken_transfer_goes_on_in_the_next_call(server: Server, archive: bytes
     assert server.requests[-1] == "bytes=2500-"
 
 
-def test_server_without_ranges_starts_again(server: Server, archive: bytes, tmp_path: Path) -> None:
+def test_a_server_without_ranges_restarts_the_transfer(
+    server: Server, archive: bytes, tmp_path: Path
+) -> None:
     server.files["/plant_1_mono.zip"] = archive
     server.ranges = False
     (tmp_path / "plant_1_mono.zip.part").write_bytes(archive[:700])
     assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
 
 
-def test_transfer_that_was_complete_already(server: Server, archive: bytes, tmp_path: Path) -> None:
+def test_a_complete_transfer_is_not_repeated(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     (tmp_path / "plant_1_mono.zip.part").write_bytes(archive)
     assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
 
 
-def test_leftovers_longer_than_the_file_are_thrown_away(
-    server: Server, archive: bytes, tmp_path: Path
-) -> None:
+def test_leftovers_longer_than_the_file_are_discarded(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     (tmp_path / "plant_1_mono.zip.part").write_bytes(archive + b"more")
     assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
@@ -180,7 +180,7 @@ def test_checksum(server: Server, archive: bytes, tmp_path: Path) -> None:
     ).is_dir()
 
 
-def test_a_body_has_an_end(
+def test_the_size_of_a_download_is_bounded(
     server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.files["/plant_1_mono.zip"] = archive
@@ -194,7 +194,7 @@ def test_a_body_has_an_end(
         assert not (tmp_path / "data" / "plant_1").exists()
 
 
-def test_a_body_that_drips(
+def test_a_slow_body_times_out(
     server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.files["/plant_1_mono.zip"] = archive
@@ -206,7 +206,7 @@ def test_a_body_that_drips(
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_what_unpacks_to_far_more_than_it_is(
+def test_a_decompression_bomb_is_refused(
     tmp_path: Path, method: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(downloads, "SMALL", 1 << 20)
@@ -221,7 +221,7 @@ def test_what_unpacks_to_far_more_than_it_is(
         open_sequence(tmp_path / "bomb.zip")
 
 
-def test_a_full_disk_is_not_the_archives_fault(
+def test_a_full_disk_is_reported_as_such(
     server: Server, archive: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.files["/plant_1_mono.zip"] = archive
@@ -231,7 +231,7 @@ def test_a_full_disk_is_not_the_archives_fault(
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["plant_1_mono.zip"]
 
 
-def test_entries_without_a_name(tmp_path: Path) -> None:
+def test_archive_entries_without_a_name_are_refused(tmp_path: Path) -> None:
     content = _entries(**{"good.txt": b"good", "N": b"nameless"})
     # The length of the name, in the entry and in the directory, becomes 0, and its byte a part of the extra field.
     for mark, at in ((b"PK\3\4", 26), (b"PK\1\2", 28)):
@@ -272,7 +272,7 @@ def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path
     "name",
     ["../evil.txt", "a/../../evil.txt", "/etc/evil.txt", "..\\evil.txt", "C:\\evil.txt", "C:/evil.txt"],
 )
-def test_paths_that_climb_out(tmp_path: Path, name: str) -> None:
+def test_paths_outside_the_target_are_refused(tmp_path: Path, name: str) -> None:
     archive = tmp_path / "hostile.zip"
     archive.write_bytes(_entries(**{"good.txt": b"good", name: b"evil"}))
     with pytest.raises(DownloadError, match=r"hostile\.zip: entry `.*evil\.txt` climbs out"):
@@ -280,7 +280,7 @@ def test_paths_that_climb_out(tmp_path: Path, name: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["hostile.zip"]
 
 
-def test_links(tmp_path: Path) -> None:
+def test_links_in_archives_are_refused(tmp_path: Path) -> None:
     entry = zipfile.ZipInfo("link")
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(tmp_path / "hostile.zip", "w") as file:

@@ -47,7 +47,7 @@ def of_all(body: bytes) -> bytes:  # more runs than there is room for
 @pytest.mark.parametrize(
     ("kind", "change"), [(b"stsz", stsz), (b"stts", stts), (b"stts", many_runs), (b"stts", of_all)]
 )
-def test_an_index_of_more_frames_than_bytes(
+def test_an_index_with_more_frames_than_bytes_is_refused(
     film: Path, kind: bytes, change: Callable[[bytes], bytes]
 ) -> None:
     assert claimed_samples(film) == 5
@@ -59,7 +59,7 @@ def test_an_index_of_more_frames_than_bytes(
         open_sequence(film, CAMERA)
 
 
-def test_boxes_without_end(tmp_path: Path) -> None:
+def test_endless_mp4_boxes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "boxes.mp4"
     large = struct.pack(">I4sQ", 1, b"moov", 2**63)
     to_the_end = struct.pack(">I4s", 0, b"trak")
@@ -84,7 +84,7 @@ def test_frames_of_a_video_that_are_too_large(film: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="measured as Linux does")
-def test_large_images_are_not_kept(tmp_path: Path) -> None:
+def test_large_images_are_not_cached(tmp_path: Path) -> None:
     """Of 16 bits, twenty are looked at to learn how many are used: one after the other."""
     side = 2048
     cv2.imwrite(str(tmp_path / "0.png"), np.full((side, side), 1000, np.uint16))
@@ -102,7 +102,7 @@ def resident(key: str) -> int:
     return int(Path("/proc/self/status").read_text().partition(f"{key}:")[2].split()[0]) * 1024
 
 
-def test_lines_that_take_time(tmp_path: Path) -> None:
+def test_long_lines_are_refused(tmp_path: Path) -> None:
     start = time.process_time()
     with pytest.raises(CalibrationError, match="here: 200000 characters, more than the 65536 of a line"):
         parse_numbers("1 " * 100_000, "here")
@@ -123,7 +123,7 @@ def test_lines_that_take_time(tmp_path: Path) -> None:
         ("1e200 0 0 0 0 1e200 0 0 0 0 1e200 0", "not a rigid transformation"),
     ],
 )
-def test_poses_that_are_none(tmp_path: Path, poses: str, message: str) -> None:
+def test_invalid_poses_are_refused(tmp_path: Path, poses: str, message: str) -> None:
     (tmp_path / "image_0").mkdir()
     for index in range(2):
         cv2.imwrite(str(tmp_path / "image_0" / f"{index}.png"), np.zeros((48, 64), np.uint8))

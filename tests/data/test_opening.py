@@ -37,7 +37,7 @@ def test_images_in_a_folder_inside(tmp_path: Path, write_picture: Write, inner: 
     assert sequence.name == tmp_path.name
 
 
-def test_what_is_no_frame_is_left_out_with_a_word(tmp_path: Path, write_picture: Write) -> None:
+def test_files_that_are_no_frames_are_skipped_with_a_note(tmp_path: Path, write_picture: Write) -> None:
     for index in range(2):
         for name in (f"{index:04d}.png", f"._{index:04d}.png", f"{index:04d}_depth.png"):
             write_picture(tmp_path / name, index)
@@ -49,13 +49,13 @@ def test_what_is_no_frame_is_left_out_with_a_word(tmp_path: Path, write_picture:
     assert {"2 hidden files", "2 depth images", "1 masks"} == set(note.partition(": ")[2].split(", "))
 
 
-def test_a_word_of_a_name_is_a_whole_word(tmp_path: Path, write_picture: Write) -> None:
+def test_names_are_matched_by_whole_words(tmp_path: Path, write_picture: Write) -> None:
     for index, name in enumerate(("masked_ball1.png", "depths2.png", "flower3.png")):
         write_picture(tmp_path / name, index)
     assert len(open_sequence(tmp_path, CAMERA)) == 3
 
 
-def test_two_series_are_not_mixed(tmp_path: Path, write_picture: Write) -> None:
+def test_two_series_of_images_are_not_mixed(tmp_path: Path, write_picture: Write) -> None:
     for index in range(3):
         write_picture(tmp_path / f"left-{index}.png", index)
         write_picture(tmp_path / f"right-{index:02d}.png", index)
@@ -67,13 +67,15 @@ def test_two_series_are_not_mixed(tmp_path: Path, write_picture: Write) -> None:
         open_sequence(tmp_path / "middle-*.png", CAMERA)
 
 
-def test_series_that_go_on_are_one(tmp_path: Path, write_picture: Write) -> None:
+def test_consecutive_series_are_joined(tmp_path: Path, write_picture: Write) -> None:
     for index, name in enumerate(("a1.png", "a2.png", "b3.png", "b4.jpg")):
         write_picture(tmp_path / name, index)
     assert names(open_sequence(tmp_path, CAMERA)) == ["a1.png", "a2.png", "b3.png", "b4.jpg"]
 
 
-def test_proposals(tmp_path: Path, tum_folder: Callable[..., Path], write_picture: Write) -> None:
+def test_misspelled_names_get_suggestions(
+    tmp_path: Path, tum_folder: Callable[..., Path], write_picture: Write
+) -> None:
     folder = tum_folder()
     for wrong, message in (
         (folder.with_name("sequense"), f"does not exist; did you mean {folder}?"),
@@ -131,7 +133,7 @@ def test_wrong_archives(tmp_path: Path) -> None:
         open_sequence(tmp_path / "c.zip")
 
 
-def test_an_archive_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_archive_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("0.png", b"x" * 1000)
     monkeypatch.setattr(
@@ -142,7 +144,7 @@ def test_an_archive_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("bits", "white"), [(10, 1023), (12, 4095), (14, 16383), (16, 65535)])
-def test_bits_in_16(tmp_path: Path, bits: int, white: int) -> None:
+def test_sixteen_bit_images_are_scaled(tmp_path: Path, bits: int, white: int) -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, white + 1, (3, 48, 64)).astype(np.uint16)
     images[1, 0, 0] = white
@@ -155,7 +157,7 @@ def test_bits_in_16(tmp_path: Path, bits: int, white: int) -> None:
         torch.testing.assert_close(sequence.image(index)[0, 0], expected)
 
 
-def test_brighter_than_the_images_looked_at(tmp_path: Path, write_picture: Write) -> None:
+def test_images_brighter_than_the_sampled_ones_are_clipped(tmp_path: Path, write_picture: Write) -> None:
     for index in range(60):
         cv2.imwrite(
             str(tmp_path / f"{index}.png"), np.full((48, 64), 8000 if index == 4 else 4000, np.uint16)
@@ -165,9 +167,7 @@ def test_brighter_than_the_images_looked_at(tmp_path: Path, write_picture: Write
     assert float(sequence.image(5).max()) == pytest.approx(4000 / 4095)
 
 
-def test_nothing_is_read_without_a_limit(
-    tmp_path: Path, write_picture: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_read_is_bounded(tmp_path: Path, write_picture: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm"):
         image = tmp_path / f"0.{suffix}"
         write_picture(image)

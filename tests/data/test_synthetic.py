@@ -30,7 +30,7 @@ def _plain(origin: tuple[float, float, float], size: tuple[float, float], gray: 
     return Rectangle(np.array(origin), np.array((1.0, 0, 0)), np.array((0, 1.0, 0)), size, texture)
 
 
-def test_edges_lie_where_the_projection_says() -> None:
+def test_rendered_edges_agree_with_the_projection() -> None:
     # From x = -0.4 to 0.8 m and y = -0.2 to 0.3 m at 2 m: pixels 54.5 to 129.5 and 47 to 78.25.
     image = Renderer([_plain((-0.4, -0.2, 2.0), (1.2, 0.5), 200)], K, SIZE).render(np.eye(4))
     expected = np.zeros((120, 160), np.float32)
@@ -46,7 +46,7 @@ def test_the_nearer_one_hides_the_farther_one() -> None:
         assert image[5, 5] == 150
 
 
-def test_nothing_is_seen_behind_the_camera_or_edge_on() -> None:
+def test_surfaces_behind_the_camera_or_edge_on_are_invisible() -> None:
     renderer = Renderer([_plain((-1, -1, 2.0), (2, 2), 200)], K, SIZE)
     turned = np.diag((-1.0, 1.0, -1.0, 1.0))
     assert renderer.render(turned).max() == 0
@@ -94,14 +94,14 @@ def test_room_has_corners_at_every_scale_and_moves_smoothly() -> None:
     assert float(steps.max()) < 0.1
 
 
-def test_same_name_same_bytes_in_any_order() -> None:
+def test_a_scene_gives_the_same_bytes_in_any_order() -> None:
     first, second = open_sequence("synthetic:room"), open_sequence("synthetic:room")
     second.image(5)
     assert torch.equal(first.image(1), second.image(1))
     assert not torch.equal(first.image(1), open_sequence("synthetic:room?noise=5").image(1))
 
 
-def test_longer_runs_come_round_again_but_never_exactly() -> None:
+def test_long_sequences_revisit_places_but_never_exactly() -> None:
     sequence = open_sequence("synthetic:room?frames=400&blank=1")
     assert sequence.groundtruth is not None
     assert len(sequence) == 400
@@ -113,7 +113,7 @@ def test_longer_runs_come_round_again_but_never_exactly() -> None:
     assert float(sequence[399].image.std()) == 0
 
 
-def test_rotation_and_standstill_have_no_parallax() -> None:
+def test_rotating_and_static_cameras_have_no_parallax() -> None:
     for scene, turns in (("rotation", True), ("standstill", False)):
         sequence = open_sequence(f"synthetic:{scene}?blank=1")
         assert sequence.groundtruth is not None
@@ -153,7 +153,7 @@ def test_every_scene_has_its_own_length() -> None:
     assert len(open_sequence("synthetic:loop?frames=30")) == 30
 
 
-def test_the_loop_moves_smoothly_and_never_turns_on_the_spot() -> None:
+def test_the_loop_is_smooth_without_rotations_in_place() -> None:
     positions, R_wc = _path("loop")
     moves = positions.diff(dim=0)
     steps, turns = moves.norm(dim=-1), _degrees_between(R_wc[:-1], R_wc[1:])
@@ -166,14 +166,14 @@ def test_the_loop_moves_smoothly_and_never_turns_on_the_spot() -> None:
     assert float((to_the_left - OUTWARD).mean().abs()) < 0.01
 
 
-def test_the_loop_comes_back_over_its_start() -> None:
+def test_the_loop_returns_to_its_start() -> None:
     positions, R_wc = _path("loop")
     assert float((positions[670:] - positions[:50]).norm(dim=-1).max()) < 0.15
     assert float(_degrees_between(R_wc[670:], R_wc[:50]).max()) < 5
     assert float((positions[:50] - positions[335:385]).norm(dim=-1).min()) > 5.0  # the far side in between
 
 
-def test_the_walk_over_the_storey_is_smooth_turns_in_place_and_comes_back() -> None:
+def test_the_building_walk_is_smooth_rotates_in_place_and_returns() -> None:
     positions, R_wc = _path("storey?frames=2400")
     steps = positions.diff(dim=0).norm(dim=-1)
     turns = _degrees_between(R_wc[:-1], R_wc[1:])
@@ -188,7 +188,7 @@ def test_the_walk_over_the_storey_is_smooth_turns_in_place_and_comes_back() -> N
     assert float((positions[:1100] - positions[0]).norm(dim=-1).max()) > 11
 
 
-def test_a_surface_with_less_on_it_has_fewer_edges() -> None:
+def test_a_surface_with_less_texture_has_fewer_edges() -> None:
     plain, full = (
         surface(np.random.default_rng(0), (1.5, 1.5), 0.004, 32, coverage).astype(np.float32)
         for coverage in (PLAIN, COVERAGE)
@@ -200,7 +200,7 @@ def test_a_surface_with_less_on_it_has_fewer_edges() -> None:
 @pytest.mark.parametrize(
     ("name", "build"), [("loop", rooms), ("corridors?frames=720", corridors), ("storey", storey)]
 )
-def test_the_walk_keeps_clear_of_walls_and_furniture(name: str, build: Build) -> None:
+def test_the_walk_avoids_walls_and_furniture(name: str, build: Build) -> None:
     positions = _path(name)[0].numpy()
     clearance = [_distance(positions, rectangle).min() for rectangle in _built(build)]
     assert 0.4 < min(clearance) < 1.0
@@ -213,7 +213,7 @@ def _distance(points: np.ndarray, rectangle: Rectangle) -> np.ndarray:
     return np.linalg.norm(points - rectangle.origin - inside @ axes, axis=-1)
 
 
-def test_the_corridors_are_never_seen_twice() -> None:
+def test_the_corridors_are_never_revisited() -> None:
     positions, _ = _path("corridors")
     apart = (torch.arange(len(positions))[:, None] - torch.arange(len(positions))).abs() >= 150
     assert float(torch.cdist(positions, positions)[apart].min()) > 2.5
@@ -253,12 +253,12 @@ def test_the_walk_meets_corresponding_places_of_the_corridors() -> None:
         assert np.linalg.norm(back @ R_wc[index] - R_wc[40]) < 0.1
 
 
-def test_a_building_is_the_same_from_the_same_seed() -> None:
+def test_a_seed_determines_the_building() -> None:
     pairs = zip(_built(corridors), corridors(0), strict=True)
     assert all(np.array_equal(one.texture, same.texture) for one, same in pairs)
 
 
-def test_a_shared_texture_is_drawn_like_copies_of_it() -> None:
+def test_a_shared_texture_renders_like_copies() -> None:
     shared = _built(corridors)
     copies = [
         Rectangle(one.origin, one.axis_u, one.axis_v, one.size, one.texture.copy())

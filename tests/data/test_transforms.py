@@ -35,7 +35,7 @@ def numbers(sequence) -> list[str]:
         ({"start": 1, "fps": 5}, "13"),
     ],
 )
-def test_which_frames(tum_folder: Callable[..., Path], options: dict, frames: str) -> None:
+def test_frames_are_selected(tum_folder: Callable[..., Path], options: dict, frames: str) -> None:
     sequence = open_sequence(tum_folder(), **options)
     assert numbers(sequence) == list(frames)
     assert [frame.timestamp for frame in sequence] == [1000 + int(number) / 10 for number in frames]
@@ -122,7 +122,7 @@ def test_masks_by_order(tum_folder: Callable[..., Path], tmp_path: Path) -> None
     assert [bool(frame.mask.any()) for frame in sequence] == [False, False, True, False, False]
 
 
-def test_wrong_masks(tum_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_invalid_masks_are_rejected(tum_folder: Callable[..., Path], tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((24, 32), np.uint8))
     with pytest.raises(SequenceError, match=r"small\.png: the mask is 32x24, the images are 64x48"):
         open_sequence(tum_folder(), mask=tmp_path / "small.png")

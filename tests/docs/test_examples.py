@@ -27,7 +27,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     monkeypatch.setattr(sys, "argv", ["example", *arguments])
 
 
-def test_a_loop_of_ones_own(
+def test_the_own_loop_example_runs(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images(folder, 20)
@@ -39,7 +39,7 @@ def test_a_loop_of_ones_own(
     assert read_map("out/map.safetensors")[0].num_points > 100
 
 
-def test_a_live_camera(
+def test_the_live_camera_example_runs(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     called(monkeypatch, "0", CAMERA, "--save", "live.safetensors")

@@ -29,12 +29,12 @@ BEFORE = {"colmap_splat.md": results_of_the_first_tutorial}
         for page in RUN_HERE
     ],
 )
-def test_page_runs(page: Path, folder: Path) -> None:
+def test_the_code_of_a_page_runs(page: Path, folder: Path) -> None:
     BEFORE.get(page.name, lambda: None)()
     run_page(page)
 
 
-def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
+def test_a_page_with_wrong_output_is_detected(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Page\n\n```python\nx = 1\n```\n\n```python\n\nassert x == 2\n```\n")
     with pytest.raises(AssertionError, match=r"page\.md:8 failed(.|\n)*page\.md\", line 9"):
@@ -51,5 +51,5 @@ def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
         ("", None),
     ],
 )
-def test_what_a_command_prints_is_compared(expected: str, missing: str | None) -> None:
+def test_the_output_of_a_command_is_compared(expected: str, missing: str | None) -> None:
     assert first_missing(expected, "a 1\n  b 2\nc 3\n") == missing

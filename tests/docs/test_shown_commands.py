@@ -48,7 +48,7 @@ def why_not(arguments: list[str]) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_are_shown_could_be_run(page: Path) -> None:
+def test_documented_commands_parse(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     wrong = list(filter(None, map(why_not, shown(text))))
     wrong += [f"python -m {name}" for name in MODULE.findall(text) if find_spec(name) is None]
@@ -59,7 +59,7 @@ def test_commands_that_are_shown_could_be_run(page: Path) -> None:
     assert not wrong
 
 
-def test_wrong_ones_are_found() -> None:
+def test_invalid_commands_are_detected() -> None:
     text = "```sh\nPYTHONPATH=. torchslam run a.mp4 \\\n  --outptu b  # why\n```\n    torchslam eval a b > c"
     first, second = shown(text)
     assert "--outptu" in why_not(first)

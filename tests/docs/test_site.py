@@ -19,7 +19,7 @@ PAGES = [
 
 
 def target(page: Path, link: str) -> Path:
-    """The file that a link leads to: experiments, CONTRIBUTING and CHANGELOG lie in the root beside docs/."""
+    """The file that a link leads to: experiments, CONTRIBUTING and CHANGELOG lie in the root next to docs/."""
     path = (page.parent / link).resolve()
     if path.exists() or not path.is_relative_to(ROOT / "docs"):
         return path
@@ -27,7 +27,7 @@ def target(page: Path, link: str) -> Path:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_resolve(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     links = [found[1] for found in LINK.finditer(text) if "://" not in found[1]]
     missing = [link for link in links if not target(page, link).exists() and Path(link).name not in MADE]
@@ -37,8 +37,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_every_page_is_in_the_navigation() -> None:
     listed = set(NAV.findall((ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     here = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
-    beside = {path.relative_to(ROOT).as_posix() for path in (ROOT / "experiments").rglob("*.md")}
-    there = here | beside | MADE | {"CONTRIBUTING.md", "CHANGELOG.md"}
+    studies = {path.relative_to(ROOT).as_posix() for path in (ROOT / "experiments").rglob("*.md")}
+    there = here | studies | MADE | {"CONTRIBUTING.md", "CHANGELOG.md"}
     assert not there - listed, "pages that `nav` of mkdocs.yml does not list"
     assert not listed - there, "pages in `nav` of mkdocs.yml that there are not"
 

@@ -48,7 +48,7 @@ def noise_images(seed: int = 0) -> Tensor:
     return torch.rand(1, 1, 96, 128, generator=torch.Generator().manual_seed(seed))
 
 
-def test_the_error_of_a_clip_is_a_share_of_its_path_and_nan_without_poses() -> None:
+def test_the_error_of_a_clip_is_relative_to_its_path_and_nan_without_poses() -> None:
     walk, standing = Walk(arc(20, length=2.0)), Walk(still(20))
     clip = clip_from(walk, 2, CPU)
     assert torch.equal(clip.T_cw, T_cw(walk)[2:18:2])
@@ -60,7 +60,7 @@ def test_the_error_of_a_clip_is_a_share_of_its_path_and_nan_without_poses() -> N
     assert math.isnan(position_error(ClipSLAM(blind), clip_from(standing, 0, CPU)))
 
 
-def test_pairs_and_clips_stay_in_their_part() -> None:
+def test_pairs_and_clips_stay_in_their_split() -> None:
     walk = Walk(arc(100))
     part = Part.of(walk, (0.5, 0.9), pairs=200, clips=3)
     assert part.pairs == list(range(50, 90 - frames_in(APART_S, walk)))
@@ -88,7 +88,7 @@ def test_patches_between_pixels_are_interpolated() -> None:
     assert float(torch.corrcoef(torch.stack([found, mean.flatten()]))[0, 1]) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_without_training_nothing_moves_and_later_no_further_than_the_reach() -> None:
+def test_offsets_start_at_zero_and_are_bounded() -> None:
     images = noise_images()
     front_end = SubPixel(ORB(100))
     plain, moved = front_end.front_end(images), front_end(images)
@@ -99,7 +99,7 @@ def test_without_training_nothing_moves_and_later_no_further_than_the_reach() ->
     assert 0 < float(distance.max()) <= REACH + 1e-4
 
 
-def test_a_remembering_front_end_looks_once_at_the_same_images() -> None:
+def test_a_caching_front_end_extracts_an_image_once() -> None:
     prepared: list[Tensor] = []
 
     class Counting(ORB):
@@ -116,7 +116,7 @@ def test_a_remembering_front_end_looks_once_at_the_same_images() -> None:
     assert len(prepared) == 3
 
 
-def test_a_front_end_that_knows_the_scene_makes_no_error() -> None:
+def test_an_exact_front_end_makes_no_error() -> None:
     walk = Walk(arc(10, length=1.0))
     pair = Pair.of(walk, 2, CPU)
     eyes = PairEyes(BentEyes(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_in(APART_S, walk)])
@@ -135,7 +135,7 @@ def result(rotations: list[float], inliers: float, positions: list[float]) -> Re
     return Result(pairs, torch.tensor(positions))
 
 
-def test_the_report_compares_what_both_could_pose() -> None:
+def test_the_report_compares_only_clips_that_both_posed() -> None:
     before = {"walk": result([0.002, 0.004, 0.008], 100, [0.01, 0.04])}
     after = {"walk": result([0.001, 0.002, math.nan], 80, [0.02, math.nan])}
     text = medians({"before": before, "after": after})

@@ -50,8 +50,8 @@ def disturbed(tracks: Tracks) -> Tracks:
     generator = torch.Generator().manual_seed(0)
     kind = torch.randint(KINDS, tracks.keypoints.shape[:2], generator=generator)
     shifts = SHIFT_PX * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64)
-    told = nn.functional.one_hot(kind, NUM_INPUTS).to(tracks.patches.dtype)
-    return replace(tracks, keypoints=tracks.keypoints + shifts[kind], patches=4 * told)
+    encoded = nn.functional.one_hot(kind, NUM_INPUTS).to(tracks.patches.dtype)
+    return replace(tracks, keypoints=tracks.keypoints + shifts[kind], patches=4 * encoded)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_tracks_of_an_exact_front_end_meet_in_points(tracks: Tracks) -> None:
     assert bool((tracks.seen.sum(-1)[tracks.seen.any(-1)] >= MIN_VIEWS).all())
 
 
-def test_what_is_drawn_is_seen_where_it_is_localized(tracks: Tracks) -> None:
+def test_sampled_points_are_visible_in_the_localized_frame(tracks: Tracks) -> None:
     settings = Settings(problems=5, tracks=12)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
@@ -104,7 +104,7 @@ def test_training_through_poses_lowers_the_pose_errors(tracks: Tracks) -> None:
     assert after < 0.5 * before
 
 
-def test_the_same_seed_learns_the_same(tracks: Tracks) -> None:
+def test_the_same_seed_trains_the_same_weights(tracks: Tracks) -> None:
     wrong, settings = disturbed(tracks), Settings(steps=3, problems=4)
     once, again = (train(SubPixel(nn.Identity()), wrong, settings, seed=1) for _ in range(2))
     assert once == again

@@ -8,7 +8,7 @@ from experiments.benchmarks.mapping import CAMERA, Walk
 from torchslam.geometry import passes_gate, transform
 
 
-def test_the_next_keyframes_see_old_points_and_new_ones_where_they_are() -> None:
+def test_the_next_keyframes_see_old_and_new_points() -> None:
     with torch.inference_mode():
         walk = Walk(12)
         slam_map = walk.submap.map

@@ -85,7 +85,7 @@ def test_training_lowers_the_loss_and_the_error_on_unseen_problems(problems: Pro
     assert median_error(Learned(network), unseen) < 0.8 * before
 
 
-def test_the_gradient_of_the_loss_is_that_of_finite_differences(
+def test_the_gradient_of_the_loss_agrees_with_finite_differences(
     problems: Problems, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(weighting, "ITERATIONS", 50)
@@ -132,7 +132,7 @@ def test_the_oracle_beats_ransac(problems: Problems) -> None:
     assert median_error(Oracle(), problems) < median_error(Ransac(6.0), problems)
 
 
-def test_the_table_tells_the_gain_against_the_best_competitor(problems: Problems) -> None:
+def test_the_table_shows_the_gain_over_the_best_competitor(problems: Problems) -> None:
     def at(centimeters: float) -> Tensor:
         T = problems.T_true.clone()
         T[:, 0, 3] += centimeters / 100
@@ -149,7 +149,7 @@ def test_the_table_tells_the_gain_against_the_best_competitor(problems: Problems
     assert "0.80 cm, 0.000°" in text
 
 
-def test_problems_survive_saving(problems: Problems, tmp_path: Path) -> None:
+def test_problems_round_trip_through_a_file(problems: Problems, tmp_path: Path) -> None:
     problems.save(tmp_path / "folder" / "problems.pt")
     loaded = Problems.load(tmp_path / "folder" / "problems.pt")
     assert torch.equal(loaded.points, problems.points)

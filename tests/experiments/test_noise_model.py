@@ -78,7 +78,7 @@ def image() -> Tensor:
     return torch.stack(rough).mean(0)
 
 
-def test_cues_are_finite_and_say_what_they_are_called(image: Tensor) -> None:
+def test_cues_are_finite_and_named(image: Tensor) -> None:
     orb = ORB(300)
     features = orb(image)
     cues = describe(orb, image, features)
@@ -97,14 +97,14 @@ def test_cues_are_finite_and_say_what_they_are_called(image: Tensor) -> None:
     )
 
 
-def test_structure_tensors_are_those_of_a_slope() -> None:
+def test_structure_tensors_of_a_slope_have_known_values() -> None:
     x, y = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="xy")
     torch.testing.assert_close(
         structure_tensors((3 * x - 2 * y)[None])[0], torch.tensor([[9.0, -6.0], [-6.0, 4.0]])
     )
 
 
-def test_powers_are_of_determinant_one_and_along_the_gradient() -> None:
+def test_matrix_powers_have_determinant_one_and_follow_the_gradient() -> None:
     A = torch.diag(torch.tensor([4.0, 1.0], dtype=torch.float64))
     for exponent in (0.0, 0.5, 2.0):
         found = powers(A, torch.tensor(exponent, dtype=torch.float64))
@@ -116,7 +116,7 @@ def test_powers_are_of_determinant_one_and_along_the_gradient() -> None:
     torch.testing.assert_close(round_, torch.eye(2, dtype=torch.float64))
 
 
-def test_the_likelihood_is_best_at_the_noise_that_there_is() -> None:
+def test_the_likelihood_is_highest_at_the_true_noise() -> None:
     errors = 0.25 * normal(0, 20000, 2)
     found = Residuals(
         errors,
@@ -129,13 +129,13 @@ def test_the_likelihood_is_best_at_the_noise_that_there_is() -> None:
     assert right < min(low, high)
 
 
-def test_residuals_are_as_large_as_the_noise_although_points_follow_it() -> None:
+def test_residuals_are_corrected_for_fitted_points() -> None:
     example = solved(simulated(1, sigma=0.3))
     found = residuals(example, example)
     assert float(found.errors.square().mean().sqrt()) == pytest.approx(0.3, rel=0.03)
 
 
-def test_a_dependence_on_cues_is_found_and_serves_the_graph() -> None:
+def test_a_dependence_on_cues_is_learned_and_improves_the_graph() -> None:
     model = fit_likelihood([simulated(seed, slope=1.0) for seed in (10, 20)], "isotropic", SMALL)
     values = torch.zeros(2, len(NAMES), dtype=torch.float64)
     values[1, 0] = 1.0
@@ -146,12 +146,12 @@ def test_a_dependence_on_cues_is_found_and_serves_the_graph() -> None:
     for seed in (30, 40, 50):
         example = simulated(seed, slope=1.0)
         with torch.no_grad():
-            plain, told = solve_graph(example.graph), solve_graph(weighed(example, model).graph)
-        better += float(position_error(example, told)) < float(position_error(example, plain))
+            plain, weighted = solve_graph(example.graph), solve_graph(weighed(example, model).graph)
+        better += float(position_error(example, weighted)) < float(position_error(example, plain))
     assert better >= 2
 
 
-def test_trajectories_move_the_model_downhill() -> None:
+def test_training_on_trajectories_lowers_the_loss() -> None:
     examples = [simulated(seed, slope=1.0) for seed in (60, 70)]
     start = NoiseModel("isotropic")
     torch.nn.init.constant_(start.level, math.log(8.0))
@@ -167,14 +167,14 @@ def test_trajectories_move_the_model_downhill() -> None:
     assert loss(moved) < loss(start)
 
 
-def test_without_truth_no_trajectory_teaches() -> None:
+def test_trajectories_without_ground_truth_are_an_error() -> None:
     example = simulated(0)
     untold = replace(example, known=torch.arange(FRAMES) < 3)
     with pytest.raises(ValueError, match="3 keyframes with true poses"):
         fit_trajectories(NoiseModel("isotropic"), [example, untold], SMALL)
 
 
-def test_keyframes_of_the_largest_world_stand_alone() -> None:
+def test_keyframes_of_the_largest_submap_are_extracted() -> None:
     graph = simulated(5).graph
     is_keyframe = torch.arange(FRAMES) % 2 == 0
     submap = (torch.arange(FRAMES) >= 8).to(torch.int64)
@@ -186,7 +186,7 @@ def test_keyframes_of_the_largest_world_stand_alone() -> None:
 
 
 @pytest.mark.parametrize("kind", ["constant", "isotropic", "directed"])
-def test_the_front_end_says_what_the_model_does(image: Tensor, tmp_path: Path, kind: str) -> None:
+def test_the_front_end_carries_the_models_information(image: Tensor, tmp_path: Path, kind: str) -> None:
     model = NoiseModel(kind, seed=3)
     torch.nn.init.constant_(model.level, math.log(8.0))
     torch.nn.init.constant_(model.line, 0.1)
@@ -201,7 +201,7 @@ def test_the_front_end_says_what_the_model_does(image: Tensor, tmp_path: Path, k
     torch.testing.assert_close(features.information[0], wanted.detach().float())
 
 
-def test_at_a_level_every_image_has_it() -> None:
+def test_every_image_has_the_given_noise_level() -> None:
     model = NoiseModel("isotropic")
     torch.nn.init.constant_(model.line, 0.3)
     values, of = normal(7, 90, len(NAMES)), torch.arange(90) // 30
@@ -216,7 +216,7 @@ def test_at_a_level_every_image_has_it() -> None:
         torch.testing.assert_close(found[rows] - found[rows].mean(), plain[rows] - plain[rows].mean())
 
 
-def test_intervals_are_those_of_student() -> None:
+def test_intervals_are_those_of_students_t() -> None:
     assert geometric_mean([0.0, 0.0, 0.0]) == "1.000 (1.000 to 1.000)"
     assert geometric_mean([math.log(0.9), math.log(1.1)]).startswith("0.995 (0.278 to ")
 

@@ -8,7 +8,7 @@ import torch
 from experiments.places.run import relative_scores
 
 
-def test_relative_scores() -> None:
+def test_scores_are_relative_to_the_best() -> None:
     keys, scores = torch.tensor([7, 3, 5]), torch.tensor([0.6, 0.4, 0.2])
     assert relative_scores(keys, scores, torch.tensor([5, 3])).tolist() == pytest.approx([1.5, 1.0, 0.5])
     assert relative_scores(keys, scores, torch.tensor([8])).tolist() == [0.0, 0.0, 0.0]

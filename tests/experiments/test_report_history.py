@@ -51,7 +51,7 @@ def record(commit: str = "a" * 40, load: float = 0.1, **changes: Any) -> Record:
     ],
     ids=str,
 )
-def test_a_tenth_is_seen_and_less_is_not(changes: dict[str, float], said: str) -> None:
+def test_a_change_of_a_tenth_is_reported(changes: dict[str, float], said: str) -> None:
     found = compare(record("b" * 40, **changes), [record()])
     assert len(found) == bool(said)
     if said:
@@ -59,7 +59,7 @@ def test_a_tenth_is_seen_and_less_is_not(changes: dict[str, float], said: str) -
         assert found[0].endswith("at aaaaaaaaaa of 2026-01-01 on one")
 
 
-def test_an_error_that_cannot_be_told_and_a_map_of_a_standstill_are_worse() -> None:
+def test_an_undefined_error_and_a_map_of_a_static_camera_are_regressions() -> None:
     new = record()
     del new["sequences"]["shelf"]["ate"]
     new["sequences"]["still"]["posed"] = 3
@@ -72,7 +72,7 @@ def test_an_error_that_cannot_be_told_and_a_map_of_a_standstill_are_worse() -> N
     ]
 
 
-def test_times_count_on_the_same_quiet_machine_alone() -> None:
+def test_times_are_compared_only_on_the_same_idle_machine() -> None:
     slow = record(cpu_s=20.0)
     assert len(compare(slow, [record()])) == 1
     assert not compare(slow, [record() | {"machine": "another"}])
@@ -82,7 +82,7 @@ def test_times_count_on_the_same_quiet_machine_alone() -> None:
     assert len(compare(slow, [record(), record(load=3.0), record() | {"machine": "another"}])) == 1
 
 
-def test_what_got_worse_comes_up_again_until_it_is_accepted() -> None:
+def test_a_regression_is_reported_until_it_is_accepted() -> None:
     bad = record("b" * 40, ate=0.004)
     bad["worse"] = compare(bad, [record()])
     again = record("c" * 40, ate=0.004)
@@ -93,7 +93,7 @@ def test_what_got_worse_comes_up_again_until_it_is_accepted() -> None:
     assert not [words for words in compare(other, [record(), other]) if words.startswith("still")]
 
 
-def test_bytes_and_what_is_missing_are_named() -> None:
+def test_changed_bytes_and_missing_rows_are_named() -> None:
     new = record(trajectory="f" * 16)
     assert same_bytes(new, [record()]) == {"shelf": False, "still": True}
     del new["sequences"]["still"]
@@ -111,7 +111,7 @@ def test_a_damaged_history_is_refused_with_its_line(tmp_path: Path) -> None:
         read_history(path)
 
 
-def test_a_row_has_the_figures_and_the_hash_of_the_bytes() -> None:
+def test_a_row_has_the_metrics_and_a_hash_of_the_trajectory() -> None:
     first, second = rows.run_row(ROOM), rows.run_row(f"{ROOM}&seed=3")
     assert first["frames"] == 8
     assert first["posed"] > 0

@@ -15,7 +15,7 @@ from torchslam.types import State, StepResult
 OURS = ["ours", "ours, one process"]
 
 
-def test_the_time_of_all_processes_counts() -> None:
+def test_the_time_of_all_processes_is_summed() -> None:
     spin = "import time; t = time.process_time()\nwhile time.process_time() < t + 0.3: pass"
     both = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {spin!r}]); {spin}\nprint('done')"
     said, seconds = run.with_cpu_time([sys.executable, "-c", both])
@@ -42,7 +42,9 @@ def test_missing_orb_slam3_is_reported(
     assert "ORB-SLAM3: skipped; set ORB_SLAM3_PYTHON" in capsys.readouterr().out
 
 
-def test_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_profile_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     times = [{"features": 20.0, "total": 20.0}, {"features": 10.0, "mapping": 30.0, "total": 40.0}]
     write_frames(
         tmp_path / "frames.csv",

@@ -20,7 +20,7 @@ def options(output: Path) -> argparse.Namespace:
     return parser.parse_args(["--output", str(output)])
 
 
-def test_rows_are_run_once_and_their_figures_come_with_times(
+def test_rows_are_run_once_and_have_metrics_and_times(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = [row_of(name, "short", overrides=SETTINGS) for name in available([ROOM, "nowhere at all"])]
@@ -41,7 +41,7 @@ def attempted(monkeypatch: pytest.MonkeyPatch, output: Path, *more: str) -> None
     trials.main()
 
 
-def test_a_trial_is_kept_and_one_without_frames_left_out(
+def test_a_trial_without_frames_is_skipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tries: list[list[str]] = []
@@ -62,7 +62,7 @@ def test_a_trial_is_kept_and_one_without_frames_left_out(
     assert tries == [[], [], ["seed=1"]]
 
 
-def test_a_trial_that_goes_wrong_ends_with_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_trial_ends_with_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def wrong(trial: object, settings: list[str]) -> None:
         raise AssertionError("no pose any more")
 
@@ -71,12 +71,12 @@ def test_a_trial_that_goes_wrong_ends_with_an_error(tmp_path: Path, monkeypatch:
         attempted(monkeypatch, tmp_path)
 
 
-def test_cases_come_back_in_their_order(tmp_path: Path) -> None:
-    told: list[int] = []
+def test_results_keep_the_order_of_the_cases(tmp_path: Path) -> None:
+    reported: list[int] = []
     found = run_cases(
         lambda case: {"twice": 2 * case["n"]},
         [{"n": n} for n in (2, 1)],
         options(tmp_path),
-        lambda columns: told.append(columns["twice"]),
+        lambda columns: reported.append(columns["twice"]),
     )
-    assert [columns["twice"] for columns in found] == told == [4, 2]
+    assert [columns["twice"] for columns in found] == reported == [4, 2]

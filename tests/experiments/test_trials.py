@@ -62,7 +62,7 @@ def test_extent_of_known_points() -> None:
 
 
 @pytest.mark.parametrize("share", [0, 5, 16])
-def test_the_similarity_is_that_of_the_majority(share: int) -> None:
+def test_the_alignment_follows_the_majority(share: int) -> None:
     truth = arc(N)
     given = similar(truth)[:, :3, 3]
     given[:share] += 5 * torch.randn(
@@ -73,7 +73,7 @@ def test_the_similarity_is_that_of_the_majority(share: int) -> None:
     torch.testing.assert_close(s * given[share:] @ R.mT + t, truth[share:, :3, 3])
 
 
-def test_a_similar_path_has_no_wrong_pose() -> None:
+def test_a_path_that_differs_by_a_similarity_has_no_wrong_pose() -> None:
     truth = arc(N)
     assert not wrong(similar(truth), truth, extent(truth[:, :3, 3])).any()
 
@@ -93,14 +93,14 @@ def test_a_pose_is_wrong_ten_degrees_beyond_the_median(degrees: float, is_wrong:
     assert bad.nonzero()[:, 0].tolist() == ([5] if is_wrong else [])
 
 
-def test_what_all_rotations_are_off_by_counts_for_none() -> None:
+def test_a_rotation_common_to_all_poses_is_no_error() -> None:
     truth = arc(N)
     given = truth.clone()
     given[:, :3, :3] = truth[:, :3, :3] @ so3_exp(torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64))
     assert not wrong(given, truth, 1.0).any()
 
 
-def test_a_camera_that_stands_for_long_is_judged_by_how_it_moves() -> None:
+def test_a_camera_at_rest_is_evaluated_by_its_motion() -> None:
     truth = torch.cat([arc(1).expand(3 * N, 4, 4), arc(N)])
     path = extent(truth[:, :3, 3])
     given = similar(truth)
@@ -111,7 +111,7 @@ def test_a_camera_that_stands_for_long_is_judged_by_how_it_moves() -> None:
     assert moves(truth[:, :3, 3], 1e-3 * path).tolist() == [0, *range(3 * N + 1, 4 * N)]
 
 
-def test_a_drift_is_shared_out_among_the_whole_path() -> None:
+def test_drift_is_distributed_over_the_whole_path() -> None:
     """The second half has another scale: fitted to one half alone, the other one's end is off by half the extent."""
     truth = arc(2 * N)
     path = extent(truth[:, :3, 3])
@@ -137,7 +137,7 @@ def walk_with(bad: range) -> tuple[Edited, dict[int, Tensor]]:
     return sequence, dict(enumerate(se3_inverse(similar(T_wc))))
 
 
-def test_wrong_frames_are_known_by_their_numbers_and_strangers_have_no_pose() -> None:
+def test_wrong_frames_are_listed_by_index_and_inserted_ones_have_no_pose() -> None:
     sequence, poses = walk_with(range(3, 6))
     assert outcome.wrong_frames(poses, sequence) == {3, 4, 5, *range(N - 5, N)}
     few = {index: poses[index] for index in (30, 10, 12, 25, 20, 4, 15)}
@@ -145,7 +145,7 @@ def test_wrong_frames_are_known_by_their_numbers_and_strangers_have_no_pose() ->
     assert outcome.wrong_frames({}, sequence) == set()
 
 
-def test_only_tracking_frames_of_the_main_world_mislead(
+def test_only_tracking_frames_of_the_main_submap_can_be_wrong(
     monkeypatch: pytest.MonkeyPatch, run: Run, results: list[StepResult]
 ) -> None:
     """Frames 0 to 2 are initializing, 3 to 17 tracking, 18 to 21 lost, 22 to 29 tracking."""
@@ -169,7 +169,7 @@ def test_final_poses_are_those_of_the_session(run: Run, trajectory: Trajectory) 
     assert outcome.final_poses(replace(run, session=1)) == {}
 
 
-def test_how_far_away_recalled_places_are() -> None:
+def test_the_distance_of_detected_loops() -> None:
     T_wc = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
     T_wc[2, :3, 3] = torch.tensor([0.3, 0.0, 0.4])
     T_wc[3, :3, :3] = so3_exp(torch.tensor([0.0, math.radians(20), 0.0], dtype=torch.float64))
@@ -187,7 +187,7 @@ def test_how_far_away_recalled_places_are() -> None:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_leave_images_of_the_cameras_size_and_poses_where_they_were(name: str) -> None:
+def test_faults_change_neither_image_size_nor_poses(name: str) -> None:
     whole, other = (
         open_sequence("synthetic:planar").part(0, 6),
         open_sequence("synthetic:rotation").part(0, 40),
@@ -202,7 +202,7 @@ def test_faults_leave_images_of_the_cameras_size_and_poses_where_they_were(name:
     assert same is (name in ("none", "kidnap", "drop3", "exposure_step"))
 
 
-def test_kidnapped_frames_have_no_pose_and_the_rest_goes_on() -> None:
+def test_kidnapped_frames_have_no_pose() -> None:
     walk = Walk(arc(10))
     made = FAULTS["kidnap"](walk, Walk(arc(50)))
     assert made.belongs.tolist() == [True] * 5 + [False] * 40 + [True] * 5
@@ -233,7 +233,7 @@ def test_light_noise_and_blur() -> None:
     assert edits.motion_blur(9)(dot, 7)[6, 10] > 15  # 91 degrees: along the column
 
 
-def test_an_occluder_comes_in_from_the_left_and_goes_round() -> None:
+def test_an_occluder_enters_from_the_left_and_circles() -> None:
     """A strip of 16 of 64 pixels; 80 pixels are its way."""
     texture = np.broadcast_to(np.arange(64, dtype=np.uint8), (48, 64))
     edit = edits.occluder(texture, 0.25, 4)
@@ -244,7 +244,7 @@ def test_an_occluder_comes_in_from_the_left_and_goes_round() -> None:
     assert (edit(blank, 21) == edit(blank, 1)).all()
 
 
-def test_marks_lie_where_they_should() -> None:
+def test_watermarks_lie_at_their_position() -> None:
     blank = np.full((480, 640), 128, np.uint8)
     small = edits.small_logo()(blank, 0) != 128
     assert small[8:40, 8:72].all() | (edits.logo((64, 32)) == 128).any()
@@ -282,7 +282,7 @@ def test_halved_cameras_see_points_at_the_middle_of_four_pixels() -> None:
     assert (fitted(np.kron(GRAY, np.ones((2, 2), np.uint8)), SIZE) == GRAY).all()
 
 
-def test_a_turned_image_is_what_the_turned_camera_sees() -> None:
+def test_a_rotated_image_is_that_of_the_rotated_camera() -> None:
     room = open_sequence("synthetic:room?noise=0&blur=0")
     camera, first = room.camera, room.pose(0)
     assert first is not None
@@ -291,7 +291,7 @@ def test_a_turned_image_is_what_the_turned_camera_sees() -> None:
     T_cw = rigid(R, torch.zeros(3, dtype=torch.float64)) @ first
     shot = Shot(room, 0, edits.turned(camera, angle), T_cw)
     image = Edited("turned", camera, [shot]).image(0)[0, 0]
-    # A point of the world in the first image, and where the pose says that it is in the second one.
+    # A scene point in the first image, and its projection by the pose in the second one.
     pixels = torch.tensor([[300.0, 200.0], [340.0, 260.0], [320.0, 300.0]], dtype=torch.float64)
     points_w = transform(se3_inverse(first), 3 * camera.unproject(pixels))
     moved, _ = camera.project(transform(T_cw, points_w))
@@ -306,7 +306,7 @@ def test_a_turned_image_is_what_the_turned_camera_sees() -> None:
 # --- trials --------------------------------------------------------------------------------------------------
 
 
-def test_a_round_comes_back_to_where_it_began() -> None:
+def test_a_round_trip_ends_at_its_start() -> None:
     whole = Round.shots()
     first, again = whole.pose(0), whole.pose(120)
     assert first is not None
@@ -316,7 +316,7 @@ def test_a_round_comes_back_to_where_it_began() -> None:
     torch.testing.assert_close(forward, torch.tensor([1.0, 0, 0], dtype=torch.float64))  # outwards
 
 
-def test_patterns_choose_trials_in_their_order() -> None:
+def test_patterns_select_trials_in_order() -> None:
     assert chosen([]) == list(TRIALS)
     assert chosen(["plain/shelf_bin", "plain/kitti07"]) == ["plain/kitti07", "plain/shelf_bin"]
     assert len(chosen(["*/machine_hall"])) == 3 + len(FAULTS)
@@ -324,7 +324,7 @@ def test_patterns_choose_trials_in_their_order() -> None:
         chosen(["nothing/here"])
 
 
-def test_the_table_keeps_what_was_run_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_table_keeps_earlier_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     readme = tmp_path / "README.md"
     readme.write_text("above\n<!-- table -->\n<!-- end -->\nbelow\n")
     monkeypatch.setattr("experiments.trials.run.README", readme)
@@ -334,21 +334,21 @@ def test_the_table_keeps_what_was_run_before(tmp_path: Path, monkeypatch: pytest
     write({"loop/open": cells("loop/open", result, "m")})
     write(rows_in(readme.read_text()) | {"loop/closed": cells("loop/closed", result, "")})
     rows = rows_in(readme.read_text())
-    told = ["90 of 100, and 2 strays", "92 + 8", "0.5000 m", "1 (1.0%)", "T92 L8", "none", "3, 21"]
-    assert rows["loop/open"] == ["loop/open", *told]
+    columns = ["90 of 100, and 2 strays", "92 + 8", "0.5000 m", "1 (1.0%)", "T92 L8", "none", "3, 21"]
+    assert rows["loop/open"] == ["loop/open", *columns]
     assert rows["loop/closed"][3] == "25.00% of the extent"
     assert NOT_RUN in readme.read_text()
     assert readme.read_text().startswith("above\n")
     assert len(HEADER) == 8
 
 
-def test_states_in_short() -> None:
+def test_states_are_abbreviated() -> None:
     states = [State.INITIALIZING, State.INITIALIZING, State.TRACKING, State.UNCERTAIN, State.LOST]
     assert states_in_short(states) == "i2 T1 U1 L1"
     assert states_in_short([State.TRACKING, State.LOST] * 5) == "T1 L1 T1 L1 T1 L1 T1 L1 …"
 
 
-def test_a_turning_start_has_the_poses_of_the_turn(data_dir: Path) -> None:
+def test_a_rotating_start_has_the_poses_of_the_rotation(data_dir: Path) -> None:
     made = turning("shelf_bin")
     assert len(made) == 110
     start, furthest_turn = made.pose(0), made.pose(15)
@@ -357,7 +357,7 @@ def test_a_turning_start_has_the_poses_of_the_turn(data_dir: Path) -> None:
     assert torch.equal(made.image(0), made.image(60))
 
 
-def test_the_drone_has_the_poses_that_there_are(data_dir: Path) -> None:
+def test_the_drone_sequence_has_the_available_poses(data_dir: Path) -> None:
     made = drone()
     known = [index for index in range(len(made)) if made.pose(index) is not None]
     assert known == list(range(0, 567, 14))
@@ -369,7 +369,7 @@ def short_round() -> Edited:
     return Edited("round", whole.camera, shots(whole, range(len(whole))))
 
 
-def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_resumes_from_its_last_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outcome, "after_the_cut", partial(outcome.after_the_cut, every=1))
     few = (*SETTINGS, "features.num_keypoints=250", "simulated.points_per_view=150")
     whole, undisturbed = outcome.perform(Trial(short_round, few))
@@ -379,7 +379,7 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(monkeypatch: pyte
     assert len(run.results) == 30
 
 
-def test_what_nobody_knows_the_truth_of_is_told_without_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_without_ground_truth_has_no_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     made = Edited("round", Round(3).camera, [Shot(Round(3), index) for index in range(3)])
     result, _ = outcome.perform(Trial(lambda: made))
     assert (result.ate, result.misled, result.loop_closures, result.posed, result.possible) == (

@@ -27,21 +27,21 @@ def outcomes_with(ratio: float, posed: float = 1.0) -> Outcomes:
     return found
 
 
-def test_ratios_are_those_of_errors_whatever_their_size() -> None:
+def test_ratios_do_not_depend_on_the_size_of_the_errors() -> None:
     outcomes = outcomes_with(0.8)
     ratios = {label: log_ratios(outcomes, label, "other") for label in ("kitti07", "shelf_bin")}
     assert geometric_mean(ratios) == pytest.approx(0.8)
     assert "**0.80** (0.80 to 0.80)" in report(outcomes, ["default", "other"])
 
 
-def test_what_poses_less_is_not_compared() -> None:
+def test_runs_with_fewer_poses_are_not_compared() -> None:
     assert log_ratios(outcomes_with(0.8, posed=0.85), "shelf_bin", "other") == {}
     lost = outcomes_with(0.8) | {("shelf_bin", "other", 1): Outcome(1.0, None)}
     assert set(log_ratios(lost, "shelf_bin", "other")) == {0, 2}
     assert "not compared" in report(outcomes_with(0.8, posed=0.5), ["default", "other"])
 
 
-def test_an_interval_draws_recordings_of_the_same_images_together() -> None:
+def test_the_bootstrap_resamples_recordings_of_the_same_images_together() -> None:
     ratios = {"a": {0: math.log(0.5)}, "a2": {0: math.log(0.5)}, "b": {0: math.log(2.0)}}
     low, high = interval(ratios, {"a": "a", "a2": "a", "b": "b"})
     assert low == pytest.approx(0.5)
@@ -51,19 +51,21 @@ def test_an_interval_draws_recordings_of_the_same_images_together() -> None:
     assert report(alone, ["default", "other"]).splitlines()[-1].endswith("| **0.80** |")
 
 
-def test_cached_features_are_those_of_the_front_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_features_equal_those_of_the_front_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cached_features, "FOLDER", tmp_path)
     image = open_sequence(ROOM).image(0)
     cached_run, own = cached_features.ORB(200), ORB(200)(image)
     first = cached_run(image)
-    monkeypatch.setattr(cached_run, "front_end", None)  # it is not asked again
+    monkeypatch.setattr(cached_run, "front_end", None)  # it is not called again
     for found in (first, cached_run(image)):
         for name, values in vars(own).items():
             assert values is None or torch.equal(getattr(found, name), values), name
     assert len(list(tmp_path.rglob("*.pt"))) == 1
 
 
-def test_without_ratio_test_what_is_hard_to_tell_apart_matches_too() -> None:
+def test_without_the_ratio_test_ambiguous_keypoints_match() -> None:
     def view(*angles: float) -> FrameFeatures:
         turned = torch.tensor(angles, dtype=torch.float64)
         described = torch.stack([turned.cos(), turned.sin()], -1).float()

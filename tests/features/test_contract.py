@@ -24,7 +24,7 @@ def image() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("kind", ["orb", "opencv-orb"])
-def test_nothing_under_the_mask_and_the_budget_elsewhere(image: torch.Tensor, kind: str) -> None:
+def test_masked_areas_have_no_keypoints_and_the_budget_goes_elsewhere(image: torch.Tensor, kind: str) -> None:
     front_end, wanted = extractor(kind, 300), LEFT.expand(image.shape)
     free, masked = front_end(image), front_end(image, wanted)
     assert bool((free.keypoints[free.mask][:, 0] > 330).any())
@@ -46,7 +46,7 @@ def test_each_image_of_a_batch_has_its_own_mask(image: torch.Tensor) -> None:
         assert torch.equal(both.descriptors[row], alone.descriptors[0])
 
 
-def test_nothing_wanted(image: torch.Tensor) -> None:
+def test_a_mask_that_excludes_everything_gives_no_keypoints(image: torch.Tensor) -> None:
     assert not ORB(100)(image, torch.zeros_like(image, dtype=torch.bool)).mask.any()
 
 
@@ -60,7 +60,7 @@ def test_front_end_passes_the_mask_on(image: torch.Tensor) -> None:
         check_size(replace(frame, mask=wanted[..., :100]), camera)
 
 
-def test_only_where() -> None:
+def test_keypoints_outside_the_mask_are_removed() -> None:
     keypoints = torch.tensor([[[0.4, 0.0], [1.0, 0.6], [2.6, 1.4], [-3.0, 9.0], [0.0, 0.0]]])
     mask = torch.tensor([[True, True, True, True, False]])
     features = Features(keypoints, mask * 1.0, mask * 1.0, mask * 0.0, torch.zeros(1, 5, 32), mask)
@@ -69,6 +69,6 @@ def test_only_where() -> None:
 
 
 @pytest.mark.parametrize("wrong", [torch.ones(1, 1, 4, 4), torch.ones(1, 1, 8, 4, dtype=torch.bool)])
-def test_wrong_masks(wrong: torch.Tensor) -> None:
+def test_invalid_masks_are_rejected(wrong: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="a mask must be bool"):
         ORB(10)(torch.zeros(1, 1, 8, 8), wrong)

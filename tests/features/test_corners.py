@@ -39,7 +39,7 @@ def test_scores_are_the_best_arc_of_nine(height: int, width: int, seed: int) -> 
             assert scores[y, x] == expected
 
 
-def test_chunks_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunking_does_not_change_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     pixels = torch.from_numpy(noise(40, 50, 3)).flatten()
     floor = torch.full_like(pixels, 10)
     scores, blurred = fast_scores(pixels, 50), brief.blur(pixels, 50)
@@ -52,7 +52,7 @@ def test_chunks_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("height", [12, 40])
-def test_numpy_makes_no_difference(monkeypatch: pytest.MonkeyPatch, height: int) -> None:
+def test_the_numpy_backend_gives_the_same_scores(monkeypatch: pytest.MonkeyPatch, height: int) -> None:
     pixels, floor = torch.from_numpy(noise(height, 50, 4)).flatten(), torch.full((50 * height,), 10).byte()
     scores = fast_scores(pixels, 50)
     found = scores, find_peaks(scores, floor, 50), brief.blur(pixels, 50)
@@ -66,7 +66,9 @@ def test_numpy_makes_no_difference(monkeypatch: pytest.MonkeyPatch, height: int)
 
 
 @pytest.mark.parametrize("by_numpy", [True, False])
-def test_bands_hold_what_they_hold_in_the_whole(monkeypatch: pytest.MonkeyPatch, by_numpy: bool) -> None:
+def test_scores_in_bands_equal_those_of_the_whole_image(
+    monkeypatch: pytest.MonkeyPatch, by_numpy: bool
+) -> None:
     pixels, floor = torch.from_numpy(noise(40, 50, 5)).flatten(), torch.full((2000,), 255).byte()
     bands = ((0, 300), (500, 900), (1700, 2000))
     for start, stop in bands:
@@ -82,7 +84,7 @@ def test_bands_hold_what_they_hold_in_the_whole(monkeypatch: pytest.MonkeyPatch,
     assert find_peaks(scores, floor, 50, ()).tolist() == []
 
 
-def test_corners_are_those_of_opencv() -> None:
+def test_corners_agree_with_opencv() -> None:
     image = cv2.GaussianBlur(noise(120, 160, 1), (0, 0), 1.5)
     detector = cv2.FastFeatureDetector.create(20, nonmaxSuppression=False)
     expected = {(round(p.pt[0]), round(p.pt[1])) for p in detector.detect(image)}
@@ -133,7 +135,7 @@ def test_peaks_exceed_the_floor() -> None:
 
 @given(st.integers(0, 50), st.integers(0, 2000), st.integers(1, 400))
 @settings(max_examples=50, deadline=None)
-def test_chunks_make_up_the_whole(start: int, count: int, most: int) -> None:
+def test_chunks_cover_the_image(start: int, count: int, most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(corners, "CHUNK_PIXELS", most)
         parts = corners.chunks(np.zeros(0), start, start + count)
@@ -144,7 +146,7 @@ def test_chunks_make_up_the_whole(start: int, count: int, most: int) -> None:
     assert len(parts) == -(-count // most)
 
 
-def test_elsewhere_than_on_the_host_there_is_one_chunk() -> None:
+def test_accelerators_use_one_chunk() -> None:
     assert corners.chunks(torch.zeros(0), 3, 10**6) == [(3, 10**6 - 3)]
 
 
@@ -162,7 +164,7 @@ def test_patches_are_cut_around_their_positions() -> None:
     assert torch.equal(patches[1], image[3:8, 3:8])
 
 
-def test_harris_is_that_of_opencv() -> None:
+def test_harris_agrees_with_opencv() -> None:
     image = np.random.default_rng(0).integers(0, 256, (11, 11), dtype=np.uint8)
     expected = cv2.cornerHarris(image.astype(np.float32), 7, 3, 0.04)[4:7, 4:7]
     ours = harris_responses(torch.from_numpy(image)[None].double())[0]
@@ -200,7 +202,7 @@ def test_soft_peak_leans_towards_the_maximum(x: float, y: float) -> None:
     assert torch.equal(offset.sign(), torch.tensor([x, y], dtype=torch.float64).sign()) or x == 0
 
 
-def test_soft_peak_of_nothing_is_the_center() -> None:
+def test_soft_peak_of_equal_scores_is_the_center() -> None:
     assert soft_peak(torch.zeros(2, 3, 3)).abs().max() < 1e-6
 
 

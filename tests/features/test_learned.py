@@ -26,7 +26,7 @@ def weights(file: str) -> Path:
 
 
 @NETWORKS
-def test_fields_have_the_promised_shapes(name: str, file: str, width: int) -> None:
+def test_fields_have_the_documented_shapes(name: str, file: str, width: int) -> None:
     network = extractor(name, 100, weights(file))
     with torch.no_grad():
         features = network(torch.cat([scene(150, 200), torch.zeros(1, 1, 150, 200)]))
@@ -67,7 +67,7 @@ def test_gradients_reach_the_weights(name: str, file: str, width: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [XFeat, ALIKED])
-def test_weights_that_cannot_be_used_are_named(kind: type, tmp_path: Path) -> None:
+def test_unusable_weights_are_rejected_by_name(kind: type, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="absent"):
         kind(tmp_path / "absent.safetensors")
     (tmp_path / "broken.safetensors").write_bytes(b"no tensors here")

@@ -54,7 +54,7 @@ def element(features: Features, index: int) -> Features:
 
 
 @EXTRACTORS
-def test_fields_have_the_promised_shapes(kind: type[nn.Module], dtype: torch.dtype) -> None:
+def test_fields_have_the_documented_shapes(kind: type[nn.Module], dtype: torch.dtype) -> None:
     features = kind(num_keypoints=150)(scene(200, 260).to(dtype).expand(2, 1, -1, -1))
     assert features.keypoints.shape == (2, 150, 2)
     assert features.descriptors.shape == (2, 150, 32)
@@ -93,7 +93,7 @@ def test_a_batch_equals_a_loop(kind: type[nn.Module]) -> None:
 
 @EXTRACTORS
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (30, 30), (41, 39), (77, 131), (39, 300)])
-def test_any_size_is_welcome(kind: type[nn.Module], size: tuple[int, int]) -> None:
+def test_any_image_size_is_accepted(kind: type[nn.Module], size: tuple[int, int]) -> None:
     generator = torch.Generator().manual_seed(0)
     features = kind(num_keypoints=50)(torch.rand(2, 1, *size, generator=generator))
     assert features.mask.shape == (2, 50)
@@ -112,7 +112,7 @@ def test_noise_and_blank_images(kind: type[nn.Module]) -> None:
 @pytest.mark.parametrize(
     "images", [torch.rand(1, 3, 64, 64), torch.rand(64, 64), torch.zeros(1, 1, 64, 64).byte()]
 )
-def test_images_of_another_kind_are_refused(kind: type[nn.Module], images: Tensor) -> None:
+def test_unsupported_images_are_refused(kind: type[nn.Module], images: Tensor) -> None:
     with pytest.raises(ValueError, match="images must be"):
         kind()(images)
 
@@ -128,14 +128,14 @@ def test_images_of_another_kind_are_refused(kind: type[nn.Module], images: Tenso
         {"ranking": "best"},
     ],
 )
-def test_senseless_options_are_refused(options: dict) -> None:
+def test_invalid_options_are_refused(options: dict) -> None:
     with pytest.raises(ValueError, match=r"ORB needs|ranking"):
         ORB(**options)
 
 
 @EXTRACTORS
 @pytest.mark.parametrize("scale", [1.0, 1.44, 2.0])
-def test_corners_of_a_square_are_found_at_their_place(kind: type[nn.Module], scale: float) -> None:
+def test_corners_of_a_square_are_detected_at_their_positions(kind: type[nn.Module], scale: float) -> None:
     """The square's corners, drawn with exact coverage of pixels, at every level that sees them."""
     edge = np.array([80.25, 160.75])  # in the image's pixels, so that pixels on the edge are partly covered
     cover = [
@@ -204,19 +204,19 @@ def test_a_dim_half_has_keypoints_too() -> None:
 
 
 @pytest.mark.parametrize("ranking", ["fast", "harris"])
-def test_an_image_of_weak_texture_has_as_many_keypoints(ranking: str) -> None:
+def test_an_image_of_weak_texture_has_the_full_number_of_keypoints(ranking: str) -> None:
     bright = scene(240, 320)
     dim = (bright - 0.5) * 0.12 + 0.5  # no corner exceeds the threshold of 20
     orb = ORB(num_keypoints=300, ranking=ranking)
     features = orb(torch.cat([bright, dim]))
     assert features.mask.sum(1).tolist() == [300, 300]
-    assert same(element(features, 1), orb(dim))  # whatever stands beside it
+    assert same(element(features, 1), orb(dim))  # whatever else the batch holds
     assert same(element(features, 0), orb(bright))
     near = distances(features.keypoints[0], features.keypoints[1]).amin(0)
     assert float((near < 1).double().mean()) > 0.7
 
 
-def test_faint_corners_count_where_there_are_hardly_others() -> None:
+def test_weak_corners_are_used_where_there_are_hardly_others() -> None:
     bright = scene(240, 320)
     faint = (bright - 0.5) * 0.06 + 0.5  # fifteen gray values from black to white
     orb = ORB(num_keypoints=300)
@@ -234,7 +234,7 @@ def test_faint_corners_count_where_there_are_hardly_others() -> None:
     fainter = (bright - 0.5) * 0.05 + 0.5
     assert (
         int(ORB(num_keypoints=300, low_threshold=3)(fainter).mask.sum()) == 300
-    )  # who asks for fainter ones has them
+    )  # a lower threshold finds them
     assert int(orb(fainter).mask.sum()) < 150
 
 
@@ -267,7 +267,7 @@ def test_the_batch_leaves_no_gradient_by_default() -> None:
 
 
 @pytest.mark.parametrize("ranking", ["fast", "harris"])
-def test_keypoints_and_scores_carry_right_gradients(ranking: str) -> None:
+def test_keypoints_and_scores_pass_gradcheck(ranking: str) -> None:
     image = scene(80, 90, 6).double()
     extract = ORB(num_keypoints=8, num_levels=2, ranking=ranking, differentiable=True)
     image = image + 1e-3 * torch.rand(
@@ -308,7 +308,7 @@ def test_orb_runs_on_the_device(device: torch.device) -> None:
     assert (apart < 0.01).double().mean() > 0.95
 
 
-def test_opencv_orb_is_opencvs() -> None:
+def test_the_opencv_extractor_equals_opencv() -> None:
     image = scene(200, 260, 10)
     features = OpenCVORB(num_keypoints=100)(image)
     array = (image[0, 0] * 255).round().to(torch.uint8).numpy()
@@ -343,13 +343,13 @@ def test_descriptor_compares_the_pattern_on_the_blurred_image() -> None:
 
 
 @pytest.mark.parametrize(("name", "kind"), [("orb", ORB), ("opencv-orb", OpenCVORB)])
-def test_extractor_by_name(name: str, kind: Callable) -> None:
+def test_an_extractor_is_created_by_name(name: str, kind: Callable) -> None:
     module = extractor(name, 77)
     assert isinstance(module, kind)
     assert module.num_keypoints == 77
 
 
-def test_unknown_extractor_names_the_known() -> None:
+def test_an_unknown_extractor_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"opencv-orb.*xfeat"):
         extractor("surf")
 

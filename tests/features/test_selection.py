@@ -38,7 +38,7 @@ def test_atlas_levels_do_not_overlap() -> None:
     assert taken.sum() == sum(h * w for h, w in pyramid.sizes)
 
 
-def test_grid_shares_the_budget_and_leaves_the_border() -> None:
+def test_the_budget_is_split_over_the_grid_without_the_border() -> None:
     pyramid = plan_pyramid(240, 320, 1.2, 8)
     grid = plan_grid(pyramid, 500, 8, 19, 7, CPU)
     assert int(grid.budgets.sum()) == 500
@@ -49,14 +49,14 @@ def test_grid_shares_the_budget_and_leaves_the_border() -> None:
     assert set(grid.floor.tolist()) == {7, 255}
 
 
-def test_levels_without_room_get_no_budget() -> None:
+def test_levels_that_are_too_small_get_no_budget() -> None:
     grid = plan_grid(plan_pyramid(60, 60, 1.2, 8), 100, 8, 19, 7, CPU)
     assert grid.budgets.tolist()[-1] == 0
     assert int(grid.budgets.sum()) == 100
     assert int(plan_grid(plan_pyramid(20, 20, 1.2, 8), 100, 8, 19, 7, CPU).budgets.sum()) == 0
 
 
-def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
+def test_the_best_of_each_cell_is_selected_first() -> None:
     pyramid = plan_pyramid(100, 100, 1.2, 1)
     grid = plan_grid(pyramid, 4, 1, 19, 7, CPU)
     assert len(grid.levels) == 4
@@ -72,14 +72,14 @@ def test_spread_takes_the_best_of_each_cell_before_the_rest() -> None:
 
 
 @given(st.lists(st.floats(-4, 4, width=32) | st.sampled_from([0.0, -0.0, 1.0]), max_size=40))
-def test_falling_order_is_that_of_a_stable_sort(values: list[float]) -> None:
+def test_descending_order_equals_a_stable_sort(values: list[float]) -> None:
     scores = torch.tensor(values, dtype=torch.float32)
     expected = torch.argsort(scores, descending=True, stable=True)
     assert torch.equal(_falling(scores), expected)
     assert torch.equal(_falling(scores.double()), expected)
 
 
-def test_spread_gives_unused_budget_to_other_levels() -> None:
+def test_unused_budget_goes_to_other_levels() -> None:
     pyramid = plan_pyramid(100, 100, 1.2, 2)
     grid = plan_grid(pyramid, 10, 2, 19, 7, CPU)
     level_1 = int((grid.levels == 1).nonzero()[0])
@@ -91,9 +91,7 @@ def test_spread_gives_unused_budget_to_other_levels() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 90), st.integers(1, 400), st.integers(1, 2), st.integers(1, 40))
-def test_whoever_contends_not_is_not_chosen(
-    seed: int, count: int, corners: int, batch: int, most: int
-) -> None:
+def test_non_candidates_are_not_selected(seed: int, count: int, corners: int, batch: int, most: int) -> None:
     draw = torch.Generator().manual_seed(seed)
     grid = plan_grid(plan_pyramid(120, 160, 1.2, 4), count, 8, 19, 7, CPU)
     num_cells = grid.levels.shape[0]
@@ -114,7 +112,7 @@ def test_whoever_contends_not_is_not_chosen(
     assert results[0] == results[1]
 
 
-def test_few_contend_where_many_are_equal() -> None:
+def test_candidates_are_bounded_where_many_scores_are_equal() -> None:
     grid = plan_grid(plan_pyramid(480, 640, 1.2, 8), 500, 8, 19, 7, CPU)
     cells = torch.randint(0, grid.levels.shape[0], (20_000,), generator=torch.Generator().manual_seed(0))
     fast = (torch.arange(20_000) % 200 + 30).to(torch.uint8)

@@ -39,19 +39,19 @@ def test_without_noise_keypoints_are_projections_of_points(camera: Camera, T_cw:
     assert torch.allclose(features.keypoints[0][found], pixels)
 
 
-def test_every_view_holds_enough_points(camera: Camera, T_cw: Tensor) -> None:
+def test_every_frame_sees_enough_points(camera: Camera, T_cw: Tensor) -> None:
     simulated = SimulatedFeatures(T_cw, camera, points_per_view=150)
     assert min(int(simulated(pose, i).mask.sum()) for i, pose in enumerate(T_cw)) >= 150
 
 
-def test_a_frame_is_the_same_whenever_it_is_asked_for(camera: Camera, T_cw: Tensor) -> None:
+def test_a_frame_does_not_depend_on_the_order_of_requests(camera: Camera, T_cw: Tensor) -> None:
     one = SimulatedFeatures(T_cw, camera, noise_px=0.5, outliers=0.1, dropout=0.1, seed=3)
     other = SimulatedFeatures(T_cw, camera, noise_px=0.5, outliers=0.1, dropout=0.1, seed=3)
     other(T_cw[0], 0)
     assert torch.equal(one(T_cw[5], 5).keypoints, other(T_cw[5], 5).keypoints)
 
 
-def test_noise_outliers_and_dropout_are_as_asked_for(camera: Camera, T_cw: Tensor) -> None:
+def test_noise_outliers_and_dropout_have_the_configured_rates(camera: Camera, T_cw: Tensor) -> None:
     simulated = SimulatedFeatures(
         T_cw, camera, num_keypoints=2000, points_per_view=1000, noise_px=0.5, outliers=0.1, dropout=0.2
     )
@@ -78,7 +78,7 @@ def test_points_lie_within_the_depth_range_of_some_view(camera: Camera, T_cw: Te
     assert (((depths >= near * 0.999) & (depths <= far * 1.001)).any(0)).all()
 
 
-def test_a_camera_at_rest_sees_points_too(camera: Camera) -> None:
+def test_a_static_camera_sees_points(camera: Camera) -> None:
     still = torch.eye(4, dtype=torch.float64).expand(5, 4, 4)
     assert int(SimulatedFeatures(still, camera)(still[0], 0).mask.sum()) >= 400
 
@@ -86,7 +86,7 @@ def test_a_camera_at_rest_sees_points_too(camera: Camera) -> None:
 SIZED = {"num_keypoints": 1000, "points_per_view": 400, "scales": True}
 
 
-def test_a_keypoint_is_as_large_as_its_point_at_that_depth(camera: Camera, T_cw: Tensor) -> None:
+def test_keypoint_size_follows_from_point_size_and_depth(camera: Camera, T_cw: Tensor) -> None:
     simulated = SimulatedFeatures(T_cw, camera, **SIZED)
     seen = []
     for index, pose in enumerate(T_cw):

@@ -1,6 +1,6 @@
 """All wrong inputs, each in a process that can be ended: python -m tests.fuzz [--inputs 30000] [--only READER[:NUMBER]]
 
-A process that hangs, dies or asks for more memory than it may have is counted with the rest. Exit status 1 where an
+A process that hangs, dies or exceeds its memory limit is counted with the rest. Exit status 1 where an
 input was not read or refused as it should be.
 """
 
@@ -32,7 +32,7 @@ LOOK = 1.0
 """Seconds from one look at its use of the processor to the next."""
 TICKS = os.sysconf("SC_CLK_TCK")
 ROOM = 3 * MEGABYTES << 20
-"""Bytes of addresses that a process may have beside those of the libraries."""
+"""Address space in bytes that a process may use in addition to the libraries."""
 GOOD = ("read", "refused")
 
 

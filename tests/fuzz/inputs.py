@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from tests.fuzz import goods
+from tests.fuzz import valid_inputs
 from tests.fuzz.mutators import Mutated, mutate, write
 from tests.fuzz.readers import Reader
 from torchslam.errors import TorchslamError
@@ -45,14 +45,14 @@ class Outcome:
 
 
 def mutated(reader: Reader, number: int) -> Mutated:
-    """The input of a number: the same whenever it is asked for."""
+    """Return the input of a number; it depends on the number alone."""
     rng = random.Random(f"{reader.name} {number}")
     files = dict(reader.files)
     if "argument" in files:
-        examples = goods.OVERRIDES if reader.name == "--set" else goods.CAMERA_ARGUMENTS
+        examples = valid_inputs.OVERRIDES if reader.name == "--set" else valid_inputs.CAMERA_ARGUMENTS
         files["argument"] = rng.choice(examples).encode()
     elif reader.name == "frame arguments":
-        return {**files, **mutate({"argument": rng.choice(goods.FRAME_ARGUMENTS).encode()}, rng)}
+        return {**files, **mutate({"argument": rng.choice(valid_inputs.FRAME_ARGUMENTS).encode()}, rng)}
     return mutate(files, rng)
 
 

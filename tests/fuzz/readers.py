@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from tests.fuzz import goods
+from tests.fuzz import valid_inputs
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
@@ -65,19 +65,21 @@ class Reader:
 def readers() -> dict[str, Reader]:
     """All of them by name."""
     found = [
-        Reader("tum", goods.tum, _sequence, 2200),
-        Reader("euroc", goods.euroc, _sequence, 1700),
-        Reader("kitti", goods.kitti, _sequence, 1700),
-        Reader("kitti raw", goods.kitti_raw, partial(_sequence, name="drive_sync"), 1700),
-        Reader("7-scenes", goods.seven_scenes, partial(_sequence, camera=CAMERA), 1000),
-        Reader("tartanair", goods.tartanair, partial(_sequence, camera=CAMERA), 1000),
-        Reader("icl-nuim", goods.icl_nuim, partial(_sequence, camera=CAMERA), 800),
-        Reader("folder", goods.folder, _sequence, 1000),
-        Reader("masks", goods.masked, partial(_sequence, name="frames", camera=CAMERA, mask="masks"), 700),
-        Reader("zip", goods.zipped, partial(_sequence, name="desk.zip"), 2500),
+        Reader("tum", valid_inputs.tum, _sequence, 2200),
+        Reader("euroc", valid_inputs.euroc, _sequence, 1700),
+        Reader("kitti", valid_inputs.kitti, _sequence, 1700),
+        Reader("kitti raw", valid_inputs.kitti_raw, partial(_sequence, name="drive_sync"), 1700),
+        Reader("7-scenes", valid_inputs.seven_scenes, partial(_sequence, camera=CAMERA), 1000),
+        Reader("tartanair", valid_inputs.tartanair, partial(_sequence, camera=CAMERA), 1000),
+        Reader("icl-nuim", valid_inputs.icl_nuim, partial(_sequence, camera=CAMERA), 800),
+        Reader("folder", valid_inputs.folder, _sequence, 1000),
+        Reader(
+            "masks", valid_inputs.masked, partial(_sequence, name="frames", camera=CAMERA, mask="masks"), 700
+        ),
+        Reader("zip", valid_inputs.zipped, partial(_sequence, name="desk.zip"), 2500),
         Reader("camera argument", lambda: {"argument": b""}, _camera_argument, 700),
-        Reader("frame arguments", goods.folder, _frame_arguments, 700),
-        Reader("trajectory", lambda: {"t.txt": goods.trajectory_text(6).encode()}, _trajectory, 1000),
+        Reader("frame arguments", valid_inputs.folder, _frame_arguments, 700),
+        Reader("trajectory", lambda: {"t.txt": valid_inputs.trajectory_text(6).encode()}, _trajectory, 1000),
         Reader("colmap binary", partial(_some, "colmap", "cameras.bin", "images.bin"), read_poses, 600),
         Reader("colmap text", partial(_some, "colmap", "cameras.txt", "images.txt"), read_poses, 600),
         Reader("transforms.json", partial(_some, "transforms", "transforms.json"), read_poses, 900),
@@ -88,22 +90,31 @@ def readers() -> dict[str, Reader]:
         Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
         Reader("--set", lambda: {"argument": b""}, _override, 800),
-        Reader("command line", goods.tum, _command, 300),
-        Reader("batch csv", lambda: {"l.csv": goods.BATCH_CSV.encode()}, partial(_list, name="l.csv"), 600),
-        Reader("batch text", lambda: {"l.txt": goods.BATCH_TEXT.encode()}, partial(_list, name="l.txt"), 300),
+        Reader("command line", valid_inputs.tum, _command, 300),
+        Reader(
+            "batch csv", lambda: {"l.csv": valid_inputs.BATCH_CSV.encode()}, partial(_list, name="l.csv"), 600
+        ),
+        Reader(
+            "batch text",
+            lambda: {"l.txt": valid_inputs.BATCH_TEXT.encode()},
+            partial(_list, name="l.txt"),
+            300,
+        ),
         Reader("batch record", _row_and_times, _record, 400),
     ]
-    found += [Reader(f"image {kind}", partial(_kind, goods.images, kind), _image, 250) for kind in IMAGES]
     found += [
-        Reader(f"calibration {kind}", partial(goods.CALIBRATIONS.__getitem__, kind), _calibration, 300)
-        for kind in goods.CALIBRATIONS
+        Reader(f"image {kind}", partial(_kind, valid_inputs.images, kind), _image, 250) for kind in IMAGES
+    ]
+    found += [
+        Reader(f"calibration {kind}", partial(valid_inputs.CALIBRATIONS.__getitem__, kind), _calibration, 300)
+        for kind in valid_inputs.CALIBRATIONS
     ]
     for kind in ("mp4", "avi"):
-        make = partial(_kind, goods.videos, kind)
+        make = partial(_kind, valid_inputs.videos, kind)
         found.append(Reader(f"video {kind}", make, partial(_sequence, name=f"v.{kind}"), 900))
     for kind, name in (("ros1", "r.bag"), ("sqlite3", "r"), ("mcap", "r")):
         found.append(
-            Reader(f"bag {kind}", partial(_kind, goods.bags, kind), partial(_sequence, name=name), 700)
+            Reader(f"bag {kind}", partial(_kind, valid_inputs.bags, kind), partial(_sequence, name=name), 700)
         )
     return {reader.name: reader for reader in found}
 
@@ -269,9 +280,9 @@ def _record(root: Path) -> None:
 
 def _image(root: Path) -> None:
     path = next(root.iterdir(), root / "a")
-    grey = read_gray(path, str(path))
-    assert bool(grey.isfinite().all())
-    assert 0 <= float(grey.min()) <= float(grey.max()) <= 1
+    gray = read_gray(path, str(path))
+    assert bool(gray.isfinite().all())
+    assert 0 <= float(gray.min()) <= float(gray.max()) <= 1
     assert read_color(path, str(path)).shape[2] == 3
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from tests.fuzz.goods import content_of
 from tests.fuzz.mutators import Files
+from tests.fuzz.valid_inputs import content_of
 from tests.walks import Walk, arc
 from torchslam import SLAM, load_config
 from torchslam.io.export.colmap import write_colmap

@@ -61,7 +61,7 @@ def two_views(
 def points_and_pixels(
     seed: int, count: int = 150, outliers: float = 0.3, noise: float = 0.5, camera: Camera = CAMERA
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (1, N, 3) in the world, their pixels (1, N, 2), and the camera's pose (1, 4, 4)."""
+    """Points (1, N, 3) in world coordinates, their pixels (1, N, 2), and the camera's pose (1, 4, 4)."""
     generator = torch.Generator().manual_seed(seed)
     T_cw = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))
     size = torch.tensor(camera.size, dtype=torch.float64)

@@ -38,7 +38,7 @@ def test_finds_the_pose_among_wrong_pairs(camera: Camera, outliers: float) -> No
         assert float((result.inliers[0] == right).double().mean()) > 0.97
 
 
-def test_is_as_good_as_poselib() -> None:
+def test_the_pose_is_as_accurate_as_that_of_poselib() -> None:
     ours, theirs = [], []
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
     for seed in range(12):
@@ -114,7 +114,7 @@ def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
-def test_gradient_is_that_of_the_estimate(camera: Camera) -> None:
+def test_the_gradient_is_that_of_the_estimate(camera: Camera) -> None:
     """Against central differences of the whole estimator; the set of inliers stays the same."""
     points_w, pixels, _ = points_and_pixels(2, count=40, outliers=0.2, noise=0.3, camera=camera)
     inputs = {"points_w": points_w, "pixels": pixels, "params": camera.params}
@@ -185,7 +185,7 @@ FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001,
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("outliers", [0.0, 0.4, 0.75])
-def test_it_is_near_the_truth_however_many_are_wrong(camera: Camera, outliers: float) -> None:
+def test_the_start_pose_is_near_the_truth_for_any_outlier_ratio(camera: Camera, outliers: float) -> None:
     for seed in range(5):
         points_w, pixels, truth = points_and_pixels(seed, 200, outliers, 0.5, camera)
         undistorted = UndistortedKeypoints.of(pixels[0], camera)
@@ -199,7 +199,7 @@ def test_it_is_near_the_truth_however_many_are_wrong(camera: Camera, outliers: f
         assert torch.equal(T_cw, again)
 
 
-def test_it_explains_as_much_as_the_long_way() -> None:
+def test_the_start_pose_has_as_many_inliers_as_the_full_estimator() -> None:
     counts = []
     for seed in range(5):
         points_w, pixels, _ = points_and_pixels(seed, 150, 0.5)
@@ -213,7 +213,7 @@ def test_it_explains_as_much_as_the_long_way() -> None:
 
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE], ids=["distorted", "fisheye"])
-def test_it_is_exact_on_exact_data_and_a_start_on_noisy_ones(camera: Camera) -> None:
+def test_the_start_pose_is_exact_on_exact_data(camera: Camera) -> None:
     """With noise near the pose of least error, but not it: the error is that of undistorted coordinates."""
     apart = []
     for noise in (0.0, 1.0):
@@ -226,7 +226,7 @@ def test_it_is_exact_on_exact_data_and_a_start_on_noisy_ones(camera: Camera) -> 
     assert 1e-6 < apart[1] < 0.01
 
 
-def test_wrong_matches_alone_give_no_pose() -> None:
+def test_outliers_alone_give_no_pose() -> None:
     points_w, pixels, _ = points_and_pixels(0, 100, 1.0)
     assert start_pose(points_w[0], UndistortedKeypoints.of(pixels[0], CAMERA), CAMERA.size, 3.0) is None
 

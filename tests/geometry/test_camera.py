@@ -212,7 +212,7 @@ def test_a_batch_has_one_model_and_one_size(other):
         default_collate([pinhole(500.0), other])
 
 
-def test_stacked_and_chosen(dtype, device):
+def test_cameras_are_stacked_and_indexed(dtype, device):
     cameras = [bent(k1).to(device, dtype) for k1 in (-0.3, -0.1, 0.05)]
     stacked = Camera.stack(cameras)
     assert stacked.params.dtype == dtype

@@ -44,7 +44,7 @@ def said(kind: str, sigmas: Tensor) -> KeypointNoise:
 
 
 @pytest.mark.parametrize("kind", ["scale", "number", "matrix"])
-def test_noise_is_the_same_however_it_is_said(kind: str, generator: torch.Generator) -> None:
+def test_noise_is_the_same_in_every_representation(kind: str, generator: torch.Generator) -> None:
     camera = Camera.pinhole(400.0, 420.0, 159.5, 119.5, size=(320, 240))
     sigmas = 0.5 + torch.rand(7, generator=generator, dtype=torch.float64)
     points_c = torch.randn(7, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 6.0])
@@ -76,7 +76,7 @@ def test_noise_is_the_same_however_it_is_said(kind: str, generator: torch.Genera
     )
 
 
-def test_the_gate_keeps_95_percent_of_noise_that_has_a_direction(generator: torch.Generator) -> None:
+def test_the_gate_keeps_95_percent_of_anisotropic_noise(generator: torch.Generator) -> None:
     """Errors drawn with covariances of their own, ten times as long as wide, pass the gate as often as they should."""
     count = 20_000
     turn = 6.3 * torch.rand(count, generator=generator, dtype=torch.float64)

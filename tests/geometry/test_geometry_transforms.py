@@ -46,12 +46,12 @@ def test_the_angle_of_a_rotation(angle: float) -> None:
 
 
 @given(st.lists(st.floats(-1.7, 1.7), min_size=6, max_size=6))
-def test_it_is_the_length_of_the_logarithm(values: list[float]) -> None:
+def test_the_angle_is_the_norm_of_the_logarithm(values: list[float]) -> None:
     R = so3_exp(torch.tensor(values, dtype=torch.float64).view(2, 3))
     torch.testing.assert_close(rotation_angle(R), so3_log(R).norm(dim=-1), rtol=1e-6, atol=1e-7)
 
 
-def test_how_far_cameras_are_apart() -> None:
+def test_the_distance_between_cameras() -> None:
     T_kw = se3_exp(torch.tensor([[0.3, -0.1, 0.5, 0.1, 0.2, -0.3]], dtype=torch.float64))
     away = torch.eye(4, dtype=torch.float64)
     away[:3, :3] = so3_exp(torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64))
@@ -61,7 +61,7 @@ def test_how_far_cameras_are_apart() -> None:
     assert rotation.tolist() == pytest.approx([math.degrees(0.2)])
 
 
-def test_a_rotation_that_nearly_is_one_becomes_one() -> None:
+def test_a_nearly_orthonormal_matrix_is_projected_to_a_rotation() -> None:
     xi = torch.linspace(-1, 1, 12, dtype=torch.float64).view(2, 6)
     T = se3_exp(xi)
     bent = T.clone()
@@ -72,7 +72,7 @@ def test_a_rotation_that_nearly_is_one_becomes_one() -> None:
     torch.testing.assert_close(reorthonormalized(T), T, rtol=0, atol=1e-15)
 
 
-def test_predicting_from_predictions_stays_a_rotation() -> None:
+def test_repeated_prediction_stays_a_rotation() -> None:
     """Without it the error grows by 2.4 from frame to frame: 1e-16 is 1e-3 after 34 of them."""
     step = se3_exp(torch.tensor([0.1, 0, 0, 0.01, 0.02, 0.03], dtype=torch.float64))
     last = torch.eye(4, dtype=torch.float64)
@@ -97,7 +97,7 @@ def problem(count: int = 5) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return normal(count, 3), A @ A.mT, normals_w, T_cw, sim3_exp(0.3 * normal(count, 7)) @ T_cw
 
 
-def test_a_known_correction() -> None:
+def test_a_correction_has_the_known_value() -> None:
     """The camera goes from the origin to x = 10, turns by half a turn about y, and its unit is doubled."""
     T_cw = torch.eye(4, dtype=torch.float64)
     R = so3_exp(torch.tensor([0.0, torch.pi, 0.0], dtype=torch.float64))
@@ -114,7 +114,7 @@ def test_a_known_correction() -> None:
     )
 
 
-def test_carried_points_are_seen_as_before_in_the_new_unit() -> None:
+def test_transferred_points_project_as_before_in_the_new_scale() -> None:
     points_w, covariances_w, normals_w, T_cw, S_cw = problem()
     moved_w, spread_w, turned_w = carry_points(points_w, covariances_w, normals_w, T_cw, S_cw)
     scale, new = sim3_scale(S_cw), without_scale(S_cw)
@@ -136,7 +136,7 @@ def test_the_pose_of_a_similarity_is_rigid_and_keeps_the_center() -> None:
     torch.testing.assert_close(se3_inverse(T_cw)[:, :3, 3], sim3_inverse(S_cw)[:, :3, 3])
 
 
-def test_another_unit_of_length() -> None:
+def test_poses_are_rescaled_to_another_unit_of_length() -> None:
     _, _, _, T, _ = problem()
     unit = torch.tensor([2.0, 1.0, 0.5, 4.0, 8.0], dtype=torch.float64)
     shorter = with_unit(T, unit)
@@ -174,7 +174,7 @@ def looking(*rotations: tuple[float, float, float]) -> torch.Tensor:
     return rigid(R_wc, torch.ones(len(rotations), 3, dtype=torch.float64))
 
 
-def test_a_camera_in_opengl_axes_sees_along_minus_z_with_y_up() -> None:
+def test_opengl_cameras_look_along_minus_z_with_y_up() -> None:
     T_wc = looking((0.3, -0.2, 0.1))
     point_c = torch.tensor([[0.2, 0.4, 3.0]], dtype=torch.float64)
     in_opengl = torch.tensor([[0.2, -0.4, -3.0]], dtype=torch.float64)
@@ -191,14 +191,14 @@ def test_pixels_and_camera_move_by_half_a_pixel_together(generator: torch.Genera
     assert camera.cx == 79.5
 
 
-def test_quaternions_begin_with_their_real_part() -> None:
+def test_quaternions_are_wxyz() -> None:
     quarter = so3_exp(torch.tensor((0.0, 0.0, math.pi / 2), dtype=torch.float64))
     half = math.sqrt(0.5)
     expected = torch.tensor((half, 0.0, 0.0, half), dtype=torch.float64)
     torch.testing.assert_close(quaternion_wxyz(quarter), expected)
 
 
-def test_a_world_whose_y_points_down_is_stood_upright() -> None:
+def test_a_map_with_y_down_is_rotated_upright() -> None:
     R = upright_rotation(looking((0.0, 0.5, 0.0), (0.0, -0.4, 0.0)))
     expected = torch.tensor(((1, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64)
     torch.testing.assert_close(R, expected)
@@ -216,7 +216,7 @@ def test_the_mean_up_direction_becomes_z(tilt: tuple[float, float, float]) -> No
     assert torch.linalg.det(R).item() == pytest.approx(1.0)
 
 
-def test_up_along_the_worlds_x() -> None:
+def test_an_up_direction_along_x_is_handled() -> None:
     T_wc = torch.tensor([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]], dtype=torch.float64)
     expected = torch.tensor(((0, 0, 1), (0, -1, 0), (1, 0, 0)), dtype=torch.float64)
     torch.testing.assert_close(upright_rotation(T_wc), expected)

@@ -84,7 +84,7 @@ def test_five_point_of_degenerate_samples_does_not_raise() -> None:
     assert torch.isfinite(E).all()
 
 
-def test_essential_matrix_comes_apart_into_its_pose() -> None:
+def test_an_essential_matrix_decomposes_into_its_pose() -> None:
     T_21 = poses(20, rotation=0.8)
     R_true, t_true = T_21[:, :3, :3], T_21[:, :3, 3]
     R, t = g.decompose_essential(-3.0 * g.essential_from_pose(R_true, t_true))
@@ -124,7 +124,7 @@ def test_offsets_from_epipolar_lines_are_sampson_errors_and_disparities() -> Non
     torch.testing.assert_close(along, expected, atol=1e-6, rtol=1e-9)
 
 
-def test_the_disparity_tells_the_depth_under_any_motion() -> None:
+def test_the_disparity_determines_the_depth_under_any_motion() -> None:
     T_21 = poses(20)
     points_1 = scene(20, 6)
     points_2 = g.transform(T_21, points_1)

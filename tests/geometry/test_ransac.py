@@ -32,7 +32,7 @@ def test_samples_are_distinct_rows_of_the_mask_and_repeatable() -> None:
 
 
 @pytest.mark.parametrize("rows", [3, 4, 40])
-def test_samples_of_all_rows_are_those_of_a_mask_that_has_all(rows: int) -> None:
+def test_samples_of_all_rows_equal_those_of_a_full_mask(rows: int) -> None:
     mask = torch.ones(1, rows, dtype=torch.bool)
     masked = sample_minimal(mask, 3, 25, torch.Generator().manual_seed(1))[0]
     assert torch.equal(sample_minimal_of_all(rows, 3, 25, torch.Generator().manual_seed(1)), masked)
@@ -53,7 +53,7 @@ def test_samples_needed() -> None:
     assert float(needed[2]) > 1e6
 
 
-def test_a_round_doubles_or_draws_what_the_support_calls_for() -> None:
+def test_a_round_doubles_or_draws_the_number_that_the_inlier_ratio_needs() -> None:
     """34.5 samples of three have one without outliers with 99 %, where half of the rows are."""
 
     def rounds(as_needed: bool, first: int) -> list[int]:
@@ -151,13 +151,13 @@ def test_implicit_step_without_a_minimum_has_zero_gradient() -> None:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(4, False), (8, False), (12, True), (30, True)])
-def test_what_is_unlikely(count: int, expected: bool) -> None:
+def test_unlikely_supports_are_significant(count: int, expected: bool) -> None:
     """Of 30 rows of a chance of 0.05 each, two of which make the sample."""
     found = is_unlikely(torch.tensor([count]), torch.tensor([30]), 2, torch.tensor([0.05]))
     assert found.tolist() == [expected]
 
 
-def test_alarms_are_more_than_the_binomial_tail() -> None:
+def test_false_alarms_bound_the_binomial_tail() -> None:
     for count in range(5, 30):
         tail = sum(math.comb(28, k) * 0.2**k * 0.8 ** (28 - k) for k in range(count - 2, 29))
         alarms = 435 * tail

@@ -32,7 +32,7 @@ def test_finds_the_pose_among_wrong_matches(camera: Camera, outliers: float) -> 
         )
 
 
-def test_is_as_good_as_poselib() -> None:
+def test_the_pose_is_as_accurate_as_that_of_poselib() -> None:
     ours, theirs = [], []
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
     for seed in range(8):
@@ -59,7 +59,7 @@ def test_exact_data_give_the_exact_pose() -> None:
 
 
 @pytest.mark.parametrize(("seed", "baseline"), [(90, 0.35), (116, 0.35), (1, 0.1), (20, 0.1)])
-def test_a_rotation_is_one_also_where_the_root_of_its_sample_was_not(seed: int, baseline: float) -> None:
+def test_the_rotation_is_orthonormal_even_if_its_sample_was_inaccurate(seed: int, baseline: float) -> None:
     scene = two_views(seed, baseline=baseline)
     found = estimate(scene)
     for T_21 in (found.T_21, found.T_21_essential):
@@ -70,7 +70,7 @@ def test_a_rotation_is_one_also_where_the_root_of_its_sample_was_not(seed: int, 
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
-def test_a_plane_is_called_a_plane_and_its_pose_is_right_or_ambiguous(noise: float) -> None:
+def test_a_plane_is_classified_and_its_pose_is_correct_or_ambiguous(noise: float) -> None:
     successes = 0
     for seed in range(10):
         scene = two_views(seed, plane=True, noise=noise)
@@ -154,7 +154,7 @@ def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
 
 @pytest.mark.parametrize("kind", ["essential", "homography", "rotation"])
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
-def test_gradient_is_that_of_the_estimate(camera: Camera, kind: str) -> None:
+def test_the_gradient_is_that_of_the_estimate(camera: Camera, kind: str) -> None:
     """Against central differences of the whole estimator; the set of inliers stays the same."""
     options = {"essential": {}, "homography": {"plane": True}, "rotation": {"baseline": 0.0}}[kind]
     scene = two_views(7, count=80, outliers=0.1, noise=0.1, camera=camera, **options)

@@ -87,7 +87,7 @@ def test_few_matches_do_not_hide_a_plane_or_a_rotation() -> None:
     assert rotations.count("rotation") >= 11
 
 
-def test_noise_with_a_long_tail_is_no_parallax() -> None:
+def test_heavy_tailed_noise_is_no_parallax() -> None:
     """Matches a few pixels off a pure rotation lie near some epipolar line by accident, wherever it is put."""
     for count in (100, 400):
         for seed in range(6):
@@ -148,7 +148,7 @@ def test_clear_parallax_on_both_sides_of_a_rotation_is_noise(
     assert bool(goes_both_ways(views, fits, side.new_ones(1))) == expected
 
 
-def test_two_motions_before_a_plane_are_told_apart_by_more_than_noise() -> None:
+def test_two_motions_of_a_plane_are_distinguished_beyond_noise() -> None:
     """Of eighty matches: a success is right, but for an essential matrix now and then."""
     right, wrong = 0, 0
     for seed in range(24):
@@ -165,7 +165,7 @@ def test_two_motions_before_a_plane_are_told_apart_by_more_than_noise() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_in_front_by_products_of_rays_is_so_by_depth(seed: int) -> None:
+def test_cheirality_by_ray_products_equals_cheirality_by_depth(seed: int) -> None:
     scene = two_views(seed)
     views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 1.0, scene.mask, None)
     generator = torch.Generator().manual_seed(seed)
@@ -206,8 +206,8 @@ def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds:
     assert bool(plane_holds(views, fits, PlaneMotions.of(views, fits))) == holds
 
 
-@pytest.mark.parametrize(("beside", "holds"), [(2, True), (3, False)])
-def test_few_matches_far_beside_the_motions_of_a_plane_contradict_it(beside: int, holds: bool) -> None:
+@pytest.mark.parametrize(("num_outside", "holds"), [(2, True), (3, False)])
+def test_few_matches_far_from_the_motions_of_a_plane_contradict_it(num_outside: int, holds: bool) -> None:
     """Of forty. Each counts as much as three deviations, so three of them are more than the gain of a fit."""
     scene = two_views(0, count=40)
     everything = torch.ones(1, 40, dtype=torch.bool)
@@ -216,13 +216,13 @@ def test_few_matches_far_beside_the_motions_of_a_plane_contradict_it(beside: int
     # Medians of the squares of Gaussian noise of variance one, in one coordinate and, in units of 1.5, in two.
     level = torch.tensor([0.6745**2, 1.3863 / 2.25, 100.0], dtype=torch.float64)
     fits = Fits(R, t, R, R, level[:, None, None].expand(3, 1, 40))
-    of_motion = torch.where(torch.arange(40) < beside, 100.0, level[0]).expand(1, 4, 40)
+    of_motion = torch.where(torch.arange(40) < num_outside, 100.0, level[0]).expand(1, 4, 40)
     possible = torch.ones(1, 4, dtype=torch.bool)
     four = R[:, None].expand(1, 4, 3, 3), t[:, None].expand(1, 4, 3), t[:, None].expand(1, 4, 3)
     assert bool(plane_holds(views, fits, PlaneMotions(*four, of_motion, possible))) == holds
 
 
-def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:
+def test_few_exact_matches_are_significant_under_a_wide_threshold() -> None:
     """A dozen matches of twenty within four pixels may be chance; within the hundredth that they show, they are not."""
     for seed in range(3):
         scene = two_views(seed, count=20, outliers=0.4, noise=0.02)
@@ -233,15 +233,15 @@ def test_few_exact_matches_are_no_accident_under_a_wide_threshold() -> None:
         assert max(errors(result, scene)) < 2
 
 
-def test_who_else_is_in_the_batch_does_not_matter() -> None:
-    """Beside a plane, whose homography is fitted, a scene with depth keeps its pose and its scores."""
+def test_the_other_elements_of_a_batch_do_not_matter() -> None:
+    """A scene with depth keeps its pose and scores next to a plane, for which a homography is fitted."""
 
-    def beside(other: Scene) -> RelativePose:
+    def estimate_in_batch(other: Scene) -> RelativePose:
         sides = [(two_views(0).pixels_1, other.pixels_1), (two_views(0).pixels_2, other.pixels_2)]
         pixels = [torch.cat(side) for side in sides]
         return estimate_relative_pose(*pixels, CAMERA, CAMERA, min_samples=512, max_samples=512)
 
-    plane, depth = beside(two_views(1, plane=True)), beside(two_views(3))
+    plane, depth = estimate_in_batch(two_views(1, plane=True)), estimate_in_batch(two_views(3))
     assert plane.model == ("essential", "homography")
     assert depth.model == ("essential", "essential")
     for name in ("T_21", "score_essential", "score_homography", "score_rotation"):
@@ -264,14 +264,14 @@ def test_the_essential_matrix_of_a_plane_has_its_pose() -> None:
     assert sum(error < 2 for error in off) >= len(off) - 1
 
 
-def test_only_the_model_asked_for_is_fitted() -> None:
+def test_only_the_requested_model_is_fitted() -> None:
     scene = two_views(0)
-    asked, free = estimate(scene, model="essential"), estimate(scene)
-    assert torch.equal(asked.score_essential, free.score_essential)
-    assert not asked.score_homography.any()
-    assert not asked.score_rotation.any()
-    assert torch.equal(asked.inliers, free.inliers)
-    torch.testing.assert_close(asked.T_21, free.T_21)
+    essential_only, free = estimate(scene, model="essential"), estimate(scene)
+    assert torch.equal(essential_only.score_essential, free.score_essential)
+    assert not essential_only.score_homography.any()
+    assert not essential_only.score_rotation.any()
+    assert torch.equal(essential_only.inliers, free.inliers)
+    torch.testing.assert_close(essential_only.T_21, free.T_21)
     turned = two_views(0, baseline=0.0)
     result = estimate(turned, model="essential")
     assert errors(result, turned)[0] < 0.5
@@ -286,7 +286,7 @@ def test_every_kernel_finds_the_pose(kernel: Kernel) -> None:
     assert direction < 4
 
 
-def test_a_weight_of_zero_is_no_match() -> None:
+def test_a_match_of_zero_weight_is_ignored() -> None:
     scene = two_views(2)
     mask = torch.rand(1, 200, generator=torch.Generator().manual_seed(0)) < 0.7
     weights = mask.double()
@@ -305,7 +305,7 @@ def test_weights_act_as_thresholds() -> None:
     assert torch.equal(twice.inliers, weighted.inliers)
 
 
-def test_information_of_the_matches_makes_the_pose_better() -> None:
+def test_match_information_improves_the_pose() -> None:
     given, without = [], []
     for seed in range(8):
         scene = two_views(seed, noise=0.0)
@@ -368,8 +368,8 @@ def test_a_batch_equals_a_loop_where_the_samples_do() -> None:
     assert torch.equal(three.inliers, one.inliers.expand(3, -1))
 
 
-def test_many_wrong_matches_do_not_pull() -> None:
-    """Half of few matches are wrong, beside poselib."""
+def test_many_outliers_do_not_bias_the_pose() -> None:
+    """Half of few matches are wrong; poselib is the reference."""
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
     ours, theirs = [], []
     for seed in range(10):
@@ -382,7 +382,7 @@ def test_many_wrong_matches_do_not_pull() -> None:
     assert sum(ours) <= 1.2 * sum(theirs)
 
 
-def test_points_behind_a_camera_do_not_count() -> None:
+def test_points_behind_a_camera_are_no_inliers() -> None:
     scene = two_views(0, noise=0.0, outliers=0.0)
     views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 1.0, scene.mask, None)
     R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3] / scene.T_21[:, :3, 3].norm()
@@ -406,7 +406,7 @@ def test_points_behind_a_camera_do_not_count() -> None:
 
 
 @pytest.mark.usefixtures("without_shape_checks")
-def test_wrong_options_are_named() -> None:
+def test_invalid_options_are_rejected_by_name() -> None:
     scene = two_views(0)
     with pytest.raises(ValueError, match="unknown model 'plane'; known are auto, essential"):
         estimate(scene, model="plane")
@@ -416,14 +416,14 @@ def test_wrong_options_are_named() -> None:
         estimate(scene, weights=torch.ones(200))
 
 
-def test_what_the_choice_of_model_refuses_keeps_its_essential_matrix() -> None:
+def test_a_rejected_model_keeps_its_essential_matrix() -> None:
     """On a plane, too, whose two motions are the reason to refuse it: one of them."""
     for seed in range(4):
         scene = two_views(seed, plane=True)
-        result, asked = estimate(scene), estimate(scene, model="essential")
+        result, essential_only = estimate(scene), estimate(scene, model="essential")
         assert result.model == ("homography",)
-        torch.testing.assert_close(result.T_21_essential, asked.T_21, rtol=0.0, atol=1e-6)
-        assert torch.equal(asked.T_21_essential, asked.T_21)
+        torch.testing.assert_close(result.T_21_essential, essential_only.T_21, rtol=0.0, atol=1e-6)
+        assert torch.equal(essential_only.T_21_essential, essential_only.T_21)
     turned = estimate(two_views(0, baseline=0.0))
     assert not turned.T_21[0, :3, 3].any()
     assert turned.T_21_essential[0, :3, 3].norm().item() == pytest.approx(1)

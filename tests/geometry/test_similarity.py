@@ -194,7 +194,7 @@ def test_without_scale() -> None:
     assert fixed.score < 0.5 * free.score
 
 
-def test_an_inlier_fits_in_both_images() -> None:
+def test_an_inlier_agrees_in_both_images() -> None:
     """Points too near in one of the maps, on the same ray there, fit in that image alone."""
     pairs = make_pairs(2, outliers=0.0, noise=0.0)
     for side in (0, 1):
@@ -218,7 +218,7 @@ def test_scale_where_both_cameras_are_at_one_place(log_scale: float) -> None:
         check(result.S_21, pairs.S_21)
 
 
-def test_errors_count_in_their_standard_deviations() -> None:
+def test_errors_are_whitened_by_their_standard_deviations() -> None:
     """The threshold follows sigma, in each image by itself."""
     pairs = make_pairs(3, outliers=0.0, noise=0.0)
     ones = torch.ones_like(pairs.right, dtype=torch.float64)

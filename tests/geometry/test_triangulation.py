@@ -42,7 +42,7 @@ def views(
 
 
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
-def test_exact_matches_give_the_points_back(camera: Camera) -> None:
+def test_exact_matches_recover_the_points(camera: Camera) -> None:
     T_cw, pixels, points_w = views(camera, extra=2)
     two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera)
     many = triangulate_many(T_cw, pixels, camera)
@@ -119,7 +119,7 @@ def test_bad_rows_are_masked_and_finite(dtype: torch.dtype) -> None:
     assert torch.isfinite(pixels.grad).all()
 
 
-def test_no_baseline_or_parallel_rays_give_no_point() -> None:
+def test_zero_baseline_or_parallel_rays_give_no_point() -> None:
     T_cw, pixels, _ = views()
     same = triangulate(T_cw[0], T_cw[0], pixels[:, 0], pixels[:, 0], CAMERA, CAMERA)
     assert not same.mask.any()
@@ -160,7 +160,7 @@ def test_covariance_is_zero_where_the_views_do_not_determine_a_point(device: tor
     assert torch.isfinite(behind).all()
 
 
-def test_coordinates_that_are_undistorted_already_give_the_same() -> None:
+def test_undistorted_coordinates_give_the_same_points() -> None:
     T_cw, pixels, _ = views(RADIAL, noise=1.0)
     seen = pixels[:, 0], pixels[:, 1]
     known = RADIAL.normalize(seen[0]), RADIAL.normalize(seen[1])

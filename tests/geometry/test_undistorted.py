@@ -18,7 +18,7 @@ def pixels(count: int = 50) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
-def test_the_slope_is_that_of_pixels_in_undistorted_coordinates(camera):
+def test_the_slope_is_the_derivative_of_undistorted_coordinates(camera):
     undistorted, step = UndistortedKeypoints.of(pixels(), camera), 1e-6
     ones = torch.ones(50, 1, dtype=torch.float64)
     torch.testing.assert_close(camera.project(torch.cat((undistorted.xy.mT, ones), 1))[0], pixels())
@@ -50,7 +50,7 @@ def test_whitened_slopes_give_errors_in_units_of_the_noise(kind):
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
-def test_the_table_is_right_to_a_hundredth_of_a_pixel_or_two(camera):
+def test_the_lookup_table_is_accurate_to_hundredths_of_a_pixel(camera):
     inside = torch.cat((pixels(2000), torch.tensor([[-0.5, -0.5], [639.5, 479.5], [0.0, 479.5]]).double()))
     exact, quick = UndistortedKeypoints.of(inside, camera), Undistortion(camera)(inside)
     ones = torch.ones(len(inside), 1, dtype=torch.float64)
@@ -61,7 +61,7 @@ def test_the_table_is_right_to_a_hundredth_of_a_pixel_or_two(camera):
     )
 
 
-def test_beyond_the_distortion_the_table_has_its_edge():
+def test_beyond_the_valid_radius_the_table_has_its_edge_value():
     camera = Camera.radial_tangential(300.0, 300.0, 320.0, 240.0, -0.4, 0.0, 0.0, 0.0, size=(640, 480))
     corner = torch.tensor([[1.0, 1.0], [320.0, 240.0]]).double()
     exact, quick = UndistortedKeypoints.of(corner, camera), Undistortion(camera)(corner)
@@ -72,7 +72,7 @@ def test_beyond_the_distortion_the_table_has_its_edge():
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=[camera.model for camera in CAMERAS])
-def test_normalized_pixels_are_those_of_the_camera_in_any_shape(camera):
+def test_normalized_coordinates_equal_those_of_the_camera_in_any_shape(camera):
     batch, focal = pixels().view(2, 25, 2), camera.params[:2]
     found, exact = Undistortion(camera).normalize(batch), camera.normalize(batch)
     torch.testing.assert_close(found * focal, exact * focal, rtol=0, atol=0.02)

@@ -10,7 +10,7 @@ from torchslam.io.results import read_frames, write_frames
 from torchslam.types import State, StepResult
 
 
-def test_frames_come_back_without_poses(tmp_path: Path, results: list[StepResult]) -> None:
+def test_frames_without_poses_round_trip(tmp_path: Path, results: list[StepResult]) -> None:
     write_frames(tmp_path / "frames.csv", results)
     loaded = read_frames(tmp_path / "frames.csv")
     for before, after in zip(results, loaded, strict=True):
@@ -18,7 +18,7 @@ def test_frames_come_back_without_poses(tmp_path: Path, results: list[StepResult
         assert after == replace(before, T_cw=None, stage_ms=times)
 
 
-def test_the_state_and_the_world_of_a_frame_have_columns(tmp_path: Path, results: list[StepResult]) -> None:
+def test_state_and_submap_of_a_frame_have_columns(tmp_path: Path, results: list[StepResult]) -> None:
     doubtful = [replace(results[0], state=State.UNCERTAIN, submap=12), replace(results[1], submap=None)]
     write_frames(tmp_path / "frames.csv", doubtful)
     lines = (tmp_path / "frames.csv").read_text().splitlines()

@@ -67,7 +67,7 @@ NAMES = ["scene", "top_view", "errors", "tracking", "stages", "features", "few",
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_picture_is_drawn_and_the_same_again(
+def test_plots_are_drawn_deterministically(
     name: str, figures: dict[str, Callable[[], Figure]], tmp_path: Path
 ) -> None:
     for attempt in ("one", "two"):
@@ -108,7 +108,7 @@ def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w:
     assert "5 outside" in figure.get_suptitle().replace("\n", " ")
 
 
-def test_a_world_with_y_down_is_seen_over_x_and_z(trajectory: Trajectory, points_w: torch.Tensor) -> None:
+def test_a_map_with_y_down_is_plotted_over_x_and_z(trajectory: Trajectory, points_w: torch.Tensor) -> None:
     axes = plots.plot_top_view(trajectory, points_w, unit="").axes[0]
     assert axes.get_xlabel() == "x (map units)"
     assert axes.get_ylabel() == "z (map units)"
@@ -184,7 +184,7 @@ def test_stage_bars_show_means_over_the_frames_that_ran(results: list[StepResult
     assert "% of frames" in bars.texts[2].get_text()
 
 
-def test_nothing_to_draw_is_drawn_without_complaint(tmp_path: Path, generator: torch.Generator) -> None:
+def test_empty_plots_are_drawn(tmp_path: Path, generator: torch.Generator) -> None:
     pose = Trajectory(torch.zeros(1, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[None])
     empty = [
         plots.plot_scene(pose, torch.zeros(0, 3)),
@@ -198,7 +198,7 @@ def test_nothing_to_draw_is_drawn_without_complaint(tmp_path: Path, generator: t
         plots.save(figure, tmp_path / f"{index}.png")
 
 
-def test_ellipses_tell_how_certain_keyframes_are(trajectory: Trajectory, points_w: torch.Tensor) -> None:
+def test_ellipses_show_keyframe_covariances(trajectory: Trajectory, points_w: torch.Tensor) -> None:
     covariances_w = 1e-6 * torch.eye(3, dtype=torch.float64).repeat(len(trajectory), 1, 1)
     covariances_w[0] = 0  # the fixed one
     covariances_w[1:, 0, 0] *= 4

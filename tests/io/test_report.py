@@ -54,14 +54,16 @@ def test_quality(run: Run) -> None:
 @pytest.mark.parametrize(
     ("keyframes", "posed", "said"), [(12, 23, True), (11, 23, False), (9, 9, False), (5, 10, True)]
 )
-def test_when_half_of_the_frames_are_keyframes(run: Run, keyframes: int, posed: int, said: bool) -> None:
+def test_half_of_the_frames_being_keyframes_is_reported(
+    run: Run, keyframes: int, posed: int, said: bool
+) -> None:
     found = result_warnings(run_metrics(run) | {"keyframes": keyframes, "posed": posed})
     assert [text.partition(":")[0] for text in found] == [
         f"{keyframes} of {posed} posed frames are keyframes"
     ] * said
 
 
-def test_counts_of_several_worlds_and_sessions(run: Run, submap: Submap) -> None:
+def test_counts_of_several_submaps_and_sessions(run: Run, submap: Submap) -> None:
     """Frames 10 to 14 uncertain in submap 0; from frame 22 in submap 3, which has as many frames of another session."""
     other = Submap(3, submap.tracking)
     other.map.add_keyframe(replace(submap.map.frame_features(0), session=2), submap.map.T_cw[0])
@@ -102,7 +104,7 @@ def test_times(run: Run) -> None:
     assert figures["stage_ms"]["tracking"]["frames"] == 30
 
 
-def test_a_map_that_was_given_up_does_not_count_as_the_start(run: Run) -> None:
+def test_a_discarded_map_is_not_the_initialization(run: Run) -> None:
     given_up = [replace(run.results[0], state=State.TRACKING), *run.results[1:]]
     assert run_metrics(replace(run, results=given_up))["initialized_at"] == 3
 

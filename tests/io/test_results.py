@@ -30,7 +30,9 @@ def write(run: Run, directory: Path) -> None:
 def two(run: Run, submap: Submap) -> Run:
     """A second submap with two frames."""
     other = Submap(3, submap.tracking)
-    other.map.add_keyframe(replace(submap.map.frame_features(0), index=18, timestamp=100.6), submap.map.T_cw[0])
+    other.map.add_keyframe(
+        replace(submap.map.frame_features(0), index=18, timestamp=100.6), submap.map.T_cw[0]
+    )
     for index in (18, 19):
         view = replace(submap.map.frame_features(0), index=index, timestamp=100 + index / 30)
         seen = PoseEstimate(
@@ -40,7 +42,7 @@ def two(run: Run, submap: Submap) -> Run:
     return replace(run, submaps=(other, submap))
 
 
-def test_what_is_written_reads_back(tmp_path: Path, run: Run) -> None:
+def test_results_round_trip(tmp_path: Path, run: Run) -> None:
     assert results_in(tmp_path / "new") == []
     write(run, tmp_path / "new")
     assert {path.name for path in results_in(tmp_path / "new")} == {
@@ -53,14 +55,14 @@ def test_what_is_written_reads_back(tmp_path: Path, run: Run) -> None:
     assert results.session == 0
 
 
-def test_the_poses_as_they_were_given_have_a_file(tmp_path: Path, run: Run) -> None:
+def test_online_poses_have_a_file(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
     online = read_trajectory(tmp_path / "online.txt")
     assert len(online) == 23
     assert torch.equal(online.T_wc, torch.eye(4, dtype=torch.float64).expand(23, 4, 4))
 
 
-def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
+def test_online_poses_of_merged_submaps_stay_separate(run: Run) -> None:
     """Frames 3 to 9 given in submap 5, 10 to 17 in 4; those became submap 0. Submap 7, of 22 to 24, is another one."""
     submaps = {index: 5 if index < 10 else 4 for index in range(3, 18)} | dict.fromkeys(range(22, 25), 7)
     results = [replace(one, submap=submaps.get(one.index, one.submap)) for one in run.results]
@@ -78,9 +80,7 @@ def test_poses_of_worlds_that_were_joined_are_kept_apart(run: Run) -> None:
     assert replace(joined, submaps=()).online_parts == []
 
 
-def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
-    tmp_path: Path, two: Run, run: Run
-) -> None:
+def test_other_submaps_have_their_own_trajectories(tmp_path: Path, two: Run, run: Run) -> None:
     write(two, tmp_path)
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == 23
     assert len(read_trajectory(tmp_path / "trajectory_3.txt")) == 2
@@ -91,9 +91,7 @@ def test_worlds_beside_the_main_one_have_trajectories_of_their_own(
     assert not (tmp_path / "trajectory_3.txt").exists()
 
 
-def test_pictures_say_which_world_they_show(
-    tmp_path: Path, two: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plots_name_their_submap(tmp_path: Path, two: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     from torchslam.io import plots
 
     titles = {}
@@ -108,7 +106,7 @@ def test_pictures_say_which_world_they_show(
     assert "submap" not in titles["top_view"]
 
 
-def test_a_run_that_only_localized_is_drawn(tmp_path: Path, run: Run, submap: Submap) -> None:
+def test_a_localization_run_is_plotted(tmp_path: Path, run: Run, submap: Submap) -> None:
     submap.posed_frames.frames["session"][:] = 1
     localized = replace(run, session=1, sessions=1)
     write(localized, tmp_path)
@@ -120,7 +118,7 @@ def test_a_run_that_only_localized_is_drawn(tmp_path: Path, run: Run, submap: Su
     assert names == {"tracking", "stages", "scene", "top_view"}
 
 
-def test_certainty_is_drawn_where_the_keyframe_is(
+def test_ellipses_are_drawn_at_the_keyframes(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows of the map are not in order of time: those found on the way back come later."""
@@ -144,7 +142,7 @@ def test_certainty_is_drawn_where_the_keyframe_is(
     assert torch.allclose(variances, drawn["keyframes"].timestamps)  # type: ignore[attr-defined]
 
 
-def test_other_figures_are_refused(tmp_path: Path, run: Run) -> None:
+def test_unknown_metrics_are_refused(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
     for content in ("[]", '{"frames": 3}'):
         (tmp_path / "metrics.json").write_text(content)

@@ -23,7 +23,7 @@ def camera_with(focal: Tensor | float) -> Camera:
     return Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
 
 
-def test_a_call_is_looking_and_posing(walk: Walk) -> None:
+def test_a_call_equals_extraction_and_solution(walk: Walk) -> None:
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)
     clip_slam = ClipSLAM(eyes)
@@ -53,7 +53,7 @@ def test_a_call_is_looking_and_posing(walk: Walk) -> None:
         assert all(torch.equal(*pair) for pair in zip(results[0], other, strict=True))
 
 
-def test_a_graph_has_no_gradient_and_no_part_in_what_is_learned(walk: Walk) -> None:
+def test_a_clip_graph_is_detached(walk: Walk) -> None:
     images, _ = clip_of(walk)
     focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
     camera = camera_with(focal)
@@ -67,7 +67,7 @@ def test_a_graph_has_no_gradient_and_no_part_in_what_is_learned(walk: Walk) -> N
     assert graph.cameras[0].fx == 400
 
 
-def test_the_gradient_of_what_was_looked_at_once_is_that_of_finite_differences(walk: Walk) -> None:
+def test_the_gradient_through_a_stored_graph_agrees_with_finite_differences(walk: Walk) -> None:
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)
     clip_slam = ClipSLAM(eyes, config=CONFIG)
@@ -103,7 +103,7 @@ def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
         clip_slam(images[None], walk.camera.with_params(params))
 
 
-def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
+def test_graphs_of_clips_stack_to_a_batch(walk: Walk) -> None:
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
     graphs = [clip_slam.build_graph(images, camera_with(focal)) for focal in (400.0, 410.0)]
@@ -120,7 +120,7 @@ def test_graphs_of_clips_stack_to_one_of_a_batch(walk: Walk) -> None:
         clip_slam.pose(ClipGraph.stack(graphs), features[:1])
 
 
-def test_keypoints_that_are_gone_do_not_count(walk: Walk) -> None:
+def test_missing_keypoints_are_ignored(walk: Walk) -> None:
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0, noise_px=0.0))
     graph, features = clip_slam.build_graph(images, walk.camera), clip_slam.extract(images)
@@ -137,7 +137,7 @@ def test_keypoints_that_are_gone_do_not_count(walk: Walk) -> None:
     assert 0 < len(left.pixels) < len(seen.pixels)
 
 
-def test_what_started_no_map_has_no_pose_later() -> None:
+def test_a_clip_without_initialization_has_no_pose() -> None:
     walk = Walk(still(4))
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))

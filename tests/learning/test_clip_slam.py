@@ -57,7 +57,7 @@ def derivative(loss: object, value: float, h: float) -> float:
         return float(loss(value + h) - loss(value - h)) / (2 * h)
 
 
-def test_the_gradient_to_a_front_end_is_that_of_finite_differences() -> None:
+def test_the_gradient_to_a_front_end_agrees_with_finite_differences() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)
@@ -74,7 +74,7 @@ def test_the_gradient_to_a_front_end_is_that_of_finite_differences() -> None:
     assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
 
 
-def test_the_gradient_to_weights_and_camera_is_that_of_finite_differences() -> None:
+def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)
@@ -97,7 +97,7 @@ def test_the_gradient_to_weights_and_camera_is_that_of_finite_differences() -> N
     assert float(focal.grad) == pytest.approx(derivative(lambda x: loss(1.0, x), 400.0, 1e-2), rel=1e-2)
 
 
-def test_a_training_loop_finds_the_lens() -> None:
+def test_a_training_loop_estimates_the_distortion() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.02, noise_px=0.05)
@@ -130,7 +130,7 @@ def test_the_gradient_reaches_the_images() -> None:
     assert (images.grad.abs().sum((1, 2, 3)) > 0).all()
 
 
-def test_a_clip_without_a_map_has_no_pose_and_a_gradient_of_zero() -> None:
+def test_a_clip_without_a_map_has_no_pose_and_zero_gradient() -> None:
     walk = Walk(still(4))
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.02)
@@ -156,7 +156,7 @@ def test_a_clip_without_a_map_has_no_pose_and_a_gradient_of_zero() -> None:
     assert eyes.bend.grad == 0
 
 
-def test_a_failed_clip_is_no_clip_without_error() -> None:
+def test_a_failed_clip_does_not_count_as_zero_error() -> None:
     generator = torch.Generator().manual_seed(0)
     truth = se3_exp(torch.randn(3, 5, 6, generator=generator, dtype=torch.float64))
     T_cw = se3_exp(torch.randn(3, 5, 6, generator=generator, dtype=torch.float64)).requires_grad_()
@@ -178,7 +178,7 @@ def test_a_failed_clip_is_no_clip_without_error() -> None:
         clip_loss(poses, truth, on_failure="ignore")  # type: ignore[arg-type]
 
 
-def test_a_batch_is_its_clips() -> None:
+def test_a_batch_equals_its_clips() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)
     clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
@@ -191,7 +191,7 @@ def test_a_batch_is_its_clips() -> None:
         clip_slam(images[0], walk.camera)
 
 
-def test_a_clip_that_falls_apart_has_the_poses_of_its_main_world() -> None:
+def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
     """It looks ahead in most frames, and back in the others: what cannot be compared is not posed."""
     poses = torch.cat([arc(22, length=1.0), arc(10, length=1.0)])
     poses[22:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y

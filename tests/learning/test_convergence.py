@@ -48,7 +48,7 @@ def seen() -> Seen:
     return Seen()
 
 
-def test_a_long_way_to_the_minimum_ends_there_and_the_gradient_is_right(seen: Seen) -> None:
+def test_a_slow_convergence_reaches_the_minimum_with_the_right_gradient(seen: Seen) -> None:
     features = seen.moved(MANY)
     (gradient,) = torch.autograd.grad(seen.loss(features), features.keypoints)
     h, direction = 1e-4, gradient / gradient.norm()
@@ -59,7 +59,7 @@ def test_a_long_way_to_the_minimum_ends_there_and_the_gradient_is_right(seen: Se
     assert float((ahead - behind) / (2 * h)) == pytest.approx(float(gradient.norm()), rel=1e-6)
 
 
-def test_in_one_call_or_in_turn_the_gradients_are_the_same(seen: Seen) -> None:
+def test_gradients_do_not_depend_on_batching(seen: Seen) -> None:
     features = [seen.moved(seed) for seed in (FEW, MANY)]
     truths = torch.stack([seen.truth, seen.truth])
     together = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)
@@ -70,9 +70,7 @@ def test_in_one_call_or_in_turn_the_gradients_are_the_same(seen: Seen) -> None:
         assert (each.keypoints.grad - alone).norm() < 1e-6 * alone.norm()
 
 
-def test_what_does_not_get_there_is_no_success_and_says_so(
-    seen: Seen, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unconverged_problems_are_reported_as_failed(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clip_module, "_ITERATIONS", 40)
     features = [seen.moved(seed) for seed in (FEW, MANY)]
     poses = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)

@@ -35,7 +35,7 @@ RADIAL = Camera.radial_tangential(400.0, 400.0, 159.5, 119.5, 0.1, 0.0, 0.0, 0.0
 FISHEYE = Camera.fisheye(400.0, 400.0, 159.5, 119.5, 0.1, 0.0, 0.0, 0.0, size=(320, 240))
 
 
-class Told(Walk):
+class WalkWithTruth(Walk):
     """A walk whose images say, in their first pixel, which frame they are; its true poses may be withheld."""
 
     def __init__(self, T_wc: Tensor, has_truth: bool = True) -> None:
@@ -72,8 +72,8 @@ def chosen(
     monkeypatch: pytest.MonkeyPatch, walk: Walk, has_truth: bool = True, **options: object
 ) -> list[tuple[int, int, int]]:
     monkeypatch.setattr(dataset, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
-    told = Told(se3_inverse(true_T_cw(walk)), has_truth)
-    return Clips([told], **options).chosen  # type: ignore[arg-type]
+    walk_with_truth = WalkWithTruth(se3_inverse(true_T_cw(walk)), has_truth)
+    return Clips([walk_with_truth], **options).chosen  # type: ignore[arg-type]
 
 
 def simulated(poses: Tensor, near: float = 50.0, far: float = 70.0) -> Features:
@@ -99,7 +99,7 @@ def test_parallax_is_the_angle_at_the_points(depths: tuple[float, float]) -> Non
         assert parallax(features[:1], features[1:], camera) == pytest.approx(found, rel=0.05)
 
 
-def test_who_sees_too_little_in_common_shows_no_parallax() -> None:
+def test_frames_with_little_overlap_have_no_parallax() -> None:
     features = simulated(true_T_cw(Walk(arc(2, length=0.2))))
     few = replace(features, mask=features.mask & (torch.arange(300) < 40))
     assert parallax(few[:1], few[1:], Walk(still(2)).camera) == 0
@@ -117,14 +117,12 @@ def test_strides_grow_until_there_is_parallax(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("has_truth", [True, False])
-def test_a_camera_that_stands_or_turns_gives_no_clips(
-    monkeypatch: pytest.MonkeyPatch, has_truth: bool
-) -> None:
+def test_a_static_or_rotating_camera_gives_no_clips(monkeypatch: pytest.MonkeyPatch, has_truth: bool) -> None:
     for poses in (still(12), turn(12, math.radians(10))):
         assert chosen(monkeypatch, Walk(poses), has_truth, frames=4, supervised=False) == []
 
 
-def test_without_true_poses_there_is_nothing_to_supervise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_supervision_needs_ground_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(40, length=2.0))
     options = {"frames": 4, "per_sequence": 3}
     assert chosen(monkeypatch, walk, has_truth=False, **options) == []
@@ -140,8 +138,8 @@ def test_the_same_seed_gives_the_same_clips(monkeypatch: pytest.MonkeyPatch) -> 
     assert first != other
 
 
-def test_a_clip_has_the_frames_it_says() -> None:
-    walk = Told(arc(20))
+def test_a_clip_has_its_listed_frames() -> None:
+    walk = WalkWithTruth(arc(20))
     clip = Clip.of(walk, 2, frames=5, stride=3, number=7)
     assert clip.images.shape == (5, 1, 240, 320)
     assert clip.images[:, 0, 0, 0].tolist() == [2, 5, 8, 11, 14]
@@ -151,18 +149,18 @@ def test_a_clip_has_the_frames_it_says() -> None:
     with pytest.raises(SequenceError, match="5 frames from 10, 3 apart, exceed its 20 frames"):
         Clip.of(walk, 10, frames=5, stride=3)
     assert int(Clip.of(walk, 7, frames=5, stride=3).images[-1, 0, 0, 0]) == 19
-    blind = Clip.of(Told(arc(20), has_truth=False), 2, frames=5, stride=3)
+    blind = Clip.of(WalkWithTruth(arc(20), has_truth=False), 2, frames=5, stride=3)
     assert not blind.known.any()
     assert torch.equal(blind.T_cw, torch.eye(4, dtype=torch.float64).expand(5, 4, 4))
     with pytest.raises(SequenceError, match="the clip from 2 on has no true pose"):
-        Clip.of(Told(arc(20), has_truth=False), 2, frames=5, stride=3, supervised=True)
+        Clip.of(WalkWithTruth(arc(20), has_truth=False), 2, frames=5, stride=3, supervised=True)
 
 
-def test_frames_in_a_time_are_at_least_one() -> None:
+def test_a_time_span_has_at_least_one_frame() -> None:
     assert [frames_in(seconds, Walk(arc(4))) for seconds in (0.01, 0.1, 0.34)] == [1, 1, 3]  # at 10 Hz
 
 
-def test_images_go_to_a_device_and_geometry_stays(device: torch.device) -> None:
+def test_images_move_to_the_device_and_geometry_stays(device: torch.device) -> None:
     clip = Clip.of(Walk(arc(4)), 0, frames=2, stride=1).to(device)
     assert clip.images.device.type == device.type
     assert clip.T_cw.device.type == clip.camera.params.device.type == "cpu"
@@ -186,7 +184,7 @@ def test_a_batch_has_a_camera_for_each_clip() -> None:
         collate([Clip.of(walks[0], 0, frames=frames, stride=2) for frames in (3, 4)])
 
 
-def test_batches_show_every_clip_once_an_epoch_and_resume_anywhere() -> None:
+def test_batches_contain_every_clip_once_per_epoch_and_can_be_resumed() -> None:
     def rows(first: int, count: int, **options: int) -> list[list[int]]:
         return list(itertools.islice(Batches(7, 3, first=first, **options), count))
 
@@ -202,10 +200,10 @@ def test_batches_show_every_clip_once_an_epoch_and_resume_anywhere() -> None:
         Batches(0, 3)
 
 
-def test_clips_come_through_a_loader(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clips_work_with_a_data_loader(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(40, length=2.0))
     monkeypatch.setattr(dataset, "ORB", type("Eyes", (Knowing,), {"walk": walk}))
-    clips = Clips([Told(se3_inverse(true_T_cw(walk)))], frames=4, per_sequence=3)
+    clips = Clips([WalkWithTruth(se3_inverse(true_T_cw(walk)))], frames=4, per_sequence=3)
     batches = Batches(len(clips), 2)
     loader = DataLoader(clips, batch_sampler=batches, collate_fn=collate)
     for batch, rows in itertools.islice(zip(loader, batches, strict=False), 3):
@@ -213,7 +211,7 @@ def test_clips_come_through_a_loader(monkeypatch: pytest.MonkeyPatch) -> None:
         assert batch.images[:, 0, 0, 0, 0].tolist() == [clips.chosen[row][1] for row in rows]
 
 
-def test_clips_are_looked_at_once_and_by_who_looked_first() -> None:
+def test_clip_graphs_are_computed_once() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     eyes = BentEyes(walk, bend=0.01)
     clip_slam = ClipSLAM(eyes)

@@ -52,7 +52,7 @@ def scene(views: int = 3, points: int = 7, batch: int = 2) -> tuple[Tensor, Tens
     return T_cw, torch.stack(seen, -2)
 
 
-def test_the_path_is_the_way_of_the_camera() -> None:
+def test_the_path_length_is_that_of_the_camera() -> None:
     centers = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 2]], dtype=torch.float64)
     T_wc = rigid(so3_exp(normal(3, 3)), centers)
     assert float(path_length(se3_inverse(T_wc))) == pytest.approx(7.0)
@@ -60,7 +60,7 @@ def test_the_path_is_the_way_of_the_camera() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.1, 10.0), st.integers(0, 5))
-def test_what_is_free_of_scale_does_not_know_the_world(scale: float, seed: int) -> None:
+def test_scale_free_losses_do_not_depend_on_the_frame(scale: float, seed: int) -> None:
     T_cw, truth = poses(6, seed=seed), poses(6, seed=seed + 100)
     S = sim3_exp(torch.cat([normal(6, seed=seed + 7), torch.tensor([math.log(scale)]).double()]))
     T_wc = S @ se3_inverse(T_cw)
@@ -71,7 +71,7 @@ def test_what_is_free_of_scale_does_not_know_the_world(scale: float, seed: int) 
     torch.testing.assert_close(relative_ate(T_cw, longer), relative_ate(T_cw, truth))
 
 
-def test_the_share_of_the_path_is_that_of_the_ate() -> None:
+def test_the_relative_error_is_the_ate_over_the_path_length() -> None:
     T_cw, truth = poses(2, 6), poses(2, 6, seed=1)
     mask = torch.tensor([[True] * 6, [True] * 2 + [False] * 4])
     shares = relative_ate(T_cw, truth, mask)
@@ -97,7 +97,7 @@ def test_pose_errors_are_distance_and_angle() -> None:
     assert exact.grad.isfinite().all()
 
 
-def test_motions_are_apart_by_what_turns_them() -> None:
+def test_motion_errors_are_rotation_and_direction_angles() -> None:
     turn = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
     T_21 = rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, 2.0]).double())
     other = rigid(so3_exp(turn), torch.tensor([0.0, math.sin(0.1), math.cos(0.1)]).double())
@@ -130,7 +130,7 @@ def test_the_likelihood_is_that_of_a_gaussian() -> None:
     assert pose_nll(T_cw, truth, covariance, ~mask & (mask > mask)).isnan()
 
 
-def test_the_likelihood_is_best_with_the_right_covariance() -> None:
+def test_the_likelihood_is_highest_at_the_true_covariance() -> None:
     """Half and twice the true standard deviation are both worse."""
     xi, T_cw = normal(4000, 6, scale=0.01), torch.eye(4).double().expand(4000, 4, 4)
     sigmas = torch.tensor([0.005, 0.0095, 0.01, 0.0105, 0.02]).double()
@@ -159,7 +159,7 @@ def test_the_epipolar_loss_is_the_distance_from_the_line() -> None:
     torch.testing.assert_close(twice, torch.tensor(0.6**2 / (1 + 0.25)).double())
 
 
-def test_matches_outside_the_mask_may_be_anything() -> None:
+def test_masked_matches_may_be_anything() -> None:
     T_cw, pixels = scene(2)
     T_21 = T_cw[:, 1] @ se3_inverse(T_cw[:, 0])
     pixels = pixels + normal(*pixels.shape)
@@ -192,7 +192,7 @@ def test_exact_matches_and_tracks_cost_nothing() -> None:
     assert float(reprojection_loss(T_cw, pixels, CAMERA).max()) < 1e-12
 
 
-def test_tracks_bear_their_best_errors() -> None:
+def test_tracks_are_charged_their_smallest_errors() -> None:
     """Sideways, two views that are a pixel apart in y meet half a pixel from both."""
     camera = Camera.pinhole(400.0, 400.0, 159.5, 119.5, size=(320, 240))
     T_cw = rigid(torch.eye(3).double(), torch.tensor([[0.0, 0, 0], [-1.0, 0, 0]]).double())
@@ -257,7 +257,7 @@ def test_gradients_of_losses_of_matches(name: str, noise: float) -> None:
     assert gradcheck(loss, (xi, pixels, params), atol=1e-5, rtol=1e-3)
 
 
-def test_a_batch_is_its_elements() -> None:
+def test_a_batch_equals_its_elements() -> None:
     T_cw, pixels = scene()
     pixels = pixels + normal(*pixels.shape)
     truth = poses(2, 3, seed=1)
@@ -273,7 +273,7 @@ def test_a_batch_is_its_elements() -> None:
         torch.testing.assert_close(together, torch.stack(alone))
 
 
-def test_a_clip_can_be_judged_by_its_own_observations() -> None:
+def test_the_loss_of_a_clip_can_use_its_own_observations() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)
     eyes = BentEyes(walk, bend=0.02, noise_px=0.1)
@@ -294,7 +294,7 @@ def test_a_clip_can_be_judged_by_its_own_observations() -> None:
     assert 0.5 * 0.02 < values[-1] < 0.02
 
 
-def test_what_did_not_move_does_not_judge_a_clip() -> None:
+def test_failed_frames_and_unconverged_points_are_excluded_from_the_loss() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     poses = ClipSLAM(BentEyes(walk, bend=0.02))(clip_of(walk)[0], walk.camera)
     (graph,), (solution,) = poses.graphs, poses.solutions
@@ -316,7 +316,7 @@ def test_what_did_not_move_does_not_judge_a_clip() -> None:
     torch.testing.assert_close(clip_reprojection(replace(poses, solutions=(spoilt,))), expected)
 
 
-def test_the_clips_of_a_batch_are_judged_alone_and_failures_have_their_price() -> None:
+def test_clips_have_separate_losses_and_failures_a_penalty() -> None:
     walk, standing = Walk(arc(FRAMES, length=1.0)), Walk(still(FRAMES))
     seen, unseen = (ClipSLAM(BentEyes(each, bend=0.02)) for each in (walk, standing))
     good = seen(clip_of(walk)[0][None], walk.camera)
@@ -353,9 +353,7 @@ def every_loss(like: Tensor) -> dict[str, Tensor]:
     }
 
 
-def test_losses_are_where_and_as_precise_as_what_they_are_given(
-    device: torch.device, dtype: torch.dtype
-) -> None:
+def test_losses_keep_device_and_dtype(device: torch.device, dtype: torch.dtype) -> None:
     expected = every_loss(torch.zeros(1, dtype=torch.float64))
     for name, loss in every_loss(torch.zeros(1, dtype=dtype, device=device)).items():
         assert loss.dtype == dtype, name
@@ -363,7 +361,7 @@ def test_losses_are_where_and_as_precise_as_what_they_are_given(
         torch.testing.assert_close(loss.cpu().double(), expected[name], rtol=1e-3, atol=1e-4)
 
 
-def test_autocast_changes_no_bit() -> None:
+def test_autocast_does_not_change_results() -> None:
     T_cw, pixels = (x.float() for x in scene())
     pixels, truth, camera = pixels + normal(*pixels.shape).float(), T_cw.roll(1, 1), CAMERA.to(torch.float32)
     covariance = torch.eye(6).expand(2, 3, 6, 6)

@@ -39,7 +39,7 @@ def state_bytes(one: Training, folder: Path) -> bytes:
     return (folder / "state.pt").read_bytes()
 
 
-def test_a_stopped_training_ends_with_the_same_bytes(tmp_path: Path) -> None:
+def test_a_resumed_training_ends_with_the_same_bytes(tmp_path: Path) -> None:
     whole = training()
     for _ in whole:
         whole.descend(loss_of(whole))
@@ -61,23 +61,23 @@ def test_a_stopped_training_ends_with_the_same_bytes(tmp_path: Path) -> None:
     assert list(resumed) == []
 
 
-def test_a_step_is_clipped_scheduled_and_told() -> None:
-    told: list[tuple[str, float, int]] = []
-    one = training(steps=4, log=lambda *said: told.append(said))
+def test_a_step_is_clipped_scheduled_and_logged() -> None:
+    logged: list[tuple[str, float, int]] = []
+    one = training(steps=4, log=lambda *values: logged.append(values))
     rates = []
     for step in one:
         rates.append(one.optimizer.param_groups[0]["lr"])
         one.descend(1e3 * loss_of(one))
         norm = torch.stack([p.grad.norm() for p in one.module.parameters() if p.grad is not None]).norm()
         assert float(norm) == pytest.approx(MAX_NORM, rel=1e-4)
-        assert told[-2] == ("loss", one.losses[step], step)
-        assert told[-1][0] == "gradient_norm"
-        assert told[-1][1] > MAX_NORM
+        assert logged[-2] == ("loss", one.losses[step], step)
+        assert logged[-1][0] == "gradient_norm"
+        assert logged[-1][1] > MAX_NORM
     assert rates == pytest.approx([0.1, 0.1 * 0.853553, 0.05, 0.1 * 0.146447], rel=1e-5)
-    assert len(told) == 8
+    assert len(logged) == 8
 
 
-def test_another_schedule_and_another_norm() -> None:
+def test_schedule_and_gradient_norm_are_configurable() -> None:
     module = nn.Linear(3, 1)
     optimizer = torch.optim.SGD(module.parameters(), 0.5)
     schedule = torch.optim.lr_scheduler.StepLR(optimizer, 2, gamma=0.1)
@@ -91,7 +91,7 @@ def test_another_schedule_and_another_norm() -> None:
     assert lengths == pytest.approx([0.1, 0.1, 0.01, 0.01], rel=1e-3)
 
 
-def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
+def test_a_non_finite_gradient_changes_nothing() -> None:
     one = training()
     before = [parameter.clone() for parameter in one.module.parameters()]
     with pytest.raises(RuntimeError, match="non-finite"):
@@ -100,7 +100,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
     assert (one.step, one.losses) == (0, [])
 
 
-def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_checkpoint_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.pt").write_text("no")
     torch.save({"module": 1}, tmp_path / "other.pt")
     training(steps=9).save(tmp_path / "nine.pt")
@@ -118,7 +118,7 @@ def test_a_summary_writer_fits() -> None:
     inspect.signature(tensorboard.SummaryWriter.add_scalar).bind(None, "loss", 1.0, 0)
 
 
-def test_weights_of_keypoints_begin_alike_and_stay_one_in_the_mean() -> None:
+def test_keypoint_weights_start_equal_and_keep_mean_one() -> None:
     features = ORB(50)(torch.rand(2, 1, 96, 128, generator=torch.Generator().manual_seed(0)))
     weigh = Weigh()
     assert torch.equal(weigh(features), torch.ones(2, 50))
@@ -143,7 +143,7 @@ def clips() -> Clips:
     return Clips([room], frames=4, per_sequence=3, min_parallax=0.03)
 
 
-def test_the_example_goes_on_to_the_same_bytes(clips: Clips, tmp_path: Path) -> None:
+def test_the_example_resumes_to_the_same_bytes(clips: Clips, tmp_path: Path) -> None:
     whole = train(clips, 4, tmp_path / "whole.pt", batch=2, save_every=2)
     with pytest.raises(Stopped):
         train(clips, 4, tmp_path / "part.pt", batch=2, save_every=2, log=stop)
@@ -164,7 +164,7 @@ def _train_as(rank: int, ranks: int, store: str, clips: Clips, folder: Path) -> 
 
 
 @pytest.mark.slow
-def test_two_processes_stop_and_go_on_to_the_same_bytes(clips: Clips, tmp_path: Path) -> None:
+def test_two_processes_resume_to_the_same_bytes(clips: Clips, tmp_path: Path) -> None:
     arguments = (2, str(tmp_path / "store"), clips, tmp_path)
     mp.start_processes(_train_as, arguments, nprocs=2, start_method="spawn")
     assert (tmp_path / "part.pt").read_bytes() == (tmp_path / "whole.pt").read_bytes()

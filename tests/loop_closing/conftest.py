@@ -1,4 +1,4 @@
-"""Two worlds of one scene that do not know of each other."""
+"""Two separate submaps of one scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A way around in a circle: its end sees what its start saw, as points of its own, and has drifted."""
+"""A circular path with drift whose end sees the scene of its start as separate points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from tests.map.simulated import tracked_at
+from tests.map.simulated import estimate_at
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import Config
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp
@@ -16,7 +16,7 @@ from torchslam.map.atlas import Submap
 from torchslam.tracking.tracker import Tracker
 
 KEYFRAMES = 30
-EARLY, LATE = 7, 18  # what the first seven see is made anew by those from the eighteenth on
+EARLY, LATE = 7, 18  # points seen by the first seven are duplicated from the eighteenth on
 END = KEYFRAMES - 1
 
 
@@ -38,8 +38,8 @@ def around(count: int = KEYFRAMES) -> Tensor:
     return se3_inverse(rigid(R_wc, R_wc @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)))
 
 
-def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
-    """Once around in the frame of the first camera; per keyframe the unit shrinks by `scale` and the way bends."""
+def ring_submap(scale: float = 1.0, twist: float = 0.0) -> Submap:
+    """One round in the frame of the first camera; per keyframe the scale drifts by `scale` and the path bends."""
     scene, T_cw = ring(), around()
     submap = Submap.empty(0, CAMERA.params)
     rows: dict[tuple[int, bool], int] = {}
@@ -59,7 +59,7 @@ def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
             early.update(seen)
         ids = torch.tensor([rows[name] for name in names])
         submap.map.add_observations(keyframe, at, ids)
-        submap.posed_frames.add(view, tracked_at(true, ids, at), pose(), keyframe)
+        submap.posed_frames.add(view, estimate_at(true, ids, at), pose(), keyframe)
     submap.map.update_appearance(torch.arange(KEYFRAMES))
     submap.apply_sim3_correction(drifted(T_cw, scale, twist))
     Tracker(CAMERA, Config()).reset_to_keyframe(submap, END)
@@ -67,7 +67,7 @@ def ring_world(scale: float = 1.0, twist: float = 0.0) -> Submap:
 
 
 def drifted(T_cw: Tensor, scale: float, twist: float) -> Tensor:
-    """(K, 4, 4) similarities of a way of which every step is a little wrong, the first one at the origin."""
+    """(K, 4, 4) similarities of a path with a small error in every step, the first one at the origin."""
     step = se3_exp(torch.tensor([0, 0, 0, twist, 0.5 * twist, 0], dtype=torch.float64))
     step[:3, :3] *= scale
     S_cw = [torch.eye(4, dtype=torch.float64)]

@@ -24,24 +24,24 @@ def edges(*ranges: tuple[int, int]) -> list[list[int]]:
     return essential_edges(keyframes_that_see(*ranges)).tolist()
 
 
-def test_each_keyframe_holds_on_to_the_earlier_one_that_shares_most() -> None:
+def test_each_keyframe_is_joined_to_the_most_covisible_earlier_one() -> None:
     assert edges((0, 50), (20, 70), (45, 95), (10, 60)) == [[0, 1], [0, 3], [1, 2]]
 
 
-def test_one_shared_point_is_a_tie() -> None:
+def test_one_shared_point_is_an_edge() -> None:
     assert edges((0, 20), (30, 50), (19, 21)) == [[0, 1], [0, 2]]
 
 
-def test_a_keyframe_that_shares_nothing_holds_on_to_the_one_before() -> None:
+def test_a_keyframe_without_shared_points_is_joined_to_the_previous_one() -> None:
     assert edges((0, 20), (15, 30), (40, 50)) == [[0, 1], [1, 2]]
 
 
-def test_those_that_share_much_are_tied_as_well() -> None:
+def test_highly_covisible_keyframes_are_joined_as_well() -> None:
     assert STRONG == 100
     assert edges((0, 150), (0, 120), (20, 150)) == [[0, 1], [0, 2], [1, 2]]
     assert edges((0, 150), (0, 119), (20, 150)) == [[0, 1], [0, 2]]
     assert edges((0, 150), (0, 120), (20, 150), (30, 150)) == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
 
 
-def test_a_lonely_keyframe_has_no_edges() -> None:
+def test_a_single_keyframe_has_no_edges() -> None:
     assert essential_edges(keyframes_that_see((0, 5))).shape == (0, 2)

@@ -47,14 +47,14 @@ def answer_alike(left: KeyframeDatabase, right: KeyframeDatabase) -> bool:
 # --- words and codes -----------------------------------------------------------------------------------------
 
 
-def test_the_words_that_come_along_differ() -> None:
+def test_the_bundled_visual_words_are_distinct() -> None:
     words = rendered_words(torch.device("cpu"))
     assert words.shape == (1024, 32)
     assert words.dtype == torch.uint8
     assert len(torch.unique(words, dim=0)) > 1000
 
 
-def test_words_are_the_nearest_and_the_lower_of_equals() -> None:
+def test_descriptors_choose_the_nearest_word_and_the_lower_of_equals() -> None:
     words = noise(40, 32)
     words[7] = words[3]
     used, _ = words_and_codes(torch.stack([words[7], words[30], words[12]]), words)
@@ -64,7 +64,7 @@ def test_words_are_the_nearest_and_the_lower_of_equals() -> None:
     assert used.tolist() == sorted(set(hamming(descriptors, words).argmin(1).tolist()))
 
 
-def test_codes_are_the_majority_of_what_shares_a_word() -> None:
+def test_codes_are_the_majority_bits_of_a_word() -> None:
     words = noise(2, 32)
     three = torch.stack([blurred(words[1], 0.2, seed) for seed in range(3)])
     used, codes = words_and_codes(three, words)
@@ -75,7 +75,7 @@ def test_codes_are_the_majority_of_what_shares_a_word() -> None:
 
 
 @pytest.mark.parametrize("distance", [0, 1, 9, 19, 20, 64])
-def test_likeness_falls_with_the_distance_and_ends(distance: int) -> None:
+def test_similarity_falls_with_distance_and_ends_at_zero(distance: int) -> None:
     code = torch.tensor([0x0123456789ABCDEF])
     bits = sum(1 << (3 * bit % 64) for bit in range(distance))  # 3 and 64 have no divisor in common
     other = code ^ torch.tensor([bits - (1 << 64) if bits >= 1 << 63 else bits])
@@ -83,7 +83,7 @@ def test_likeness_falls_with_the_distance_and_ends(distance: int) -> None:
     assert float(likeness(code, other)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_floats_become_bits_that_keep_their_angles(generator: torch.Generator) -> None:
+def test_binarized_floats_keep_their_angles(generator: torch.Generator) -> None:
     floats = torch.nn.functional.normalize(torch.randn(30, 64, generator=generator), dim=1)
     bits = binary(floats)
     angles = torch.acos((floats @ floats.T).clamp(-1, 1))
@@ -98,7 +98,7 @@ def test_floats_become_bits_that_keep_their_angles(generator: torch.Generator) -
 # --- scores --------------------------------------------------------------------------------------------------
 
 
-def test_known_scores() -> None:
+def test_scores_have_known_values() -> None:
     # One word each: rare ones, of one image in two, weigh log(3)^2, the common one log(3 / 2)^2.
     words = noise(3, 32)
     database = KeyframeDatabase(words)
@@ -110,14 +110,14 @@ def test_known_scores() -> None:
     assert scores.tolist() == pytest.approx([1.0, common / (rare + common)], rel=1e-5)
 
 
-def test_an_image_is_like_itself_and_unlike_noise() -> None:
+def test_an_image_is_similar_to_itself_and_not_to_noise() -> None:
     keys, scores = places_of(5, 3, 9).query(*image(3))
     assert int(keys[0]) == 3
     assert float(scores[0]) == pytest.approx(1.0)
     assert float(scores[1]) < 0.1
 
 
-def test_a_masked_row_does_not_count() -> None:
+def test_masked_keypoints_are_ignored() -> None:
     descriptors, mask = image(1)
     mask[20:] = False
     first, second = KeyframeDatabase(), KeyframeDatabase()
@@ -128,7 +128,7 @@ def test_a_masked_row_does_not_count() -> None:
     assert float(first.query(descriptors, mask)[1]) == pytest.approx(1.0)
 
 
-def test_only_the_strongest_count() -> None:
+def test_only_the_strongest_keypoints_count() -> None:
     descriptors, mask = image(0, 700)
     first, second = KeyframeDatabase(), KeyframeDatabase()
     first.add(0, descriptors, mask)
@@ -139,7 +139,7 @@ def test_only_the_strongest_count() -> None:
     assert not answer_alike(first, third)
 
 
-def test_more_keyframes_than_the_first_room_and_equal_scores_by_key() -> None:
+def test_capacity_grows_and_ties_are_ordered_by_key() -> None:
     database = KeyframeDatabase()
     for key in reversed(range(200)):
         database.add(key, *image(key % 100))
@@ -150,7 +150,7 @@ def test_more_keyframes_than_the_first_room_and_equal_scores_by_key() -> None:
     assert bool((scores.diff() <= 0).all())
 
 
-def test_nothing_to_ask_and_nothing_to_remember() -> None:
+def test_empty_queries_and_empty_keyframes() -> None:
     nothing = torch.zeros(0, 32, dtype=torch.uint8), torch.zeros(0, dtype=torch.bool)
     keys, scores = KeyframeDatabase().query(*image(0))
     assert len(keys) == len(scores) == 0
@@ -164,7 +164,7 @@ def test_nothing_to_ask_and_nothing_to_remember() -> None:
 # --- changes -------------------------------------------------------------------------------------------------
 
 
-def test_removal_leaves_no_trace_and_its_room_is_used_again() -> None:
+def test_removed_keyframes_leave_no_trace_and_free_their_slot() -> None:
     database = places_of(0, 1, 2, 3)
     database.remove(torch.tensor([1, 2]))
     assert answer_alike(database, places_of(0, 3))
@@ -177,7 +177,7 @@ def test_removal_leaves_no_trace_and_its_room_is_used_again() -> None:
 
 
 @pytest.mark.parametrize("key", [-1, 0])
-def test_a_key_must_be_new(key: int) -> None:
+def test_a_duplicate_key_is_an_error(key: int) -> None:
     with pytest.raises(ValueError, match="key"):
         places_of(0).add(key, *image(1))
 
@@ -185,7 +185,7 @@ def test_a_key_must_be_new(key: int) -> None:
 # --- other front ends and devices ----------------------------------------------------------------------------
 
 
-def test_floats_choose_their_words_and_keep_them(generator: torch.Generator) -> None:
+def test_float_descriptors_fix_their_words_once(generator: torch.Generator) -> None:
     floats = torch.nn.functional.normalize(torch.randn(6, 100, 64, generator=generator), dim=-1)
     mask = torch.ones(100, dtype=torch.bool)
     database = KeyframeDatabase()
@@ -203,7 +203,7 @@ def test_floats_choose_their_words_and_keep_them(generator: torch.Generator) -> 
         assert float(scores[0]) > 3 * float(scores[1])
 
 
-def test_on_any_device(device: torch.device) -> None:
+def test_queries_run_on_any_device(device: torch.device) -> None:
     database, expected = KeyframeDatabase(), places_of(0, 1, 2)
     for key in range(3):
         descriptors, mask = image(key)
@@ -220,7 +220,7 @@ def test_on_any_device(device: torch.device) -> None:
 # --- places --------------------------------------------------------------------------------------------------
 
 
-def test_the_true_place_wins_among_rendered_ones() -> None:
+def test_the_true_place_scores_highest_in_a_rendered_sequence() -> None:
     # Frames 160 on pass the places of the first round again, on another sway.
     orb, database = ORB(500), KeyframeDatabase()
     sequence = open_sequence("synthetic:room?frames=320")
@@ -237,7 +237,7 @@ def test_the_true_place_wins_among_rendered_ones() -> None:
 
 
 @pytest.mark.parametrize("floats", [False, True])
-def test_a_keyframe_that_is_there_asks_as_its_image_does(floats: bool) -> None:
+def test_a_query_by_key_equals_a_query_by_image(floats: bool) -> None:
     database = KeyframeDatabase()
     for key in range(4):
         descriptors, mask = image(key % 3, count=100)

@@ -1,4 +1,4 @@
-"""Loops that drifted come back, and worlds become one."""
+"""Drifted loops are closed, and submaps are merged."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.loop_closing.ring import END, around, ring, ring_world
-from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
+from tests.loop_closing.ring import END, around, ring, ring_submap
+from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, sim3_inverse
 from torchslam.geometry.similarity import umeyama
@@ -34,7 +34,7 @@ OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 def error(submap: Submap) -> float:
     """The root mean square error of the keyframes, aligned to the truth."""
-    estimate, truth = centre(submap.map.T_cw), centre(around())
+    estimate, truth = camera_center(submap.map.T_cw), camera_center(around())
     scale, R, t = umeyama(estimate, truth)
     return float((scale * estimate @ R.mT + t - truth).square().sum(-1).mean().sqrt())
 
@@ -45,8 +45,8 @@ def loop(submap: Submap) -> LoopCandidate:
     return LoopCandidate(submap, END, submap, 0, relation)
 
 
-def test_a_way_that_drifted_comes_back() -> None:
-    submap = ring_world(scale=1.01, twist=0.002)
+def test_a_drifted_loop_is_closed() -> None:
+    submap = ring_submap(scale=1.01, twist=0.002)
     assert error(submap) > 0.1
     points = submap.map.num_points
     close_loop(loop(submap), CAMERA, CONFIG)
@@ -61,8 +61,8 @@ def visible_points(keyframe: int, T_cw: Tensor) -> Tensor:
     return ring().shows(keyframe)[view.mask]
 
 
-def test_the_graph_alone_spreads_the_drift_over_the_way() -> None:
-    submap = ring_world(scale=1.01, twist=0.002)
+def test_the_pose_graph_distributes_the_drift_along_the_loop() -> None:
+    submap = ring_submap(scale=1.01, twist=0.002)
     found = loop(submap)
     S_cw = essential_graph_solution(found)
     torch.testing.assert_close(S_cw[0], submap.map.T_cw[0])
@@ -77,8 +77,8 @@ def test_the_graph_alone_spreads_the_drift_over_the_way() -> None:
     assert error(submap) < 0.1
 
 
-def test_without_a_drift_nothing_moves() -> None:
-    submap = ring_world()
+def test_a_loop_without_drift_moves_nothing() -> None:
+    submap = ring_submap()
     T_cw = submap.map.T_cw.clone()
     close_loop(loop(submap), CAMERA, CONFIG)
     torch.testing.assert_close(submap.map.T_cw, T_cw, atol=1e-4, rtol=0)
@@ -87,7 +87,7 @@ def test_without_a_drift_nothing_moves() -> None:
 
 def test_the_final_adjustment_can_be_left_out() -> None:
     for override in ("loop_closing.global_bundle_adjustment=false", "bundle_adjustment.local=false"):
-        submap = ring_world(scale=1.01, twist=0.002)
+        submap = ring_submap(scale=1.01, twist=0.002)
         found = loop(submap)
         T_cw = essential_graph_solution(found)
         close_loop(found, CAMERA, load_config(None, [override]))
@@ -97,21 +97,21 @@ def test_the_final_adjustment_can_be_left_out() -> None:
         assert len(submap.map.observed_points(torch.tensor([0]))) > 0
 
 
-@pytest.mark.parametrize("asks", ["younger", "older"])
-def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
-    older = world_in(SCENE, sideways(4), number=0)
-    younger = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
-    if asks == "younger":
+@pytest.mark.parametrize("query", ["younger", "older"])
+def test_two_submaps_are_merged(S_21: Tensor, query: str) -> None:
+    older = submap_of_scene(SCENE, sideways(4), number=0)
+    younger = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+    if query == "younger":
         found = LoopCandidate(younger, 3, older, 2, RelativeSim3(sim3_inverse(S_21), 0, 0, 0))
     else:
         found = LoopCandidate(older, 3, younger, 2, RelativeSim3(S_21, 0, 0, 0))
-    camera = younger if asks == "younger" else older
-    last = moved(camera.T_cw, sim3_inverse(S_21)) if asks == "younger" else camera.T_cw.clone()
+    camera = younger if query == "younger" else older
+    last = moved(camera.T_cw, sim3_inverse(S_21)) if query == "younger" else camera.T_cw.clone()
     submap, keyframe = merge_maps(found, CAMERA, CONFIG)
     assert submap is older
     assert submap.map.num_keyframes == 8
     assert len(younger.map.keyframes) == 0
-    assert int(submap.map.keyframes["frame_index"][keyframe]) == (103 if asks == "younger" else 3)
+    assert int(submap.map.keyframes["frame_index"][keyframe]) == (103 if query == "younger" else 3)
     torch.testing.assert_close(submap.map.T_cw, torch.cat([sideways(4), OTHER]), atol=1e-5, rtol=0)
     torch.testing.assert_close(submap.T_cw, last, atol=1e-5, rtol=0)
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), submap.map.T_cw, atol=1e-5, rtol=0)
@@ -121,9 +121,9 @@ def test_two_worlds_become_one(S_21: Tensor, asks: str) -> None:
     assert int(shared[6]) > 100
 
 
-def test_welding_merges_around_both_places(S_21: Tensor) -> None:
-    submap = world_in(SCENE, sideways(4))
-    submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
+def test_a_closure_fuses_landmarks_around_both_keyframes(S_21: Tensor) -> None:
+    submap = submap_of_scene(SCENE, sideways(4))
+    submap.merge(submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
     count = submap.map.num_points
     fuse_and_adjust(submap, 5, 1, CAMERA, CONFIG)
     assert submap.map.num_points < 0.6 * count
@@ -138,11 +138,13 @@ VISIT = 4  # keyframes
 
 def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     """A place seen by four keyframes, then something else, then by four others: of its points `tied` are tied."""
-    submap = world_in(SCENE, sideways(VISIT))
+    submap = submap_of_scene(SCENE, sideways(VISIT))
     if between:
-        submap.merge(world_in(SCENE, sideways(2), S_ws=pose(50.0), first=50), pose(-50.0) @ pose(0, 0, 90.0))
+        submap.merge(
+            submap_of_scene(SCENE, sideways(2), S_ws=pose(50.0), first=50), pose(-50.0) @ pose(0, 0, 90.0)
+        )
     first = submap.map.num_keyframes
-    submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
+    submap.merge(submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
     looks = submap.map.points["descriptors"].long() @ torch.arange(1, 33)
     early, late = (submap.map.observed_points(torch.arange(start, start + VISIT)) for start in (0, first))
     same = torch.nonzero(looks[late][:, None] == looks[early])[:tied]
@@ -152,7 +154,7 @@ def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     return submap
 
 
-def test_who_was_here_at_another_time(S_21: Tensor) -> None:
+def test_earlier_visits_are_keyframes_of_another_time(S_21: Tensor) -> None:
     submap = two_visits(S_21)
     last = submap.map.num_keyframes - 1
     assert set(earlier_visit_keyframes(submap.map, last).tolist()) == {0, 1, 2, 3}
@@ -161,7 +163,7 @@ def test_who_was_here_at_another_time(S_21: Tensor) -> None:
     assert earlier_visit_keyframes(two_visits(S_21, between=False).map, last - 2).tolist() == []
 
 
-def test_time_is_that_of_the_frames(S_21: Tensor) -> None:
+def test_visits_are_separated_by_frame_time(S_21: Tensor) -> None:
     submap = two_visits(S_21)
     frames = submap.map.keyframes["frame_index"]
     frames[:] = frames.max() - frames  # the last keyframe came first
@@ -169,7 +171,7 @@ def test_time_is_that_of_the_frames(S_21: Tensor) -> None:
     assert set(earlier_visit_keyframes(submap.map, 0).tolist()) == {6, 7, 8, 9}
 
 
-def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> None:
+def test_a_new_keyframe_is_fused_with_every_keyframe_of_an_earlier_visit(S_21: Tensor) -> None:
     submap = two_visits(S_21)
     last = submap.map.num_keyframes - 1
     early = torch.arange(VISIT)
@@ -186,14 +188,14 @@ def test_a_later_keyframe_is_tied_to_all_of_an_earlier_visit(S_21: Tensor) -> No
     assert bool(torch.isin(seen, submap.tracking.local_points).all())
 
 
-def test_without_an_earlier_visit_nothing_is_tied(S_21: Tensor) -> None:
+def test_without_an_earlier_visit_nothing_is_fused(S_21: Tensor) -> None:
     submap = two_visits(S_21, tied=0)
     table = submap.map.keyframes["point_ids"].clone()
     fuse_with_earlier_visits(submap, submap.map.num_keyframes - 1, CAMERA, CONFIG)
     assert torch.equal(submap.map.keyframes["point_ids"], table)
 
 
-def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
+def test_landmarks_are_fused_from_both_sides(S_21: Tensor) -> None:
     """What one side's keyframes see no point at is filled by the points of the other side, and the other way round."""
     submap = two_visits(S_21, tied=0, between=False)
     here, there = torch.arange(VISIT, 2 * VISIT), torch.arange(VISIT)
@@ -206,15 +208,15 @@ def test_sewing_searches_on_both_sides(S_21: Tensor) -> None:
     assert int(submap.map.count_observed(submap.map.observed_points(there))[VISIT + 2]) > 100
 
 
-def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) -> None:
+def test_duplicates_found_after_the_adjustment_are_merged_too(S_21: Tensor) -> None:
     """The two sides lie 4 px apart: at first only coarse keypoints are near enough, adjusted all are."""
     counts = []
     for override in (
         "loop_closing.global_bundle_adjustment=false",
         "loop_closing.global_bundle_adjustment=true",
     ):
-        submap = world_in(SCENE, sideways(4))
-        submap.merge(world_in(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
+        submap = submap_of_scene(SCENE, sideways(4))
+        submap.merge(submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
         fuse_and_adjust(submap, 5, 1, CAMERA, load_config(None, [override]))
         looks = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
         counts.append((submap.map.num_points, len(looks)))
@@ -223,7 +225,7 @@ def test_what_is_found_after_the_adjustment_alone_is_merged_too(S_21: Tensor) ->
     assert tied == different
 
 
-def test_the_memory_ties_what_it_need_not_recognise(S_21: Tensor) -> None:
+def test_the_loop_closer_fuses_earlier_visits_without_detection(S_21: Tensor) -> None:
     for enabled in (True, False):
         submap, atlas = two_visits(S_21), Atlas(CAMERA.params)
         atlas._submaps = [submap]

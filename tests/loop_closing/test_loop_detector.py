@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.loop_closing.ring import END, KEYFRAMES, ring_world
-from tests.scene import CAMERA, Scene, centre, pose, sideways, world_in
+from tests.loop_closing.ring import END, KEYFRAMES, ring_submap
+from tests.scene import CAMERA, Scene, camera_center, pose, sideways, submap_of_scene
 from torchslam.config import Config, LoopClosingConfig, load_config
 from torchslam.geometry import sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
@@ -30,7 +30,7 @@ OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
 def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetector:
-    """One that knows all keyframes of these worlds."""
+    """A detector whose database holds all keyframes of these submaps."""
     atlas, database = Atlas(CAMERA.params), KeyframeDatabase()
     atlas._submaps = list(held)
     for submap in held:
@@ -40,15 +40,15 @@ def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetecto
     return LoopDetector(CAMERA, load_config(None, overrides), atlas, database)
 
 
-def two_worlds(S_21: Tensor) -> tuple[Submap, Submap]:
-    return world_in(SCENE, sideways(4)), world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:
+    return submap_of_scene(SCENE, sideways(4)), submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
 
 
 # --- recognising ------------------------------------------------------------------------------------------------
 
 
-def test_another_world_of_the_same_place_is_recognised(S_21: Tensor) -> None:
-    one, other = two_worlds(S_21)
+def test_another_submap_of_the_same_place_is_detected(S_21: Tensor) -> None:
+    one, other = two_submaps(S_21)
     found = loop_detector(one, other).detect(other, 3)
     assert found is not None
     assert (found.submap, found.keyframe, found.other) == (other, 3, one)
@@ -57,8 +57,8 @@ def test_another_world_of_the_same_place_is_recognised(S_21: Tensor) -> None:
     assert found.closure == LoopClosureRecord(frame=103, place=found.place, submap=1, other=0)
 
 
-def test_a_loop_that_drifted_is_recognised() -> None:
-    submap = ring_world(scale=1.01, twist=0.002)
+def test_a_drifted_loop_is_detected() -> None:
+    submap = ring_submap(scale=1.01, twist=0.002)
     found = loop_detector(submap).detect(submap, END)
     assert found is not None
     assert found.is_loop
@@ -68,28 +68,28 @@ def test_a_loop_that_drifted_is_recognised() -> None:
     assert scale == pytest.approx(1.01 ** (END - found.place), rel=0.02)
 
 
-def test_a_place_that_was_never_left_is_no_news() -> None:
-    submap = world_in(SCENE, sideways(6))
+def test_a_place_that_was_never_left_is_no_loop() -> None:
+    submap = submap_of_scene(SCENE, sideways(6))
     assert loop_detector(submap).detect(submap, 5) is None
 
 
-def test_a_place_that_looks_alike_elsewhere_is_no_loop() -> None:
-    """A hundred metres on everything looks the same; no drift takes a camera that far on a way of a hundred metres."""
-    submap = world_in(SCENE, sideways(4))
-    submap.merge(world_in(SCENE, OTHER, first=50), pose(0, 0, 100.0))
+def test_a_similar_looking_place_elsewhere_is_no_loop() -> None:
+    """A hundred meters later everything looks the same; no drift is that large over a hundred meters."""
+    submap = submap_of_scene(SCENE, sideways(4))
+    submap.merge(submap_of_scene(SCENE, OTHER, first=50), pose(0, 0, 100.0))
     assert loop_detector(submap).detect(submap, 7) is None
     found = loop_detector(submap, overrides=("loop_closing.max_drift=1.1",)).detect(submap, 7)
     assert found is not None
     torch.testing.assert_close(found.relation.S_21, pose(0, 0, -100.0), atol=1e-5, rtol=0)
 
 
-def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
-    one, other = two_worlds(S_21)
+def test_neighboring_keyframes_must_verify_a_loop(S_21: Tensor) -> None:
+    one, other = two_submaps(S_21)
     other.map.keyframes["keypoints"][:3] += 40.0  # these see nothing where it should be
     assert loop_detector(one, other).detect(other, 3) is None
     alone = loop_detector(one, other, overrides=("loop_closing.min_confirming_keyframes=0",))
     assert alone.detect(other, 3) is not None
-    one, other = two_worlds(S_21)
+    one, other = two_submaps(S_21)
     other.map.keyframes["keypoints"][:1] += 40.0
     assert loop_detector(one, other).detect(other, 3) is not None
     assert (
@@ -98,8 +98,8 @@ def test_keyframes_beside_it_have_to_confirm(S_21: Tensor) -> None:
     )
 
 
-def test_what_two_steps_reach() -> None:
-    slam_map = ring_world().map
+def test_covisibility_reaches_two_steps() -> None:
+    slam_map = ring_submap().map
     near = covisible_twice(slam_map, 10)
     shared = slam_map.count_observed(slam_map.observed_points(torch.tensor([10])))
     assert set(torch.nonzero(shared)[:, 0].tolist()) <= set(near.tolist())
@@ -114,8 +114,8 @@ def test_what_two_steps_reach() -> None:
 
 
 def way() -> Submap:
-    """Eleven keyframes, a metre apart, of which the first and the last are compared: ten metres."""
-    return world_in(Scene.of(50), sideways(11, step=1.0))
+    """Eleven keyframes, a meter apart; the first and the last are ten meters apart."""
+    return submap_of_scene(Scene.of(50), sideways(11, step=1.0))
 
 
 def drifts(
@@ -127,7 +127,7 @@ def drifts(
     )
 
 
-def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
+def test_the_allowed_position_drift_grows_with_path_length() -> None:
     assert drifts(pose(0, 1.99))
     assert not drifts(pose(0, 2.01))
     assert drifts(pose(0, 0, 0.99), place=5)
@@ -136,31 +136,31 @@ def test_a_drift_of_position_goes_with_the_length_of_the_way() -> None:
     assert drifts(pose(0, 3.99), max_drift=0.4)
 
 
-def test_the_way_is_that_in_which_the_frames_came() -> None:
+def test_path_length_follows_the_order_of_the_frames() -> None:
     submap = way()
     submap.map.keyframes["frame_index"][:] = torch.tensor([0, 5, 1, 6, 2, 7, 3, 8, 4, 9, 10])
-    # to and fro: 2, 2, 2, 2, then 7 back, 2, 2, 2, 2 and 1: 24 metres
+    # to and fro: 2, 2, 2, 2, then 7 back, 2, 2, 2, 2 and 1: 24 meters
     assert drifts(pose(0, 4.79), submap)
     assert not drifts(pose(0, 4.81), submap)
 
 
-def test_the_position_is_that_of_the_camera() -> None:
-    here = centre(way().map.T_cw[10])
+def test_drift_is_measured_at_the_camera_center() -> None:
+    here = camera_center(way().map.T_cw[10])
     about = pose(*here.tolist()) @ pose(0, 0, 0, 0, math.radians(19.0)) @ pose(*(-here).tolist())
     assert drifts(about)
     assert not drifts(pose(0, 0, 0, 0, math.radians(19.0)))  # about the origin the camera moves by 3.3 m
 
 
-def test_a_drift_of_direction_is_bounded() -> None:
-    here = centre(way().map.T_cw[10])
+def test_rotation_drift_is_bounded() -> None:
+    here = camera_center(way().map.T_cw[10])
     for degrees, may in ((19.9, True), (20.1, False)):
         about = pose(*here.tolist()) @ pose(0, 0, 0, math.radians(degrees)) @ pose(*(-here).tolist())
         assert drifts(about) is may
 
 
 @pytest.mark.parametrize(("scale", "may"), [(4.99, True), (5.01, False), (1 / 4.99, True), (1 / 5.01, False)])
-def test_a_drift_of_scale_is_bounded(scale: float, may: bool) -> None:
-    here = centre(way().map.T_cw[10])
+def test_scale_drift_is_bounded(scale: float, may: bool) -> None:
+    here = camera_center(way().map.T_cw[10])
     grown = rescaling(torch.tensor(scale).double())
     grown = pose(*here.tolist()) @ grown @ pose(*(-here).tolist())
     assert drifts(grown) is may
@@ -172,19 +172,19 @@ def test_a_drift_of_scale_is_bounded(scale: float, may: bool) -> None:
 
 
 def answers(S_1: Tensor, S_2: Tensor, same: bool = True) -> bool:
-    one, other = world_in(SCENE, sideways(4)), world_in(SCENE, sideways(4), number=1)
-    third = other if same else world_in(SCENE, sideways(4), number=2)
+    one, other = submap_of_scene(SCENE, sideways(4)), submap_of_scene(SCENE, sideways(4), number=1)
+    third = other if same else submap_of_scene(SCENE, sideways(4), number=2)
     first = LoopCandidate(one, 2, other, 1, RelativeSim3(S_1, 0, 0, 0))
     return are_consistent(first, LoopCandidate(one, 2, third, 1, RelativeSim3(S_2, 0, 0, 0)))
 
 
 def about(S: Tensor) -> Tensor:
     """The same about the camera of keyframe 2."""
-    here = centre(sideways(4)[2])
+    here = camera_center(sideways(4)[2])
     return pose(*here.tolist()) @ S @ pose(*(-here).tolist())
 
 
-def test_answers_agree_that_say_nearly_the_same() -> None:
+def test_candidates_with_nearly_equal_similarities_agree() -> None:
     degree = math.pi / 180
     assert answers(pose(), pose())
     for near, far in (
@@ -198,22 +198,22 @@ def test_answers_agree_that_say_nearly_the_same() -> None:
         assert not answers(pose(), about(far))
 
 
-def test_answers_are_compared_where_the_camera_is(S_21: Tensor) -> None:
+def test_candidates_are_compared_at_the_camera(S_21: Tensor) -> None:
     assert answers(S_21, S_21)
     turned = pose(0, 0, 0, 0, 0, 0.08)
     assert answers(S_21, S_21 @ about(turned))
     assert not answers(S_21, S_21 @ pose(3.0, 4.0) @ turned @ pose(-3.0, -4.0))
 
 
-def test_of_different_worlds_nothing_can_be_said() -> None:
+def test_candidates_in_different_submaps_are_not_compared() -> None:
     assert answers(pose(5.0), pose(), same=False)
 
 
-def test_two_places_that_both_might_be_it_are_none(S_21: Tensor) -> None:
-    """A world with two corridors that look the same: which of them it is, nobody knows."""
-    twin = world_in(SCENE, sideways(4), first=0)
-    twin.merge(world_in(SCENE, sideways(4), first=50), pose(100.0))
-    one = world_in(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+def test_two_contradicting_candidates_are_no_loop(S_21: Tensor) -> None:
+    """Two corridors of one submap look the same, so a place in them is ambiguous."""
+    twin = submap_of_scene(SCENE, sideways(4), first=0)
+    twin.merge(submap_of_scene(SCENE, sideways(4), first=50), pose(100.0))
+    one = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
     assert loop_detector(twin, one).detect(one, 3) is None
     assert loop_detector(twin, one, overrides=("loop_closing.max_candidates=1",)).detect(one, 3) is not None
     assert Config().loop_closing.max_candidates == 3

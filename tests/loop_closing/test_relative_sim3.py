@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, transform
 from torchslam.geometry.similarity import Similarity
@@ -32,8 +32,8 @@ TWO = 100  # first frame of the second map
 
 
 def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
-    one = world_in(SCENE, ONE, noise=noise)
-    other = world_in(SCENE, OTHER, S_ws=S_21, first=TWO, number=1, noise=noise)
+    one = submap_of_scene(SCENE, ONE, noise=noise)
+    other = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=TWO, number=1, noise=noise)
     return one.map, other.map
 
 
@@ -41,7 +41,7 @@ def related(map_1: Map, map_2: Map, *overrides: str) -> RelativeSim3 | None:
     return estimate_relative_sim3(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
 
 
-def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
+def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     relation = related(map_1, map_2)
     assert relation is not None
@@ -54,14 +54,14 @@ def test_the_similarity_between_two_maps_is_found(S_21: Tensor) -> None:
     assert relation.backward == len(back & here)
 
 
-def test_the_other_way_round_it_is_the_inverse(S_21: Tensor) -> None:
+def test_the_reverse_similarity_is_the_inverse(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     relation = estimate_relative_sim3(map_2, 1, map_1, 2, CAMERA, Config())
     assert relation is not None
     torch.testing.assert_close(relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
 
 
-def test_noise_moves_it_a_little(S_21: Tensor) -> None:
+def test_noise_changes_the_similarity_little(S_21: Tensor) -> None:
     relation = related(*maps(S_21, noise=0.5))
     assert relation is not None
     points = SCENE.points_w[:50]
@@ -71,7 +71,7 @@ def test_noise_moves_it_a_little(S_21: Tensor) -> None:
 
 
 @pytest.mark.parametrize(("known", "samples"), [(12, 1), (24, 69), (60, 1147), (120, 3000)])
-def test_no_more_samples_are_drawn_than_would_have_found_enough_matches(
+def test_sampling_stops_when_enough_matches_would_have_been_found(
     S_21: Tensor, monkeypatch: pytest.MonkeyPatch, known: int, samples: int
 ) -> None:
     map_1, map_2 = maps(S_21)
@@ -88,8 +88,8 @@ def test_no_more_samples_are_drawn_than_would_have_found_enough_matches(
     assert drawn == [samples]
 
 
-def test_a_map_is_related_to_itself_by_nothing_at_all() -> None:
-    slam_map = world_in(SCENE, ONE).map
+def test_a_map_is_related_to_itself_by_the_identity() -> None:
+    slam_map = submap_of_scene(SCENE, ONE).map
     relation = estimate_relative_sim3(slam_map, 3, slam_map, 0, CAMERA, Config())
     assert relation is not None
     torch.testing.assert_close(relation.S_21, pose(), atol=1e-6, rtol=0)
@@ -97,14 +97,14 @@ def test_a_map_is_related_to_itself_by_nothing_at_all() -> None:
 
 def test_another_scene_is_not_related(S_21: Tensor) -> None:
     map_1, _ = maps(S_21)
-    elsewhere = world_in(Scene.of(300, seed=9), OTHER, first=TWO).map
+    elsewhere = submap_of_scene(Scene.of(300, seed=9), OTHER, first=TWO).map
     assert related(map_1, elsewhere) is None
 
 
-def test_points_that_look_alike_but_lie_elsewhere_are_not_related(S_21: Tensor) -> None:
+def test_similar_descriptors_at_other_positions_are_not_related(S_21: Tensor) -> None:
     map_1, _ = maps(S_21)
     looks = Scene(Scene.of(300, seed=9).points_w, SCENE.sizes, SCENE.descriptors)
-    assert related(map_1, world_in(looks, OTHER, first=TWO).map) is None
+    assert related(map_1, submap_of_scene(looks, OTHER, first=TWO).map) is None
 
 
 def thinned(slam_map: Map, points: Tensor) -> Map:
@@ -141,7 +141,7 @@ def test_enough_of_them_must_be_known_to_the_own_map(S_21: Tensor) -> None:
         assert relation is None or (relation.pairs, relation.backward) == (20, 20)
 
 
-def test_half_as_many_must_be_seen_the_other_way(S_21: Tensor) -> None:
+def test_the_reverse_direction_needs_half_as_many_matches(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     both = in_both(map_1, map_2)[:30]
     thinned(map_1, both)
@@ -149,7 +149,7 @@ def test_half_as_many_must_be_seen_the_other_way(S_21: Tensor) -> None:
     assert related(map_1, map_2, "loop_closing.min_matches=62") is None
 
 
-def test_the_unit_is_that_of_most_depths(S_21: Tensor) -> None:
+def test_the_scale_is_that_of_most_depths(S_21: Tensor) -> None:
     """A third of the points of the first map at twice their depth leave the pixels, and the scale, as they are."""
     map_1, map_2 = maps(S_21)
     T_cw = map_1.T_cw[2]
@@ -161,7 +161,7 @@ def test_the_unit_is_that_of_most_depths(S_21: Tensor) -> None:
     torch.testing.assert_close(relation.S_21, S_21, atol=1e-3, rtol=0)
 
 
-def test_a_keyframe_confirms_what_it_sees_where_it_should_be(S_21: Tensor) -> None:
+def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
     right = RelativeSim3(S_21, 0, 0, 0)
@@ -193,7 +193,7 @@ def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees
     assert torch.equal(ROWS[order[at]], good)
 
 
-def test_points_are_looked_for_eight_pixels_around(S_21: Tensor) -> None:
+def test_projected_points_are_searched_within_eight_pixels(S_21: Tensor) -> None:
     for offset, found in ((7.8, True), (8.2, False)):
         map_1, map_2 = maps(S_21)
         map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
@@ -202,13 +202,13 @@ def test_points_are_looked_for_eight_pixels_around(S_21: Tensor) -> None:
         assert (len(ids) > 100) is found
 
 
-def test_a_neighbourhood_is_a_keyframe_and_those_that_share_most_with_it() -> None:
-    slam_map = world_in(SCENE, sideways(5)).map
+def test_a_neighborhood_is_a_keyframe_and_its_most_covisible_ones() -> None:
+    slam_map = submap_of_scene(SCENE, sideways(5)).map
     assert neighborhood(slam_map, 4, 2).tolist() == [4, 3, 2]
     assert neighborhood(slam_map, 0).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_a_camera_is_seen_from_the_other_map(S_21: Tensor) -> None:
+def test_a_camera_pose_is_expressed_in_the_other_map(S_21: Tensor) -> None:
     torch.testing.assert_close(seen_from(moved(ONE[1], S_21), S_21), ONE[1])
     torch.testing.assert_close(seen_from(ONE[1], sim3_inverse(S_21)), moved(ONE[1], S_21))
     points = SCENE.points_w[:5]

@@ -1,4 +1,4 @@
-"""An adjustment that is asked for now and taken over later, here or with another process."""
+"""Bundle adjustment that is requested now and applied later, here or in another process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
@@ -27,7 +27,7 @@ PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with not
 
 def shaken(seed: int = 0) -> Map:
     """A row of keyframes, the last ones not where they should be."""
-    slam_map = world_in(SCENE, sideways(5)).map
+    slam_map = submap_of_scene(SCENE, sideways(5)).map
     generator = torch.Generator().manual_seed(seed)
     for keyframe in (3, 4):
         twist = 0.003 * torch.randn(6, generator=generator, dtype=torch.float64)
@@ -55,7 +55,7 @@ def adjusted(seed: int = 0) -> Map:
     return slam_map
 
 
-def test_nothing_happens_before_it_is_taken_over() -> None:
+def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     assert not adjusting.is_pending
     assert adjusting.due is None
@@ -72,7 +72,7 @@ def test_nothing_happens_before_it_is_taken_over() -> None:
     check_same(slam_map, adjusted())
 
 
-def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
+def test_a_request_is_started_once() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     begun: list[BundleProblem] = []
 
@@ -81,7 +81,7 @@ def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
         return solve_here(problem, iterations, covariances)
 
     adjusting.solver = solver
-    adjusting.start()  # nothing was asked for
+    adjusting.start()  # nothing was requested
     adjusting.request(slam_map, 4, due=12)
     assert not begun
     adjusting.start()
@@ -103,7 +103,7 @@ def test_it_is_begun_once_when_somebody_has_time_for_it() -> None:
     assert all(torch.equal(a, b) for a, b in zip(columns(slam_map), before, strict=True))
 
 
-def test_it_can_be_hurried_or_dropped() -> None:
+def test_a_request_can_be_hurried_or_dropped() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
@@ -115,7 +115,7 @@ def test_it_can_be_hurried_or_dropped() -> None:
     check_same(slam_map, shaken())
 
 
-def test_it_may_be_due_before_the_next_frame() -> None:
+def test_a_request_may_be_due_before_the_next_frame() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
@@ -132,7 +132,7 @@ def test_it_may_be_due_before_the_next_frame() -> None:
     assert not adjusting.is_due_before_next_frame
 
 
-def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
+def test_an_empty_request_is_due_as_well() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
@@ -144,7 +144,7 @@ def test_where_there_is_nothing_to_adjust_it_is_due_all_the_same() -> None:
 
 
 @pytest.fixture(scope="module", params=["copied", "begun anew"])
-def beside(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
+def worker(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
     """A process that has started, however it was."""
     is_copied = request.param == "copied"
     if is_copied and sys.platform != "linux":
@@ -156,10 +156,12 @@ def beside(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
             yield solver
 
 
-def test_another_process_finds_the_same(beside: BundleWorker, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_process_computes_the_same_result(
+    worker: BundleWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_local", None)  # here nothing is solved
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True)
-    adjusting.solver = beside
+    adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
         slam_map = shaken(seed)
@@ -174,26 +176,26 @@ def test_another_process_finds_the_same(beside: BundleWorker, monkeypatch: pytes
     check_same(slam_map, adjusted(3))
 
 
-def test_without_covariances(beside: BundleWorker) -> None:
+def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker) -> None:
     adjusting, slam_map, expected = (
         AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False),
         shaken(),
         shaken(),
     )
-    adjusting.solver = beside
+    adjusting.solver = worker
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
     adjust_local(expected, 4, CAMERA, SETTINGS)
     check_same(slam_map, expected)
 
 
-def test_what_goes_wrong_there_is_raised_here(beside: BundleWorker) -> None:
+def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
     slam_map = shaken()
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False)
 
     def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
         problem.frame_index[0] = 99
-        return beside(problem, iterations, covariances)
+        return worker(problem, iterations, covariances)
 
     adjusting.solver = wrong
     adjusting.request(slam_map, 4, due=12)
@@ -202,7 +204,7 @@ def test_what_goes_wrong_there_is_raised_here(beside: BundleWorker) -> None:
     assert "in the process that adjusts" in raised.value.__notes__[0]
 
 
-def test_a_process_that_is_killed_is_done_without() -> None:
+def test_the_run_continues_without_a_killed_worker() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
     with BundleWorker(CAMERA) as solver:
         assert solver._worker._ours.poll(PATIENCE)
@@ -220,7 +222,7 @@ def test_a_process_that_is_killed_is_done_without() -> None:
         check_same(slam_map, adjusted(1))
 
 
-def test_a_process_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
     with BundleWorker(CAMERA) as solver:
         monkeypatch.setattr(solver._worker, "receive", None)

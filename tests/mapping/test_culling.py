@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.map.simulated import CAMERA, path, tracked_at, view_of
+from tests.map.simulated import CAMERA, estimate_at, path, view_of
 from torchslam.config import Config, KeyframesConfig, load_config
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.map import compaction
@@ -41,7 +41,7 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
         if index == 0:
             slam_map.add_points(cloud(), view.descriptors, 0)
         slam_map.observe(keyframe, everyone, everyone)
-        seen = tracked_at(pose, everyone, everyone)
+        seen = estimate_at(pose, everyone, everyone)
         submap.posed_frames.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)
@@ -57,13 +57,13 @@ def which(submap: Submap, *candidates: int) -> list[int]:
     return torch.nonzero(redundant_keyframes(submap, torch.tensor(candidates), SETTINGS))[:, 0].tolist()
 
 
-def test_a_keyframe_that_three_others_repeat_can_go_and_no_more_than_that() -> None:
+def test_a_keyframe_is_redundant_when_three_others_see_its_points() -> None:
     assert which(world_of(standing(4)), 2) == [2]
     assert which(world_of(standing(3)), 2) == []
     assert which(world_of(standing(6)), 4, 3, 2, 1) == [2, 3, 4]
 
 
-def test_coarser_views_do_not_replace_finer_ones() -> None:
+def test_coarser_observations_do_not_replace_finer_ones() -> None:
     scales = [2.0, 1.0, 2.0, 2.0, 2.0]
     assert which(world_of(standing(5), scales), 1) == []
     assert which(world_of(standing(5), scales), 2) == [2]
@@ -76,14 +76,14 @@ def forget(slam_map: Map, keyframe: int, count: int) -> None:
 
 
 @pytest.mark.parametrize(("missing", "covered"), [(2, True), (3, False)])
-def test_nine_of_ten_points_are_enough(missing: int, covered: bool) -> None:
+def test_nine_of_ten_redundant_points_are_enough(missing: int, covered: bool) -> None:
     submap = world_of(standing(4))
     forget(submap.map, 3, missing)
     assert is_covered(submap.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
 
 
 @pytest.mark.parametrize(("degrees", "near"), [(11.0, True), (13.0, False)])
-def test_a_keyframe_that_looks_elsewhere_stays(degrees: float, near: bool) -> None:
+def test_a_keyframe_with_another_view_direction_is_kept(degrees: float, near: bool) -> None:
     T_cw = standing(4)
     angle = torch.tensor(degrees).deg2rad().double()
     T_cw[2] = se3_exp(torch.tensor([0, 0, 0, 0, 0, 1.0], dtype=torch.float64) * angle)
@@ -91,13 +91,13 @@ def test_a_keyframe_that_looks_elsewhere_stays(degrees: float, near: bool) -> No
 
 
 @pytest.mark.parametrize(("share", "near"), [(0.09, True), (0.12, False)])
-def test_a_keyframe_that_stands_elsewhere_stays(share: float, near: bool) -> None:
+def test_a_keyframe_at_another_position_is_kept(share: float, near: bool) -> None:
     T_cw = standing(4)
     T_cw[2, 0, 3] = share * float(cloud()[:, 2].median())
     assert (which(world_of(T_cw), 2) == [2]) is near
 
 
-def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> None:
+def test_a_static_camera_keeps_its_first_and_newest_keyframes() -> None:
     submap = world_of(standing(30))
     before = submap.posed_frames.T_cw(submap.map)
     renumbering = cull_keyframes(submap, SETTINGS)
@@ -107,10 +107,10 @@ def test_of_a_camera_that_stands_the_first_and_the_newest_keyframes_stay() -> No
     assert stays[-NUM_NEWEST_KEPT:].tolist() == list(range(30 - NUM_NEWEST_KEPT, 30))
     assert submap.map.num_keyframes == len(stays) == NUM_NEWEST_KEPT + 1
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), before)
-    assert cull_keyframes(submap, SETTINGS) is None  # nobody new to ask about
+    assert cull_keyframes(submap, SETTINGS) is None  # no new keyframe
 
 
-def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compaction, "MIN_INVALID_ROWS", 5)
     monkeypatch.setattr(compaction, "_MAX_REWRITTEN", 1000)
     submap = world_of(standing(30))
@@ -129,7 +129,7 @@ def test_a_mapper_tidies_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) -
     assert Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap) is None
 
 
-def test_keyframes_go_where_the_rows_of_points_stay() -> None:
+def test_keyframes_are_culled_without_renumbering_points() -> None:
     submap = world_of(standing(30))
     went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None
@@ -137,14 +137,14 @@ def test_keyframes_go_where_the_rows_of_points_stay() -> None:
     assert submap.map.num_keyframes == NUM_NEWEST_KEPT + 1
 
 
-def test_a_few_new_keyframes_are_not_worth_the_trouble() -> None:
+def test_culling_waits_for_several_new_keyframes() -> None:
     assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
     submap = world_of(standing(20))
     submap.num_cull_checked = 13
     assert cull_keyframes(submap, SETTINGS) is None
 
 
-def test_the_reference_of_the_track_stays() -> None:
+def test_the_reference_keyframe_is_kept() -> None:
     submap = world_of(standing(20))
     submap.tracking.reference = 5
     renumbering = cull_keyframes(submap, SETTINGS)
@@ -152,11 +152,11 @@ def test_the_reference_of_the_track_stays() -> None:
     assert submap.tracking.reference == renumbering.keyframes[5] >= 0
 
 
-def test_a_camera_on_its_way_keeps_its_keyframes() -> None:
+def test_a_moving_camera_keeps_its_keyframes() -> None:
     T_cw = path(200)[::15]
     assert cull_keyframes(world_of(T_cw), SETTINGS) is None
 
 
-def test_a_mapper_that_may_not_cull_keeps_all() -> None:
+def test_culling_can_be_disabled() -> None:
     keeping = load_config(None, ["mapping.cull=false"])
     assert Mapper(CAMERA, keeping, Stopwatch()).cull_and_compact(world_of(standing(30))) is None

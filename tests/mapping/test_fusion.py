@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, transform
 from torchslam.map.atlas import Submap
@@ -20,7 +20,7 @@ ROWS = rows_of(SCENE)
 
 
 def submap(count: int = 3) -> Submap:
-    return world_in(SCENE, sideways(count))
+    return submap_of_scene(SCENE, sideways(count))
 
 
 def free(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
@@ -44,7 +44,7 @@ def double(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
     return points, doubles
 
 
-def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
+def test_a_free_keypoint_is_matched_to_a_projected_point() -> None:
     here = submap()
     points, at = free(here.map, 2, 6)
     before = here.map.points["times_observed"].clone()
@@ -54,7 +54,7 @@ def test_a_free_keypoint_sees_a_point_that_lies_there() -> None:
     assert torch.equal(here.map.points["times_observed"][points], before[points] + 1)
 
 
-def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
+def test_several_keyframes_at_once_equal_one_after_the_other() -> None:
     together, apart = submap(4), submap(4)
     for here in (together, apart):
         points, _ = free(here.map, 3, 6)
@@ -71,7 +71,7 @@ def test_several_keyframes_at_once_are_as_one_after_the_other() -> None:
     assert len(found[0]) >= 6
 
 
-def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
+def test_an_observed_point_is_not_searched() -> None:
     here = submap()
     seen = here.map.points_seen_by(torch.tensor([1]))
     before = here.map.keyframes["point_ids"].clone()
@@ -79,7 +79,7 @@ def test_a_point_that_is_seen_already_is_not_looked_for() -> None:
     assert torch.equal(here.map.keyframes["point_ids"], before)
 
 
-def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
+def test_a_keypoint_of_another_point_gives_a_duplicate_pair() -> None:
     here = submap()
     points, doubles = double(here.map, 2, 6)
     table = here.map.keyframes["point_ids"].clone()
@@ -91,7 +91,7 @@ def test_a_keypoint_that_sees_another_point_makes_a_pair() -> None:
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(2.4, True), (2.5, False)])
-def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, agrees: bool) -> None:
+def test_a_projection_must_match_within_the_keypoint_scale(offset: float, agrees: bool) -> None:
     here = submap()
     points, at = free(here.map, 2, 6)
     T_cw = here.map.T_cw[2]
@@ -108,7 +108,7 @@ def test_a_point_must_lie_where_it_is_seen_in_units_of_the_scale(offset: float, 
         assert (here.map.keyframes["point_ids"][2, at] == points).all()
 
 
-def test_another_look_is_another_point() -> None:
+def test_different_descriptors_are_not_fused() -> None:
     here = submap()
     points, at = free(here.map, 2, 6)
     here.map.points["descriptors"][points] ^= 255
@@ -117,7 +117,7 @@ def test_another_look_is_another_point() -> None:
 
 
 @pytest.mark.parametrize(("factor", "found"), [(1.4, True), (1.6, False), (0.72, True), (0.6, False)])
-def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) -> None:
+def test_a_keypoint_must_have_the_expected_scale(factor: float, found: bool) -> None:
     here = submap()
     points, at = free(here.map, 2, 40)
     middle = (here.map.keyframes["scales"][2, at] - 1.7).abs() < 0.15  # far from the ends of the scales
@@ -129,19 +129,19 @@ def test_a_point_must_be_as_large_as_it_should_be(factor: float, found: bool) ->
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not found
 
 
-@pytest.mark.parametrize("asks", [0, 2])
-def test_doubles_are_found_from_either_side(asks: int) -> None:
-    """Keyframe 2 has points of its own that the other two see as others: whoever asks, they become one."""
+@pytest.mark.parametrize("keyframe_row", [0, 2])
+def test_duplicates_are_found_from_either_keyframe(keyframe_row: int) -> None:
+    """Keyframe 2 has points of its own that the other two see as others: from either side, they are merged."""
     here = submap()
     points, doubles = double(here.map, 2, 10)
-    others = torch.tensor([keyframe for keyframe in range(3) if keyframe != asks])
-    fuse(here.map, asks, others, CAMERA, Config())
+    others = torch.tensor([keyframe for keyframe in range(3) if keyframe != keyframe_row])
+    fuse(here.map, keyframe_row, others, CAMERA, Config())
     assert torch.equal(here.map.follow_merges(doubles), points)
     assert not here.map.points["is_valid"][doubles].any()
     assert (here.map.points["times_observed"][points] == 3).all()
 
 
-def test_what_is_free_in_a_neighbour_or_here_is_filled_in() -> None:
+def test_free_keypoints_of_both_keyframes_gain_observations() -> None:
     for keyframe in (0, 1):
         here = submap()
         points, at = free(here.map, 1, 10)
@@ -168,21 +168,21 @@ def merged(times: tuple[int, ...], *pairs: tuple[int, int]) -> list[int]:
     return slam_map.follow_merges(torch.arange(len(times))).tolist()
 
 
-def test_the_point_that_is_seen_most_stays() -> None:
+def test_the_most_observed_point_is_kept() -> None:
     assert merged((3, 2), (0, 1)) == [0, 0]
     assert merged((2, 3), (0, 1)) == [1, 1]
     assert merged((2, 2), (0, 1)) == [1, 1]  # of equals the one that was there
     assert merged((2, 2), (1, 0)) == [0, 0]
 
 
-def test_chains_end_in_one_point() -> None:
+def test_chains_of_duplicates_merge_into_one_point() -> None:
     assert merged((2, 3, 4), (0, 1), (1, 2)) == [2, 2, 2]
     assert merged((2, 3, 4), (1, 2), (0, 1)) == [2, 2, 2]
     assert merged((4, 2, 3), (1, 2), (1, 0), (2, 0)) == [0, 0, 0]
     assert merged((3, 3, 3, 2), (0, 1), (1, 0)) == [1, 1, 2, 3]
 
 
-def test_nothing_to_merge_changes_nothing() -> None:
+def test_without_duplicates_nothing_changes() -> None:
     slam_map = observed(2, 3)
     merge_points(slam_map, torch.arange(0), torch.arange(0))
     merge_points(slam_map, torch.tensor([1]), torch.tensor([1]))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
@@ -24,7 +24,7 @@ ROWS = rows_of(SCENE)
 
 
 def row(T: Tensor) -> Map:
-    return world_in(SCENE, T).map
+    return submap_of_scene(SCENE, T).map
 
 
 def shake(slam_map: Map, keyframes: list[int], size: float = 0.003) -> None:
@@ -44,7 +44,7 @@ def bundle(**changes: int) -> BundleAdjustmentConfig:
     ).bundle_adjustment
 
 
-def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> None:
+def test_a_window_has_free_neighbors_and_fixed_keyframes() -> None:
     slam_map = row(sideways(6))
     truth = slam_map.T_cw.clone()
     shake(slam_map, [4, 5])
@@ -54,7 +54,7 @@ def test_a_keyframe_and_its_neighbours_are_free_and_the_rest_holds_them() -> Non
     torch.testing.assert_close(slam_map.T_cw, truth, atol=1e-5, rtol=0)
 
 
-def test_the_first_keyframe_never_moves() -> None:
+def test_the_first_keyframe_is_always_fixed() -> None:
     slam_map = row(sideways(3))
     shake(slam_map, [1, 2])
     before = slam_map.T_cw.clone()
@@ -64,7 +64,7 @@ def test_the_first_keyframe_never_moves() -> None:
     assert torch.equal(slam_map.T_cw[0], before[0])
 
 
-def test_no_more_keyframes_hold_than_are_allowed() -> None:
+def test_the_number_of_fixed_keyframes_is_bounded() -> None:
     """With one holding keyframe alone the scale is free; with two it is not."""
     for limit, holds in ((1, False), (2, True)):
         slam_map = row(sideways(4))
@@ -94,18 +94,18 @@ def weighted(coarse: float) -> float:
     return float((after - before)[:, 1].median())
 
 
-def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
+def test_a_keypoint_is_weighted_by_its_inverse_variance() -> None:
     assert weighted(1.0) == pytest.approx(2 / 3, rel=0.02)
     assert weighted(2.0) == pytest.approx(2 / 9, rel=0.02)
     assert weighted(4.0) == pytest.approx(2 / 33, rel=0.02)
 
 
-def test_the_kernel_turns_where_an_error_is_hardly_noise() -> None:
+def test_the_robust_kernel_starts_at_the_noise_level() -> None:
     assert pytest.approx(5.991**0.5) == HUBER
 
 
 @pytest.mark.parametrize(("offset", "stays"), [(2.4, True), (2.5, False)])
-def test_observations_are_dropped_in_units_of_their_scale(offset: float, stays: bool) -> None:
+def test_outliers_are_removed_in_units_of_their_scale(offset: float, stays: bool) -> None:
     slam_map = row(sideways(4))
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[2] >= 0)[:10, 0]
@@ -120,7 +120,7 @@ def test_observations_are_dropped_in_units_of_their_scale(offset: float, stays: 
     assert slam_map.points["is_valid"].sum() > 100
 
 
-def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
+def test_a_point_with_one_observation_is_invalidated() -> None:
     slam_map = row(sideways(2))
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[1] >= 0)[:3, 0]
@@ -134,7 +134,7 @@ def test_a_point_that_one_keyframe_still_sees_is_dead() -> None:
     assert slam_map.num_points == count - 3
 
 
-def test_a_bundle_leaves_no_observation_that_disagrees() -> None:
+def test_an_adjusted_window_has_no_outliers() -> None:
     slam_map = row(sideways(4))
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[3] >= 0)[:5, 0]
@@ -143,7 +143,7 @@ def test_a_bundle_leaves_no_observation_that_disagrees() -> None:
     assert (table[3, at] == NO_POINT).all()
 
 
-def test_adjusted_points_are_as_their_observers_have_them() -> None:
+def test_adjusted_points_are_refreshed_from_their_observations() -> None:
     slam_map = row(sideways(4))
     slam_map.points["scale_distance"][:] = 0
     adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
@@ -152,7 +152,7 @@ def test_adjusted_points_are_as_their_observers_have_them() -> None:
     torch.testing.assert_close(slam_map.points["scale_distance"][seen], size)
 
 
-def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
+def test_global_adjustment_fixes_the_first_keyframe() -> None:
     slam_map = row(sideways(5))
     truth = slam_map.T_cw.clone()
     shake(slam_map, [1, 2, 3, 4])
@@ -163,20 +163,20 @@ def test_the_whole_map_is_mended_around_its_first_keyframe() -> None:
     assert (slam_map.keyframes["covariances"] == 0).all()
 
 
-def test_certainty_is_noted_where_it_is_asked_for() -> None:
-    for asked in (False, True):
-        slam_map = world_in(SCENE, sideways(4), noise=0.5).map
-        adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=asked)
+def test_covariances_are_stored_on_request() -> None:
+    for requested in (False, True):
+        slam_map = submap_of_scene(SCENE, sideways(4), noise=0.5).map
+        adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=requested)
         known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
-        assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if asked else [])
+        assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if requested else [])
         seen = slam_map.points_seen_by(torch.tensor([2, 3]))
         seen = seen[slam_map.points["times_observed"][seen] >= 2]
         trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
-        assert bool((trace > 0).all()) is asked
+        assert bool((trace > 0).all()) is requested
 
 
 def test_covariances_do_not_change_the_adjustment() -> None:
-    plain, certain = (world_in(SCENE, sideways(4), noise=0.5).map for _ in range(2))
+    plain, certain = (submap_of_scene(SCENE, sideways(4), noise=0.5).map for _ in range(2))
     adjust_local(plain, 3, CAMERA, bundle(local_window=2))
     adjust_local(certain, 3, CAMERA, bundle(local_window=2), covariances=True)
     for name in ("T_cw", "point_ids"):
@@ -186,7 +186,7 @@ def test_covariances_do_not_change_the_adjustment() -> None:
     assert (certain.keyframes["covariances"][2:] != 0).any()
 
 
-def test_nothing_to_adjust_changes_nothing() -> None:
+def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
     slam_map.invalidate(slam_map.valid_points())
     before = slam_map.T_cw.clone()
@@ -194,7 +194,7 @@ def test_nothing_to_adjust_changes_nothing() -> None:
     assert torch.equal(slam_map.T_cw, before)
 
 
-def test_some_of_the_observations() -> None:
+def test_observations_can_be_selected() -> None:
     slam_map = row(sideways(2))
     seen = slam_map.observations()
     few = select(seen, torch.nonzero(seen.keyframe_index == 1)[:, 0])

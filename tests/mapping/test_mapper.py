@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, centre, pose, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, camera_center, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import transform, triangulation_covariance
@@ -40,7 +40,7 @@ def start(true: bool = True) -> tuple[TwoViewMap, Tensor]:
     return TwoViewMap(one, two, T_cw, points_w, SCENE.at(3)[both], SCENE.at(8)[both]), both
 
 
-def test_the_unit_of_the_world() -> None:
+def test_the_scale_of_a_new_map() -> None:
     begin, _ = start()
     assert initial_scale(begin, "unit") == pytest.approx(1 / float(begin.points_w[:, 2].median()))
     assert initial_scale(begin, "groundtruth") == pytest.approx(3.0)
@@ -53,14 +53,14 @@ def test_the_unit_of_the_world() -> None:
 
 
 @pytest.mark.parametrize("scale", ["unit", "groundtruth"])
-def test_a_start_becomes_two_keyframes_that_see_its_points(scale: str) -> None:
+def test_an_initialization_becomes_two_keyframes_with_points(scale: str) -> None:
     begin, both = start()
     slam_map, factor = Map(), initial_scale(begin, scale)
     assert mapper(f"scale={scale}").start(slam_map, begin) == (0, 1)
     assert slam_map.keyframes["frame_index"].tolist() == [3, 8]
     torch.testing.assert_close(slam_map.T_cw[0], pose())
     torch.testing.assert_close(slam_map.T_cw[1, :3, :3], BASE[1, :3, :3])
-    torch.testing.assert_close(centre(slam_map.T_cw[1]), factor * torch.tensor([1.0, 0, 0]).double())
+    torch.testing.assert_close(camera_center(slam_map.T_cw[1]), factor * torch.tensor([1.0, 0, 0]).double())
     points = slam_map.points
     torch.testing.assert_close(points["positions_w"], factor * begin.points_w)
     torch.testing.assert_close(
@@ -82,13 +82,13 @@ def test_a_start_becomes_two_keyframes_that_see_its_points(scale: str) -> None:
     everyone = torch.arange(len(both))
     assert torch.equal(slam_map.keyframes["point_ids"][0, begin.keypoints_1], everyone)
     assert torch.equal(slam_map.keyframes["point_ids"][1, begin.keypoints_2], everyone)
-    distance = (points["positions_w"] - centre(slam_map.T_cw[1])).norm(dim=-1)
+    distance = (points["positions_w"] - camera_center(slam_map.T_cw[1])).norm(dim=-1)
     torch.testing.assert_close(points["scale_distance"], distance * begin.view.scales[begin.keypoints_2])
     assert torch.equal(begin.T_cw[:3, 3], 2 * BASE[1, :3, 3])  # the start itself is left alone
 
 
 def half_world(count: int = 2) -> Submap:
-    return world_in(SCENE, sideways(count, step=0.4), seen=torch.arange(300) % 2 == 0)
+    return submap_of_scene(SCENE, sideways(count, step=0.4), seen=torch.arange(300) % 2 == 0)
 
 
 def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
@@ -98,7 +98,7 @@ def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
     return by.insert(submap.map, view, estimate)
 
 
-def test_a_keyframe_brings_the_points_it_tracked_and_new_ones() -> None:
+def test_a_keyframe_adds_observations_and_new_points() -> None:
     submap = half_world()
     before = len(submap.map.points)
     keyframe = inserted(mapper("bundle_adjustment.local=false"), submap, sideways(1, start=0.8)[0])
@@ -120,7 +120,7 @@ def test_a_keyframe_brings_the_points_it_tracked_and_new_ones() -> None:
     assert (seen[:, 2] > 0).all()
 
 
-def test_new_points_come_from_the_neighbours_that_are_asked() -> None:
+def test_new_points_come_from_the_configured_neighbors() -> None:
     made = []
     for count in (1, 5):
         submap = half_world(3)
@@ -142,10 +142,10 @@ def test_new_points_come_from_the_neighbours_that_are_asked() -> None:
     assert len(last.map.points) - before == made[1]
 
 
-def test_fusing_culling_and_adjusting_are_done_where_they_are_asked_for() -> None:
+def test_fusion_culling_and_adjustment_can_be_disabled() -> None:
     doubles: dict[str, int] = {}
     for fuse in ("true", "false"):
-        submap = world_in(SCENE, sideways(2, step=0.4))
+        submap = submap_of_scene(SCENE, sideways(2, step=0.4))
         table = submap.map.keyframes["point_ids"]
         at = torch.nonzero(table[0] >= 0)[:10, 0]
         originals = table[0, at].clone()
@@ -169,9 +169,9 @@ def test_fusing_culling_and_adjusting_are_done_where_they_are_asked_for() -> Non
     assert doubles["true"] < 5
 
 
-def test_a_bundle_follows_a_keyframe() -> None:
+def test_a_local_bundle_adjustment_follows_a_keyframe() -> None:
     for enabled, gate in (("true", "chi_square"), ("true", "mahalanobis"), ("false", "mahalanobis")):
-        submap = world_in(SCENE, sideways(3, step=0.4), noise=0.5)
+        submap = submap_of_scene(SCENE, sideways(3, step=0.4), noise=0.5)
         before = submap.map.T_cw.clone()
         by = mapper(f"bundle_adjustment.local={enabled}", f"measurement.gate={gate}")
         inserted(by, submap, sideways(1, start=1.0)[0])
@@ -186,7 +186,7 @@ def young_map(
     age: int, *, found: int = 10, visible: int = 10, observed: int = 3, from_initialization: bool = False
 ) -> bool:
     """Whether a point of that kind survives; the keyframe asking is number 8."""
-    submap = world_in(SCENE, sideways(9, step=0.01))
+    submap = submap_of_scene(SCENE, sideways(9, step=0.01))
     slam_map = submap.map
     point = int(torch.nonzero(slam_map.points["times_observed"] == 9)[0])
     points = slam_map.points
@@ -202,7 +202,7 @@ def young_map(
     return bool(points["is_valid"][point])
 
 
-def test_young_points_must_be_found_where_they_should_be_seen() -> None:
+def test_new_points_must_be_found_where_they_are_visible() -> None:
     assert young_map(1, found=5, visible=20)
     assert not young_map(1, found=4, visible=20)
     assert not young_map(YOUNG, found=4, visible=20)
@@ -210,7 +210,7 @@ def test_young_points_must_be_found_where_they_should_be_seen() -> None:
     assert YOUNG == 3
 
 
-def test_young_points_must_be_seen_by_a_third_keyframe_in_time() -> None:
+def test_new_points_must_be_observed_by_a_third_keyframe_in_time() -> None:
     assert young_map(1, observed=2)
     assert not young_map(2, observed=2)
     assert young_map(2, observed=3)

@@ -1,4 +1,4 @@
-"""Initialisation, tracking, mapping and adjustment on a small exact world."""
+"""Initialization, tracking, mapping and adjustment on a small exact scene."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
 @pytest.mark.parametrize(
     "override", ["tracking.motion_model=false", "tracking.guided_matching=false", "tracking.recent_frames=10"]
 )
-def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
+def test_tracking_works_without_optional_checks(slam: SLAM, override: str) -> None:
     tracker = Tracker(slam.camera, load_config(None, ["features.kind=simulated", override]))
     tracker.reset_to_keyframe(slam.submap, slam.map.num_keyframes - 1)
     estimate = tracker.track(slam.submap, view_of(slam, 20))
@@ -113,7 +113,7 @@ def test_tracking_without_its_aids(slam: SLAM, override: str) -> None:
     assert torch.allclose(estimate.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
 
-def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
+def test_a_frame_is_relocalized_anywhere_in_the_map(slam: SLAM) -> None:
     view = view_of(slam, 2)
     anywhere = match_points(slam.map, slam.map.valid_points(), view, CONFIG.matching)
     estimate = slam.tracker.localizer.locate(slam.map, view, iter([anywhere]), anywhere.first[:0])
@@ -124,7 +124,7 @@ def test_a_frame_is_located_anywhere_in_the_map(slam: SLAM) -> None:
     assert torch.allclose(slam.submap.T_cw, estimate.T_cw)
 
 
-def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Generator) -> None:
+def test_bundle_adjustment_repairs_a_perturbed_map(slam: SLAM, generator: torch.Generator) -> None:
     count = slam.map.num_keyframes
     shake = 0.01 * torch.randn(count - 1, 6, generator=generator, dtype=torch.float64)
     slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
@@ -139,9 +139,7 @@ def test_bundle_adjustment_mends_a_shaken_map(slam: SLAM, generator: torch.Gener
         assert torch.allclose(slam.map.T_cw[k, :3, 3], scale * truth[:3, 3], atol=1e-3)
 
 
-def test_an_adjustment_that_is_interrupted_leaves_the_map_as_it_was(
-    slam: SLAM, generator: torch.Generator
-) -> None:
+def test_an_interrupted_adjustment_leaves_the_map_unchanged(slam: SLAM, generator: torch.Generator) -> None:
     shake = 0.01 * torch.randn(slam.map.num_keyframes - 1, 6, generator=generator, dtype=torch.float64)
     slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
     before = copy.deepcopy(slam.map)
@@ -158,7 +156,7 @@ def test_an_adjustment_that_is_interrupted_leaves_the_map_as_it_was(
             assert torch.equal(column, old[name]), name
 
 
-def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
+def test_bundle_adjustment_removes_an_outlier(slam: SLAM) -> None:
     keyframe = slam.map.num_keyframes - 1
     keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])
     slam.map.keyframes["keypoints"][keyframe, keypoint] += 40.0
@@ -166,7 +164,7 @@ def test_bundle_adjustment_drops_a_wrong_observation(slam: SLAM) -> None:
     assert slam.map.keyframes["point_ids"][keyframe, keypoint] == NO_POINT
 
 
-def test_the_first_keyframe_stays(slam: SLAM) -> None:
+def test_the_first_keyframe_is_fixed(slam: SLAM) -> None:
     before = slam.map.T_cw[0].clone()
     adjust_local(slam.map, 1, slam.camera, CONFIG.bundle_adjustment)
     adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
@@ -197,7 +195,7 @@ def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
     assert not slam.map.points["is_valid"][born].any()
 
 
-def test_epipolar_matches_are_the_true_ones(slam: SLAM) -> None:
+def test_epipolar_matches_are_correct(slam: SLAM) -> None:
     one, two = (
         FreeKeypoints(
             view.features,
@@ -217,7 +215,7 @@ def test_scale_consistency() -> None:
     points_w = torch.tensor([[0.0, 0.0, 4.0]] * 3, dtype=torch.float64)
     T_1w = torch.eye(4, dtype=torch.float64)
     T_2w = T_1w.clone()
-    T_2w[2, 3] = -2.0  # two metres ahead: the point appears twice as large
+    T_2w[2, 3] = -2.0  # two meters ahead: the point appears twice as large
     scales = torch.tensor([2.0, 1.0, 4.0], dtype=torch.float64)
     consistent = has_consistent_scale(
         points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (scales[1], 2 * scales[2])
@@ -233,7 +231,7 @@ def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> TwoViewMap
     return result
 
 
-def test_two_views_make_a_start_with_the_true_motion() -> None:
+def test_two_views_initialize_with_the_true_motion() -> None:
     start = start_of((0, 5), WALK, CONFIG)
     assert isinstance(start, TwoViewMap), start
     truth = true_T_cw(WALK)[5] @ se3_inverse(true_T_cw(WALK)[0])
@@ -244,7 +242,7 @@ def test_two_views_make_a_start_with_the_true_motion() -> None:
     )
 
 
-def test_the_parallax_criterion_waits_longer() -> None:
+def test_the_parallax_criterion_initializes_later() -> None:
     strict = load_config(None, [*OVERRIDES, "initialization.criterion=parallax"])
     rejection = start_of((0, 1), WALK, strict)
     assert isinstance(rejection, Rejection)
@@ -252,7 +250,7 @@ def test_the_parallax_criterion_waits_longer() -> None:
     assert isinstance(start_of((0, 6), WALK, strict), TwoViewMap)
 
 
-def test_pure_rotation_is_no_start() -> None:
+def test_pure_rotation_does_not_initialize() -> None:
     walk = Walk(turn(10))
     config = load_config(None, [*OVERRIDES, "simulated.noise_px=0.3"])
     assert isinstance(start_of((0, 5), walk, config), Rejection)
@@ -271,7 +269,7 @@ def test_scale_from_ground_truth_needs_ground_truth() -> None:
         )
 
 
-def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
+def test_keyframes_are_chosen_by_translation_rotation_and_overlap(slam: SLAM) -> None:
     estimate = slam.tracker.track(slam.submap, view_of(slam, 20))
     assert estimate is not None
     reference = slam.map.T_cw[slam.submap.tracking.reference]
@@ -289,7 +287,7 @@ def test_keyframes_by_translation_rotation_and_overlap(slam: SLAM) -> None:
     assert why([0.0] * 6, overlap=0.3).startswith("sees 30%")
 
 
-def test_a_mapper_starts_with_two_keyframes_that_see_the_same() -> None:
+def test_a_mapper_starts_with_two_covisible_keyframes() -> None:
     start = start_of((0, 5), WALK, CONFIG)
     assert isinstance(start, TwoViewMap)
     slam = SLAM(WALK.camera, CONFIG)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import MatchingConfig, load_config
 from torchslam.geometry import KeypointNoise, se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.map.map import Map
@@ -24,15 +24,15 @@ ROWS = rows_of(SCENE)
 
 def half_known(T_cw: Tensor, noise: float = 0.0) -> Map:
     """Keyframes at T_cw that know every other point of the scene."""
-    return world_in(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
+    return submap_of_scene(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
 
 
 def triangulated(
-    slam_map: Map, *overrides: str, keyframe: int = 1, neighbours: tuple[int, ...] = (0,)
+    slam_map: Map, *overrides: str, keyframe: int = 1, neighbors: tuple[int, ...] = (0,)
 ) -> Tensor:
-    """(n,) rows of the points that a keyframe and its neighbours make."""
+    """(n,) rows of the points that a keyframe and its neighbors make."""
     before, config = len(slam_map.points), load_config(None, overrides)
-    triangulate_against(slam_map, keyframe, torch.tensor(neighbours), CAMERA, config)
+    triangulate_against(slam_map, keyframe, torch.tensor(neighbors), CAMERA, config)
     return torch.arange(before, len(slam_map.points))
 
 
@@ -43,7 +43,7 @@ def shown(slam_map: Map, keyframe: int, points: Tensor) -> Tensor:
     return SCENE.shows(int(slam_map.keyframes["frame_index"][keyframe]))[at]
 
 
-def test_what_both_see_and_neither_knows_becomes_a_point_where_it_is() -> None:
+def test_unmatched_keypoints_of_both_keyframes_are_triangulated() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     new = triangulated(slam_map)
     one, two = shown(slam_map, 1, new), shown(slam_map, 0, new)
@@ -59,28 +59,28 @@ def test_what_both_see_and_neither_knows_becomes_a_point_where_it_is() -> None:
     assert len(triangulated(slam_map)) == 0  # they are known now
 
 
-def test_several_neighbours_at_once_are_as_one_after_the_other() -> None:
+def test_several_neighbors_at_once_equal_one_after_the_other() -> None:
     T_cw = sideways(4, step=0.4)
     together, apart = half_known(T_cw), half_known(T_cw)
-    new = triangulated(together, keyframe=3, neighbours=(0, 1, 2))
-    for neighbour in (0, 1, 2):
-        assert len(triangulated(apart, keyframe=3, neighbours=(neighbour,))) > 0
+    new = triangulated(together, keyframe=3, neighbors=(0, 1, 2))
+    for neighbor in (0, 1, 2):
+        assert len(triangulated(apart, keyframe=3, neighbors=(neighbor,))) > 0
     assert torch.equal(together.keyframes["point_ids"], apart.keyframes["point_ids"])
     for name in ("positions_w", "covariances_w"):
         torch.testing.assert_close(together.points[name], apart.points[name], atol=1e-9, rtol=1e-6)
     assert len(new) == len(torch.unique(shown(together, 3, new)))
 
 
-def test_of_several_neighbours_the_first_counts() -> None:
+def test_the_first_of_several_neighbors_is_used() -> None:
     slam_map = half_known(sideways(3, step=0.4))
-    new = triangulated(slam_map, keyframe=2, neighbours=(0, 1))
+    new = triangulated(slam_map, keyframe=2, neighbors=(0, 1))
     table = slam_map.keyframes["point_ids"]
-    alone = triangulated(half_known(sideways(3, step=0.4)), keyframe=2, neighbours=(0,))
+    alone = triangulated(half_known(sideways(3, step=0.4)), keyframe=2, neighbors=(0,))
     assert torch.isin(new, table[0]).sum() == len(alone) < len(new)
     assert not torch.isin(table[0][table[0] >= new[0]], table[1]).any()
 
 
-def test_new_points_know_how_certain_they_are() -> None:
+def test_new_points_have_covariances() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     new = triangulated(slam_map)
     scales = []
@@ -93,7 +93,7 @@ def test_new_points_know_how_certain_they_are() -> None:
     torch.testing.assert_close(slam_map.points["covariances_w"][new], wanted)
 
 
-def test_points_with_little_parallax_are_not_made() -> None:
+def test_points_with_little_parallax_are_rejected() -> None:
     T_cw = sideways(2, step=0.1)
     slam_map = half_known(T_cw)
     new = triangulated(slam_map, "mapping.min_parallax_deg=1.5", "mapping.min_baseline=0.001")
@@ -115,7 +115,7 @@ def spoiled(slam_map: Map, keyframe: int, pixels: float, axis: int) -> None:
 
 
 @pytest.mark.parametrize(("offset", "good"), [(4.6, True), (5.2, False)])
-def test_points_must_be_seen_where_they_are(offset: float, good: bool) -> None:
+def test_points_must_reproject_onto_their_keypoints(offset: float, good: bool) -> None:
     """Across the epipolar line an error is shared by the two views: each may be off by 2.45 times its scale."""
     slam_map = half_known(sideways(2, step=0.4))
     spoiled(slam_map, 0, offset, 1)
@@ -130,7 +130,7 @@ def test_the_gate_is_the_configured_one() -> None:
     assert len(triangulated(slam_map, "mapping.max_epipolar_px=100", "measurement.max_chi_square=9")) > 40
 
 
-def test_points_of_another_size_are_not_made() -> None:
+def test_points_with_inconsistent_scales_are_rejected() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     scales, all_of_them = (
         slam_map.keyframes["scales"][1],
@@ -143,7 +143,7 @@ def test_points_of_another_size_are_not_made() -> None:
     assert not fine[torch.nonzero(torch.isin(slam_map.keyframes["point_ids"][1], new))[:, 0]].any()
 
 
-def test_cameras_must_be_apart_by_a_share_of_the_depth() -> None:
+def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
     slam_map = half_known(sideways(2, step=0.4))
     seen = slam_map.points_seen_by(torch.tensor([0]))
     share = 0.4 / float(slam_map.positions_w[seen, 2].median())
@@ -153,8 +153,8 @@ def test_cameras_must_be_apart_by_a_share_of_the_depth() -> None:
     assert len(triangulated(slam_map, f"mapping.min_baseline={0.99 * share}")) > 0
 
 
-def test_the_depth_is_that_of_the_neighbour() -> None:
-    T_cw = torch.stack([pose(0, 0, 2.0), pose(0.5, 0, 0)])  # the first stands two metres back
+def test_the_median_depth_is_that_of_the_neighbor() -> None:
+    T_cw = torch.stack([pose(0, 0, 2.0), pose(0.5, 0, 0)])  # the first stands two meters back
     slam_map = half_known(T_cw)
     seen = slam_map.points_seen_by(torch.tensor([0]))
     share = math.hypot(0.5, 2.0) / float(slam_map.positions_w[seen, 2].median() + 2.0)
@@ -202,13 +202,13 @@ def test_matches_lie_on_the_epipolar_line() -> None:
 
 
 @pytest.mark.parametrize("limit", [1.0, 4.0])
-def test_a_match_may_be_off_the_line_in_units_of_its_scale(limit: float) -> None:
+def test_the_epipolar_threshold_scales_with_the_keypoint(limit: float) -> None:
     assert len(epipolar(0.98 * limit, limit)[0]) > 15
     assert len(epipolar(1.12 * limit, limit)[0]) == 0
 
 
 @pytest.mark.parametrize(("bits", "found"), [(51, True), (52, False)])
-def test_descriptors_must_be_alike(bits: int, found: bool) -> None:
+def test_descriptors_must_match(bits: int, found: bool) -> None:
     """Four fifths of what is allowed elsewhere: 0.8 times 64."""
     other = SCENE.view(1, ALONG[1]).descriptors.clone()
     other[:, : bits // 8] ^= 255
@@ -216,7 +216,7 @@ def test_descriptors_must_be_alike(bits: int, found: bool) -> None:
     assert (len(epipolar(0.0, descriptors=other)[0]) > 15) is found
 
 
-def test_a_keypoint_has_one_partner() -> None:
+def test_a_keypoint_is_matched_once() -> None:
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
     twin = torch.nonzero(views[0].mask)[:2, 0]  # two keypoints of the same look in the first view
     keypoints, descriptors = views[0].keypoints.clone(), views[0].descriptors.clone()
@@ -232,17 +232,17 @@ def test_a_keypoint_has_one_partner() -> None:
     assert len(torch.unique(second)) == len(second)
 
 
-def test_nobody_matches_nobody() -> None:
+def test_empty_sets_have_no_matches() -> None:
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ALONG)]
-    rows, nobody = torch.arange(10), torch.arange(0)
-    for one, other in ((nobody, rows), (rows, nobody)):
+    rows, empty = torch.arange(10), torch.arange(0)
+    for one, other in ((empty, rows), (rows, empty)):
         assert [len(part) for part in run_matcher(views, [one, other], pose(1.0))] == [0, 0]
 
 
 @pytest.mark.parametrize(
     ("factor", "consistent"), [(1.7, True), (1.9, False), (1 / 1.7, True), (1 / 1.9, False)]
 )
-def test_sizes_go_with_one_over_the_distance(factor: float, consistent: bool) -> None:
+def test_keypoint_scale_is_inverse_to_distance(factor: float, consistent: bool) -> None:
     """At a third of the distance, three times the size, within a factor of 1.8."""
     points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
     ahead = pose(0, 0, -4.0)
@@ -253,7 +253,7 @@ def test_sizes_go_with_one_over_the_distance(factor: float, consistent: bool) ->
     assert bool(has_consistent_scale(points_w, ahead, pose(), size, one, sizes)[0]) is consistent
 
 
-def test_sizes_beyond_those_of_the_detector_are_not_expected() -> None:
+def test_scales_beyond_the_pyramid_are_clamped() -> None:
     points_w = torch.tensor([[0.0, 0.0, 6.0]]).double()
     one, two = torch.tensor([1.5]).double(), torch.tensor([2.0]).double()
     finest, coarse, coarser = torch.tensor([[1.0, 2.0, 8.0]]).double().unbind(-1)
@@ -277,7 +277,7 @@ def test_angles_around_an_axis() -> None:
     torch.testing.assert_close(torch.remainder(turned - angles, 2 * math.pi), torch.full_like(angles, 0.3))
 
 
-def test_a_window_reaches_over_the_end_of_a_turn() -> None:
+def test_an_angle_window_wraps_around() -> None:
     """Forwards the planes turn around the middle of the image: all angles occur."""
     ahead = torch.stack([pose(), pose(0, 0, -0.8)])
     views = [SCENE.view(index, T_cw) for index, T_cw in enumerate(ahead)]
@@ -289,7 +289,7 @@ def test_a_window_reaches_over_the_end_of_a_turn() -> None:
     assert len(first) == len(both) > 50
 
 
-def test_keypoints_that_see_a_point_are_left_alone_where_others_have_more_free_ones() -> None:
+def test_keypoints_with_a_point_are_not_matched_again() -> None:
     slam_map = half_known(sideways(3, step=0.3))
     table = slam_map.keyframes["point_ids"]
     known = torch.nonzero(table[0] >= 0)[:40, 0]
@@ -300,5 +300,5 @@ def test_keypoints_that_see_a_point_are_left_alone_where_others_have_more_free_o
         rows = free.rows[row, free.features.mask[0 + row]]
         assert bool((before[row, rows] < 0).all())
         assert len(rows) == int(((before[row] < 0) & slam_map.keyframes["mask"][row]).sum())
-    assert len(triangulated(slam_map, keyframe=2, neighbours=(0, 1))) > 80
+    assert len(triangulated(slam_map, keyframe=2, neighbors=(0, 1))) > 80
     assert torch.equal(table[before >= 0], before[before >= 0])

@@ -93,14 +93,14 @@ def mixed(bundle_scene, **options) -> list[BundleProblem]:
 
 
 @pytest.mark.parametrize("grids", [True, False])
-def test_a_batch_is_the_loop(bundle_scene, model, grids, monkeypatch):
+def test_a_batch_equals_a_loop_over_its_elements(bundle_scene, model, grids, monkeypatch):
     if not grids:
         monkeypatch.setattr(minimization, "suits_dense", lambda *_: False)
     problems = mixed(bundle_scene, model=model)
     assert_as_alone(batch_of(problems), problems, "cauchy", 2.0)
 
 
-def test_exact_data_end_where_rounding_begins(bundle_scene, model):
+def test_exact_data_are_solved_to_rounding(bundle_scene, model):
     """Alone and in a batch; steps after that would only shuffle it."""
     problems = [bundle_scene(noise=0.0, frames=f, seed=f, model=model).problem for f in (4, 5)]
     together = bundle_adjust(batch_of(problems), iterations=100, tolerance=0.0)
@@ -114,7 +114,7 @@ def test_exact_data_end_where_rounding_begins(bundle_scene, model):
 
 
 @pytest.mark.parametrize("fixed_frames", [(0,), ()])
-def test_an_open_gauge_keeps_what_it_keeps_alone(bundle_scene, fixed_frames):
+def test_an_open_gauge_in_a_batch_equals_one_alone(bundle_scene, fixed_frames):
     problems = [
         bundle_scene(frames=5, points=30, seed=seed, fixed_frames=fixed_frames).problem for seed in (0, 1)
     ]
@@ -124,7 +124,7 @@ def test_an_open_gauge_keeps_what_it_keeps_alone(bundle_scene, fixed_frames):
 
 
 @pytest.mark.parametrize("directions", [True, torch.tensor([[1.0], [1.1], [0.0], [0.0]]).double()])
-def test_every_problem_finds_a_camera_of_its_own(bundle_scene, directions):
+def test_every_problem_estimates_its_own_camera(bundle_scene, directions):
     problems = [bundle_scene(frames=7, points=60, seed=seed).problem for seed in (0, 1)]
     batch = batch_of(problems)
     factors = torch.tensor([[0.97], [1.03]], dtype=torch.float64)
@@ -133,20 +133,20 @@ def test_every_problem_finds_a_camera_of_its_own(bundle_scene, directions):
     assert_as_alone(replace(batch, camera=camera), alone, free_camera=directions, iterations=40)
 
 
-def test_many_at_once_or_few(bundle_scene, monkeypatch):
+def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkeypatch):
     problems = mixed(bundle_scene)
     monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)
-    told = []
+    reported = []
     batch = batch_of(problems)
-    bundle_adjust(batch, progress=lambda now, most: told.append((now, most)))
+    bundle_adjust(batch, progress=lambda now, most: reported.append((now, most)))
     given = sanitized(batch, 1.0)
     assert len(minimization._parts(given, select_moving(given))) == 2
-    assert told == sorted(told)
-    assert {most for _, most in told} == {60}
+    assert reported == sorted(reported)
+    assert {most for _, most in reported} == {60}
     assert_as_alone(batch, problems)
 
 
-def test_what_has_converged_does_no_more_work(bundle_scene, monkeypatch):
+def test_converged_problems_are_not_iterated_further(bundle_scene, monkeypatch):
     """An element that starts at its minimum leaves after the first step; what is left is evaluated alone."""
     problems = [bundle_scene(seed=seed, noise=0.5).problem for seed in range(3)]
     done = bundle_adjust(problems[1], tolerance=1e-14, iterations=50)
@@ -164,8 +164,8 @@ def test_what_has_converged_does_no_more_work(bundle_scene, monkeypatch):
     assert sum(sizes) == 3 + int(iterations.sum())
 
 
-def test_a_failure_is_its_own(bundle_scene):
-    """A frame that is not finite, and two maps without a common point, beside a problem that is fine."""
+def test_a_failed_problem_does_not_affect_the_others(bundle_scene):
+    """A non-finite frame and two maps without a common point leave a valid problem unaffected."""
     problems = [bundle_scene(frames=6, points=60, visible=1.0, seed=seed).problem for seed in range(3)]
     T_cw = problems[1].T_cw.clone()
     T_cw[3, 0, 3] = torch.nan
@@ -204,7 +204,7 @@ def test_a_point_seen_twice_in_a_frame_counts_twice(bundle_scene):
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unroll", "truncated"])
-def test_gradients_are_those_of_the_loop(bundle_scene, backward):
+def test_gradients_of_a_batch_equal_those_of_a_loop(bundle_scene, backward):
     problems = mixed(bundle_scene, noise=1.0)
     batch = batch_of(problems)
 
@@ -282,7 +282,7 @@ def test_dtype_and_device_of_a_batch(bundle_scene, dtype, device):
         torch.testing.assert_close(solution.T_cw[row].cpu().double(), scene.T_cw, atol=0.03, rtol=0)
 
 
-def test_a_wrong_batch_is_named(bundle_scene):
+def test_an_invalid_batch_is_rejected_by_name(bundle_scene):
     problems = [bundle_scene(seed=seed).problem for seed in (0, 1)]
     batch = batch_of(problems)
     with pytest.raises(ValueError, match=r"mask must be \(O,\)"):
@@ -306,7 +306,7 @@ def test_vmap_over_batches(bundle_scene):
     torch.testing.assert_close(vmap(points)(pixels), expected, **EQUAL)
 
 
-def test_autocast_changes_no_bit_of_a_batch(bundle_scene):
+def test_autocast_does_not_change_a_batch(bundle_scene):
     batch = batch_of([bundle_scene(seed=seed).problem for seed in (0, 1)])
     batch = replace(
         batch, points_w=batch.points_w.float(), T_cw=batch.T_cw.float(), pixels=batch.pixels.float()

@@ -141,13 +141,13 @@ def mixed(function: Callable[[Tensor], Tensor], count: int = 6) -> Callable[[Ten
     return of
 
 
-def test_a_gradient_of_a_gradient(problem):
+def test_second_order_gradients_by_gradcheck(problem):
     function, x = problem
     x = x.clone().requires_grad_()
     assert torch.autograd.gradgradcheck(function, (x,), eps=1e-4, atol=1e-7, rtol=1e-3, fast_mode=True)
 
 
-def test_a_gradient_penalty_is_that_of_finite_differences(problem):
+def test_a_gradient_penalty_agrees_with_finite_differences(problem):
     """Of a loss linear in the answer, too, whose gradient once came without a graph."""
     function, x = problem
     weights = torch.linspace(-1, 1, function(x).numel(), dtype=torch.float64)
@@ -164,7 +164,7 @@ def test_a_gradient_penalty_is_that_of_finite_differences(problem):
     assert float(found @ step) == pytest.approx(float(expected.detach()), rel=1e-4)
 
 
-def test_both_directions_are_the_same(problem):
+def test_forward_and_reverse_mode_agree(problem):
     function, x = mixed(problem[0]), problem[1]
     expected = torch.autograd.functional.jacobian(function, x)
     for found in (jacrev(function)(x), jacfwd(function)(x)):
@@ -176,7 +176,7 @@ def test_both_directions_are_the_same(problem):
     torch.testing.assert_close(tangent, expected @ change, **EXACT)
 
 
-def test_vmap_is_the_loop(problem):
+def test_vmap_equals_a_loop(problem):
     function, x = problem
     batch = torch.stack((x, 0.5 * x.flip(0)))
     for mapped in (function, jacrev(function), jacfwd(function)):
@@ -251,7 +251,7 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
 
 
-def test_inputs_that_do_not_go_together_are_named(pose_scene, bundle_scene):
+def test_inconsistent_batch_inputs_are_rejected_by_name(pose_scene, bundle_scene):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"pixels is torch.float32, but T_cw is torch.float64"):
         refine_pose(scene.start, scene.points_w, scene.pixels.float(), scene.camera)

@@ -26,7 +26,7 @@ def isotropic(weights):
 
 
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
-def test_a_weight_as_a_matrix_is_the_same_weight(pose_scene, bundle_scene, model, kernel, generator):
+def test_a_weight_as_a_matrix_equals_the_scalar_weight(pose_scene, bundle_scene, model, kernel, generator):
     scene = pose_scene(outliers=0.1, model=model)
     weights = 0.5 + torch.rand(scene.pixels.shape[:2], generator=generator, dtype=torch.float64)
     one, other = (
@@ -49,7 +49,7 @@ def test_a_weight_as_a_matrix_is_the_same_weight(pose_scene, bundle_scene, model
     torch.testing.assert_close(one.covariance().frames, other.covariance().frames, rtol=1e-4, atol=1e-12)
 
 
-def test_the_cost_is_that_of_the_errors_in_units_of_the_covariances(pose_scene, generator):
+def test_the_cost_sums_whitened_errors(pose_scene, generator):
     """And the answer is its minimum: no small motion lowers it."""
     scene = pose_scene(outliers=0.2)
     weights = matrices(generator, *scene.pixels.shape[:2])

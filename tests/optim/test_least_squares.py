@@ -30,7 +30,7 @@ def reprojection(camera):
     return residual
 
 
-def test_a_line_is_that_of_the_normal_equations():
+def test_a_fitted_line_solves_the_normal_equations():
     x, y, weights = normal(3, 9), normal(3, 9, seed=1), normal(3, 9, seed=2).square()
     mask = normal(3, 9, seed=3) > -1
     solution = minimize(line, torch.zeros(3, 2).double(), (x, y), weights=weights, mask=mask)
@@ -44,7 +44,7 @@ def test_a_line_is_that_of_the_normal_equations():
 
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure"])
-def test_a_pose_is_that_of_refine_pose(pose_scene, kernel, model):
+def test_a_pose_equals_that_of_refine_pose(pose_scene, kernel, model):
     """And so are its gradients, whatever the kernel."""
     scene = pose_scene(batch=3, count=12, noise=1.0, model=model)
     found = []
@@ -66,7 +66,7 @@ def test_a_pose_is_that_of_refine_pose(pose_scene, kernel, model):
         torch.testing.assert_close(general, special, rtol=1e-7, atol=1e-9)
 
 
-def test_a_similarity_is_that_of_umeyama():
+def test_a_similarity_equals_that_of_umeyama():
     a = normal(2, 20, 3)
     S_ba = sim3_exp(torch.tensor([[0.3, -1, 2, 0.5, 0.2, -0.4, 0.7], [1, 0, 0, 0, 0, math.pi - 0.01, -0.5]]))
     b = transform(S_ba.double(), a) + 0.05 * normal(2, 20, 3, seed=1)
@@ -176,7 +176,7 @@ def test_every_transform_agrees(problem):
     torch.testing.assert_close(jacfwd(solve)(p), expected, rtol=0, atol=1e-9)
 
 
-def test_vmap_folds_into_the_batch():
+def test_vmap_equals_a_batch():
     x, y = normal(4, 3, 9), normal(4, 3, 9, seed=1)
 
     def fit(x: Tensor, y: Tensor) -> Tensor:
@@ -189,7 +189,7 @@ def test_vmap_folds_into_the_batch():
     )
 
 
-def test_a_batch_is_the_loop(pose_scene):
+def test_a_batch_equals_a_loop_over_its_elements(pose_scene):
     scene = pose_scene(batch=5, outliers=0.2)
     residual = reprojection(scene.camera)
     options = {"manifolds": "se3", "kernel": "cauchy"}
@@ -219,8 +219,8 @@ def test_backward_modes_agree_where_they_should():
     assert (gradients["truncated"] - gradients["implicit"]).norm() > 0.01 * gradients["implicit"].norm()
 
 
-def test_failures_are_their_own(pose_scene):
-    """Too few points, a start that is not finite, an input that is not: beside one that is fine."""
+def test_a_failure_does_not_affect_the_other_elements(pose_scene):
+    """Too few points, a non-finite start or a non-finite input leave a valid problem unaffected."""
     scene = pose_scene(batch=4, count=20)
     start, pixels = scene.start.clone(), scene.pixels.clone()
     mask = torch.ones(4, 20, dtype=torch.bool)
@@ -250,7 +250,7 @@ def test_dtype_and_device(dtype, device):
     assert solution.unknowns[0].device.type == device.type
 
 
-def test_what_does_not_fit_is_named():
+def test_inconsistent_inputs_are_rejected_by_name():
     x, y = normal(2, 9), normal(2, 9)
     start = torch.zeros(2, 2, dtype=torch.float64)
     leaf = y.clone().requires_grad_()

@@ -93,7 +93,7 @@ def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
         torch.testing.assert_close((leaves[position].grad * direction).sum(), expected, rtol=1e-5, atol=0)
 
 
-def test_every_observation_has_a_gradient_and_free_camera_ends_it():
+def test_every_observation_has_a_gradient_until_the_camera_is_free():
     truth, graph = simulated()
     pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
     graph = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
@@ -110,7 +110,7 @@ def test_every_observation_has_a_gradient_and_free_camera_ends_it():
     assert not torch.equal(solution.camera.params, params)
 
 
-def test_a_frame_that_sees_nothing_stays_and_is_flagged():
+def test_a_frame_without_observations_stays_and_is_flagged():
     _, graph = simulated()
     keep = graph.frame_index != 4
     pixels = graph.pixels[keep].requires_grad_()
@@ -128,7 +128,7 @@ def test_a_frame_that_sees_nothing_stays_and_is_flagged():
     assert pixels.grad.isfinite().all()
 
 
-def test_a_graph_without_observations_fails_without_an_error():
+def test_a_graph_without_observations_is_flagged_as_failed():
     _, graph = simulated()
     names = ("frame_index", "point_index", "pixels", "weights")
     solution = solve_graph(replace(graph, **{name: getattr(graph, name)[:0] for name in names}))
@@ -194,7 +194,7 @@ def test_a_run_graph_keeps_its_row_numbers(tmp_path):
         RunGraph.load(path)
 
 
-def test_a_file_from_before_there_were_worlds_has_one(tmp_path):
+def test_a_file_without_submap_indices_has_one_submap(tmp_path):
     _, graph = simulated()
     graph.save(tmp_path / "new")
     with safe_open(tmp_path / "new", framework="pt") as file:
@@ -203,8 +203,8 @@ def test_a_file_from_before_there_were_worlds_has_one(tmp_path):
     assert torch.equal(ObservationGraph.load(tmp_path / "old").submap, torch.zeros(10, dtype=torch.int64))
 
 
-def two_worlds():
-    """Truths and graphs of two worlds that share a camera, and both as one graph in an order of its own."""
+def two_submaps():
+    """Truths and graphs of two submaps that share a camera, and both as one graph with shuffled rows."""
     (truth_1, one), (truth_2, two) = simulated(seed=0), simulated(frames=7, points=30, seed=1)
     one, two = replace(one, submap=torch.full((10,), 4)), replace(two, submap=torch.full((7,), 1))
     return (truth_1, truth_2), (one, two), concatenate_graphs([one, two])
@@ -214,8 +214,8 @@ def close(found, expected):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
 
 
-def test_worlds_are_solved_each_on_its_own():
-    _, (one, two), both = two_worlds()
+def test_submaps_are_solved_independently():
+    _, (one, two), both = two_submaps()
     assert both.submaps == [1, 4]
     solution, first, second = solve_graph(both), solve_graph(one), solve_graph(two)
     # Frames in between are refined in one batch: on some processors that moves their last digits.
@@ -225,7 +225,7 @@ def test_worlds_are_solved_each_on_its_own():
     assert torch.equal(solution.points_w, torch.cat([first.points_w, second.points_w]))
     assert torch.equal(solution.success, torch.cat([first.success, second.success]))
     assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
-    assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # world 1, world 4
+    assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # submap 1, submap 4
     assert torch.equal(solution.submap, both.submap)
     for submap, alone in ((4, first), (1, second)):
         found = solution.trajectory_in(submap).T_wc
@@ -236,10 +236,10 @@ def test_worlds_are_solved_each_on_its_own():
     assert torch.equal(solution.keyframes[1].covariance().frames, first.keyframes[0].covariance().frames)
 
 
-def test_rows_of_worlds_may_be_mixed():
-    _, _, both = two_worlds()
+def test_rows_of_submaps_may_be_interleaved():
+    _, _, both = two_submaps()
     generator = torch.Generator().manual_seed(3)
-    # Frames stay in order within their world: the first keyframe is the one that is fixed.
+    # Frames stay in order within their submap: the first keyframe is the one that is fixed.
     order = torch.cat([torch.arange(5), torch.arange(10, 14), torch.arange(5, 10), torch.arange(14, 17)])
     place, rows = torch.argsort(order), torch.randperm(len(both.pixels), generator=generator)
     shuffled = replace(
@@ -256,8 +256,8 @@ def test_rows_of_worlds_may_be_mixed():
     assert torch.allclose(solution.points_w, expected.points_w, atol=1e-8)
 
 
-def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
-    (truth_1, truth_2), (one, two), both = two_worlds()
+def test_gradients_of_all_submaps_reach_pixels_and_the_shared_camera():
+    (truth_1, truth_2), (one, two), both = two_submaps()
 
     def gradients(graph, loss):
         pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
@@ -274,8 +274,8 @@ def test_gradients_of_all_worlds_reach_pixels_and_the_one_camera():
     assert (params_2 != 0).all()
 
 
-def test_worlds_that_cannot_be_solved_are_refused():
-    _, _, both = two_worlds()
+def test_submaps_that_cannot_be_solved_are_refused():
+    _, _, both = two_submaps()
     with pytest.raises(ValueError, match="free camera"):
         solve_graph(both, free_camera=True)
     with pytest.raises(ValueError, match="no keyframe"):
@@ -298,7 +298,7 @@ def test_joined_run_graphs_keep_their_names():
     assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
 
 
-def test_another_file_is_refused(tmp_path):
+def test_a_file_of_another_format_is_refused(tmp_path):
     path = tmp_path / "graph.safetensors"
     path.write_bytes(b"something else")
     with pytest.raises(TorchslamError, match=r"graph\.safetensors is not an observation graph"):

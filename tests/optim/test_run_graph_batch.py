@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.optim.test_run_graph import aligned_error, simulated, two_worlds
+from tests.optim.test_run_graph import aligned_error, simulated, two_submaps
 from torchslam.geometry import Camera
 from torchslam.optim import run_graph
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph, solve_graphs
@@ -43,7 +43,7 @@ def assert_alike(found: GraphSolution, alone: GraphSolution) -> None:
             torch.testing.assert_close(block, expected, rtol=1e-6, atol=1e-15)
 
 
-def test_graphs_of_different_sizes_and_cameras_are_solved_as_alone() -> None:
+def test_a_batch_of_different_graphs_equals_single_solves() -> None:
     graphs = several()
     for found, graph in zip(solve_graphs(graphs), graphs, strict=True):
         assert found.success.all()
@@ -58,7 +58,7 @@ def test_one_graph_is_solved_to_the_same_bytes() -> None:
     assert solve_graphs([]) == ()
 
 
-def test_cameras_of_other_models_and_weights_of_other_shapes_go_apart() -> None:
+def test_different_camera_models_and_weight_shapes_are_batched_separately() -> None:
     first, second, third = several()
     pinhole = Camera("pinhole", second.camera.params[:4], second.camera.size)
     matrices = third.weights[:, None, None] * torch.eye(2, dtype=torch.float64)
@@ -67,8 +67,8 @@ def test_cameras_of_other_models_and_weights_of_other_shapes_go_apart() -> None:
         assert_alike(found, solve_graph(graph))
 
 
-def test_worlds_of_a_graph_stay_apart() -> None:
-    _, (one, _), both = two_worlds()
+def test_submaps_of_a_graph_stay_separate() -> None:
+    _, (one, _), both = two_submaps()
     found = solve_graphs([one, both, one])
     assert_alike(found[0], solve_graph(one))
     assert_alike(found[1], solve_graph(both))
@@ -80,8 +80,8 @@ def test_worlds_of_a_graph_stay_apart() -> None:
         solve_graphs([one, replace(one, is_keyframe=torch.zeros(10, dtype=torch.bool))])
 
 
-def test_each_says_of_its_own_worlds_whether_they_are_at_a_minimum() -> None:
-    (*_, apart), (graph, *_) = two_worlds(), several()
+def test_convergence_is_reported_per_graph_and_submap() -> None:
+    (*_, apart), (graph, *_) = two_submaps(), several()
     ends = solve_graph(apart)
     there = replace(apart, T_cw=ends.T_cw, points_w=ends.points_w)
     second = (apart.submap == 1)[:, None, None]
@@ -95,7 +95,7 @@ def test_each_says_of_its_own_worlds_whether_they_are_at_a_minimum() -> None:
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
-def test_gradients_are_those_of_each_alone(kernel: str) -> None:
+def test_gradients_in_a_batch_equal_those_of_single_solves(kernel: str) -> None:
     graphs = several(noise=1.0)
     truths = [simulated(1.0, frames, points, seed)[0] for frames, points, seed in SIZES]
 
@@ -114,7 +114,7 @@ def test_gradients_are_those_of_each_alone(kernel: str) -> None:
         torch.testing.assert_close(found, alone, rtol=1e-8, atol=1e-9 * float(alone.abs().max()))
 
 
-def test_one_that_fails_does_not_touch_the_others() -> None:
+def test_a_failed_graph_does_not_affect_the_others() -> None:
     first, second, third = several()
     T_cw = second.T_cw.clone()
     T_cw[second.is_keyframe] = torch.nan
@@ -132,19 +132,19 @@ def test_one_that_fails_does_not_touch_the_others() -> None:
     assert (pixels.grad != 0).any()
 
 
-def test_none_is_filled_up_to_more_than_a_few_times_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_padding_is_bounded_by_a_few_times_the_graph_size(monkeypatch: pytest.MonkeyPatch) -> None:
     small = [simulated(0.5, 6, 20, seed)[1] for seed in range(3)]
     large = [simulated(0.5, 10, 200, seed)[1] for seed in range(2)]
     graphs = [large[0], *small, large[1]]
     expected = [solve_graph(graph) for graph in graphs]
-    asked = []
+    batches = []
     adjust = run_graph.bundle_adjust
 
     def counting(problem, *options):  # type: ignore[no-untyped-def]
-        asked.append(tuple(problem.points_w.shape[:2]))
+        batches.append(tuple(problem.points_w.shape[:2]))
         return adjust(problem, *options)
 
     monkeypatch.setattr(run_graph, "bundle_adjust", counting)
     for found, alone in zip(solve_graphs(graphs), expected, strict=True):
         assert_alike(found, alone)
-    assert sorted((count, points > 100) for count, points in asked) == [(2, True), (3, False)]
+    assert sorted((count, points > 100) for count, points in batches) == [(2, True), (3, False)]

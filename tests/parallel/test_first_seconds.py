@@ -41,15 +41,15 @@ def loaded(*command: str) -> list[str]:
     ],
     ids=" ".join,
 )
-def test_nothing_heavy_is_imported_where_nothing_is_computed(command: list[str], status: str) -> None:
+def test_commands_that_compute_nothing_import_no_heavy_modules(command: list[str], status: str) -> None:
     assert loaded(*command) == [status]
 
 
-def test_info_imports_what_reads_a_sequence_and_no_more() -> None:
+def test_info_imports_only_the_readers() -> None:
     status, *modules = loaded("info", "synthetic:room?frames=2&blank=1")
     assert status == "0"
     assert set(modules) == {"torch", "numpy", "cv2"}  # a camera is a tensor
 
 
-def test_the_help_names_every_preset() -> None:
+def test_help_lists_every_preset() -> None:
     assert arguments.PRESETS.split(", ") == list(PRESETS)

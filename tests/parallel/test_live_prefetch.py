@@ -51,7 +51,7 @@ class Source:
 def live(frames: int, pause: float = 0.0) -> LiveSequence:
     sequence = LiveSequence("camera", Source(frames, pause), CAMERA, backlog=frames)
     if not pause:
-        sequence._begin()  # as the first frame does that is asked for
+        sequence._begin()  # as the first requested frame does
     while not pause and sequence.backlog < frames:
         time.sleep(0.01)
     return sequence
@@ -70,7 +70,7 @@ def expected(index: int) -> Features:
     return image_extractor(CONFIG)(Frame(index, 0.0, image))
 
 
-def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LivePrefetcher) -> None:
+def test_a_queued_frame_is_extracted_by_the_worker_with_the_same_result(reader: LivePrefetcher) -> None:
     found = []
     for index in range(8):
         if index == SMALL:
@@ -86,14 +86,14 @@ def test_what_waits_is_looked_at_elsewhere_with_the_same_result(reader: LivePref
             right = expected(index)
             for name in ("keypoints", "descriptors", "mask"):
                 assert torch.equal(getattr(frame.features, name), getattr(right, name))
-    # Nothing is known of the first one before it is asked for, nor of the one behind the frame that failed.
+    # The first frame and the one after the failed frame are not prefetched.
     assert found == [False, True, True, False, True, True, True]
     assert reader._clock.take()["features"] > 0
     with pytest.raises(EndOfSequence):
         reader[8]
 
 
-def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_has_not_arrived_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.data.readers.live.STALE", PATIENCE)
     with LivePrefetcher(live(4, pause=0.05), CAMERA, CONFIG, Stopwatch()) as frames:
         assert frames._worker._ours.poll(PATIENCE)
@@ -105,7 +105,7 @@ def test_a_frame_that_has_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyP
         assert frames[2].index == 2
 
 
-def test_without_the_process_it_goes_on(reader: LivePrefetcher) -> None:
+def test_the_source_continues_without_the_worker(reader: LivePrefetcher) -> None:
     reader[0], reader[1]
     os.kill(reader._worker._process.pid or 0, signal.SIGKILL)
     reader._worker._process.join()

@@ -110,10 +110,10 @@ def ahead(sequence: Sequence, clock: Stopwatch | None = None, processes: int = 1
 
 
 @pytest.mark.usefixtures("patient")
-def test_others_find_what_would_be_found_here(sequence: Sequence) -> None:
+def test_prefetched_features_equal_those_computed_here(sequence: Sequence) -> None:
     clock = Stopwatch()
     with ahead(sequence, clock, processes=2) as frames:
-        # The first one is read here, while the others are asked for: here the run begins at frame 2.
+        # The first frame is read here while the others are requested; the run begins at frame 2.
         theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
         assert len(frames._requested) == 0
     assert theirs == [index not in (2, BAD, SMALL) for index in range(2, FRAMES)]
@@ -123,7 +123,7 @@ def test_others_find_what_would_be_found_here(sequence: Sequence) -> None:
 
 
 @pytest.mark.usefixtures("patient")
-def test_no_more_than_a_few_frames_are_asked_for() -> None:
+def test_few_frames_are_requested_ahead() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         assert frames[10].features is None
         assert sorted(frames._requested) == [*range(11, 19)]
@@ -132,7 +132,7 @@ def test_no_more_than_a_few_frames_are_asked_for() -> None:
 
 
 @pytest.mark.usefixtures("patient")
-def test_what_comes_after_the_first_frame_is_read_while_the_run_is_prepared() -> None:
+def test_the_second_frame_is_prefetched_during_setup() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         frames.begin(5)
         assert sorted(frames._requested) == [*range(6, 14)]
@@ -141,7 +141,7 @@ def test_what_comes_after_the_first_frame_is_read_while_the_run_is_prepared() ->
         assert frames[6].features is not None
 
 
-def test_a_process_that_has_not_started_is_asked_for_nothing(
+def test_a_worker_that_has_not_started_gets_no_requests(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
@@ -151,7 +151,7 @@ def test_a_process_that_has_not_started_is_asked_for_nothing(
         assert frames._next is None  # so that it still may be
 
 
-def test_a_process_that_has_not_started_is_not_waited_for(
+def test_a_worker_that_has_not_started_is_not_waited_for(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
@@ -163,7 +163,7 @@ def test_a_process_that_has_not_started_is_not_waited_for(
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_process_that_is_killed_is_done_without(sequence: Sequence) -> None:
+def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
         check_same(frames, sequence, 0)
         assert check_same(frames, sequence, 1)
@@ -187,7 +187,7 @@ class Broken(Sequence):
 
 
 @pytest.mark.usefixtures("patient")
-def test_other_errors_are_raised_at_their_frame_and_the_process_ends(sequence: Sequence) -> None:
+def test_errors_are_raised_at_their_frame_and_the_worker_ends(sequence: Sequence) -> None:
     broken = Broken("broken", "test", sequence.camera, torch.arange(5.0, dtype=torch.float64))
     with ahead(broken) as frames:
         assert [frames[index].index for index in range(2)] == [0, 1]
@@ -198,7 +198,7 @@ def test_other_errors_are_raised_at_their_frame_and_the_process_ends(sequence: S
 
 
 @pytest.mark.usefixtures("patient", "without_pictures")
-def test_same_bytes_with_one_process_or_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_or_two_processes_give_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outputs, folder = [tmp_path / "one", tmp_path / "two"], write_tum_folder(tmp_path / "room", frames=16)
     for processes, output in enumerate(outputs, start=1):
         assert main(["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]) == 0
@@ -208,12 +208,12 @@ def test_same_bytes_with_one_process_or_two(tmp_path: Path, capsys: pytest.Captu
     assert multiprocessing.active_children() == []
 
 
-def test_videos_and_archives_travel(tmp_path: Path, sequence: Sequence) -> None:
+def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Sequence) -> None:
     images = [cv2.cvtColor(picture(index), cv2.COLOR_GRAY2BGR) for index in range(5)]
-    write_mp4(tmp_path / "film.mp4", images)
+    write_mp4(tmp_path / "video.mp4", images)
     (tmp_path / "pictures" / "rgb" / f"{BAD:02}.png").unlink()
     shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path / "pictures")
-    for path in (tmp_path / "film.mp4", tmp_path / "packed.zip"):
+    for path in (tmp_path / "video.mp4", tmp_path / "packed.zip"):
         opened = open_sequence(path, "100,100,79.5,59.5", stride=2)
         first = opened.image(2)
         copy = pickle.loads(pickle.dumps(opened))
@@ -263,7 +263,7 @@ def wait_for_end(group: int) -> None:
 
 
 @needs_proc
-def test_a_process_ends_with_the_one_that_asks() -> None:
+def test_a_worker_ends_with_its_parent() -> None:
     asking = subprocess.Popen([sys.executable, "-c", ORPHAN], start_new_session=True)
     assert asking.wait(PATIENCE) == -signal.SIGKILL
     wait_for_end(asking.pid)
@@ -279,7 +279,7 @@ def test_a_process_ends_with_the_one_that_asks() -> None:
         pytest.param(signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
     ],
 )
-def test_a_signal_to_all_ends_the_run_with_results(
+def test_a_signal_to_the_process_group_ends_the_run_with_results(
     tmp_path: Path, number: int, status: int, when: str
 ) -> None:
     line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]

@@ -1,4 +1,4 @@
-"""What goes wrong in another process is told in one way, wherever it was asked for."""
+"""Errors in worker processes are reported in one way."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def fail(error: Exception) -> None:
     raise error
 
 
-def test_an_answer_is_itself_and_is_found_in_inference_mode() -> None:
+def test_results_round_trip_and_are_computed_in_inference_mode() -> None:
     assert unwrap(try_call("adds", lambda a, b: a + b, 1, 2)) == 3
     assert try_call("looks", torch.is_inference_mode_enabled) is True
 
 
-def test_an_error_is_raised_where_it_is_wanted_with_where_it_was() -> None:
+def test_a_worker_error_is_raised_by_the_caller_with_its_traceback() -> None:
     answer = pickle.loads(pickle.dumps(try_call("reads ahead", fail, ZeroDivisionError("what is this?"))))
     with pytest.raises(ZeroDivisionError, match="what is this") as raised:
         unwrap(answer)
@@ -38,13 +38,13 @@ def test_an_error_is_raised_where_it_is_wanted_with_where_it_was() -> None:
     assert "in fail" in note
 
 
-def test_errors_of_our_own_say_all_by_themselves() -> None:
+def test_own_errors_are_raised_without_a_traceback() -> None:
     with pytest.raises(FrameError) as raised:
         unwrap(try_call("reads ahead", fail, FrameError("frame 3 is damaged")))
     assert not hasattr(raised.value, "__notes__")
 
 
-def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
+def test_a_worker_starts_with_its_task_and_ends_with_its_parent() -> None:
     ours, theirs = multiprocessing.Pipe()
     ours.send_bytes(pack_task("twice", 2))
     for number in (3, 4):
@@ -64,7 +64,7 @@ def test_work_begins_with_its_task_and_ends_with_the_one_that_asks() -> None:
 
 
 def multiply(connection: Connection, factor: int) -> None:
-    """What a process of these tests does; asked for nothing, it ends as if somebody had killed it."""
+    """Answer requests; an empty request ends the process as if it had been killed."""
     for number in requests(connection):
         if number is None:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -93,7 +93,7 @@ def come(worker: Worker) -> None:
         time.sleep(0.01)
 
 
-def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
+def test_a_worker_starts_answers_and_stops(worker: Worker) -> None:
     (process,) = helpers()
     assert process.daemon  # none outlives this one
     come(worker)
@@ -105,7 +105,7 @@ def test_a_process_comes_answers_and_is_let_go(worker: Worker) -> None:
     assert not helpers()
 
 
-def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker) -> None:
+def test_a_killed_worker_is_reported_once_and_skipped(worker: Worker) -> None:
     come(worker)
     assert worker.send(pack_task(3))
     assert worker.send(pickle.dumps(None))
@@ -118,7 +118,7 @@ def test_a_process_that_was_killed_is_told_once_and_done_without(worker: Worker)
         assert worker.receive() is None
 
 
-def test_nothing_is_sent_to_a_process_that_was_not_seen_to_be_there() -> None:
+def test_nothing_is_sent_to_a_worker_before_it_is_ready() -> None:
     worker = Worker(multiply)
     try:
         assert not worker.send(pack_task(3))

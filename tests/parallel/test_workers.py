@@ -36,7 +36,7 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
-    """Where the frames come from, and whether adjustments are found beside."""
+    """The source of the frames, and whether a worker does bundle adjustment."""
     with with_workers(sequence, slam, processes, start) as frames:
         is_beside = isinstance(slam.mapper.adjustment.solver, BundleWorker)
     assert slam.mapper.adjustment.solver is solve_here
@@ -44,7 +44,7 @@ def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_who_does_what(capsys: pytest.CaptureFixture[str]) -> None:
+def test_work_is_assigned_to_workers(capsys: pytest.CaptureFixture[str]) -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, CONFIG)
     here = type(sequence).__name__
@@ -61,7 +61,7 @@ def test_who_does_what(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
+def test_without_prefetching_the_second_process_does_bundle_adjustment(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = room(20)
@@ -74,11 +74,11 @@ def test_where_frames_cannot_be_read_ahead_the_second_one_adjusts(
     monkeypatch.setattr("torchslam.parallel.workers.best_number", lambda *arguments: 3)
     assert who(sequence, slam, None) == ("LivePrefetcher", True)
     assert why_alone(sequence, slam) == ""
-    assert capsys.readouterr().err == ""  # nobody asked for more
+    assert capsys.readouterr().err == ""  # no message unless requested
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_all_is_done_here_on_another_device(capsys: pytest.CaptureFixture[str]) -> None:
+def test_accelerators_use_no_workers(capsys: pytest.CaptureFixture[str]) -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, CONFIG)
     camera = sequence.camera
@@ -87,7 +87,7 @@ def test_all_is_done_here_on_another_device(capsys: pytest.CaptureFixture[str]) 
     assert "one process: the meta does it all" in capsys.readouterr().err
 
 
-def test_how_many_are_best(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     long, short = room(WORTH), room(WORTH - 1)
     few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
     for count, several in ((1, 1), (2, 3), (8, 3)):
@@ -101,7 +101,7 @@ def test_how_many_are_best(monkeypatch: pytest.MonkeyPatch) -> None:
     assert processors() >= 1
 
 
-def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
+def test_workers_are_forked_only_from_a_single_threaded_process() -> None:
     code = (
         "import threading; from torchslam.parallel.worker import starts_at_once; alone = starts_at_once(); "
         "wait = threading.Event(); threading.Thread(target=wait.wait).start(); "
@@ -116,14 +116,14 @@ def test_a_process_is_copied_where_nothing_else_runs_in_this_one() -> None:
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_parts_of_ones_own_stay_here() -> None:
+def test_custom_components_stay_in_the_main_process() -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
     assert who(sequence, slam, 3) == (type(sequence).__name__, True)
     assert "of your own" in why_alone(sequence, slam)
 
 
-def test_a_run_with_more_processes_is_the_same() -> None:
+def test_more_processes_give_the_same_run() -> None:
     """In a program of one's own, too."""
     sequence = open_sequence("synthetic:room?frames=160").part(20, 38)
     config = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
@@ -135,7 +135,7 @@ def test_a_run_with_more_processes_is_the_same() -> None:
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
+def test_the_first_frame_does_not_wait_for_lazy_initialization() -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, load_config(None, ["features.kind=orb"]))
     extract, seen = slam.extractor, []
@@ -157,7 +157,7 @@ def test_the_first_frame_does_not_wait_for_what_is_made_on_first_use() -> None:
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_the_first_frame_that_is_tracked_does_not_wait_for_a_table() -> None:
+def test_the_first_tracked_frame_does_not_wait_for_the_undistortion_table() -> None:
     sequence = room(20)
     width, height = sequence.camera.size
     slam = SLAM(

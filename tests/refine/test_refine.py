@@ -89,7 +89,7 @@ def test_exact_features_give_the_true_poses(exact: RefinementResult) -> None:
     assert all(result.state is State.TRACKING for result in exact.run.results)
 
 
-def test_the_results_are_those_of_a_run(exact: RefinementResult) -> None:
+def test_the_results_equal_those_of_a_run(exact: RefinementResult) -> None:
     """The given poses are what it calls online; the graph of the run has its poses as the minimum."""
     torch.testing.assert_close(exact.run.online.T_wc, disturbed(TRUE).T_wc)
     assert exact.run.map.num_keyframes == sum(result.is_keyframe for result in exact.run.results)
@@ -98,7 +98,7 @@ def test_the_results_are_those_of_a_run(exact: RefinementResult) -> None:
     assert (exact.without_pose, exact.without_image) == (0, 0)
 
 
-def test_noise_is_averaged_and_said() -> None:
+def test_noise_is_averaged_and_reported() -> None:
     """A third of a pixel of noise, and every tenth match wrong: better by far, and twice the same."""
     assert WALK.groundtruth is not None
     settings = config("simulated.noise_px=0.3", "simulated.outlier_ratio=0.1")
@@ -113,7 +113,7 @@ def test_noise_is_averaged_and_said() -> None:
     assert float(found[0].camera.focal) == pytest.approx(400.0, rel=0.03)
 
 
-def test_the_unit_of_the_given_poses_stays() -> None:
+def test_the_scale_of_the_given_poses_is_kept() -> None:
     """Poses in feet, in another frame: the answer is in feet and in that frame."""
     settings = config()
     S = se3_exp(torch.tensor([1.0, -2.0, 0.5, 0.3, -0.4, 0.2], dtype=torch.float64))
@@ -127,7 +127,7 @@ def test_the_unit_of_the_given_poses_stays() -> None:
     assert angle < 0.02
 
 
-def test_a_right_camera_stays() -> None:
+def test_a_correct_camera_is_unchanged() -> None:
     """The images do not contradict it, so not a bit of it changes; freed, it comes out as good as the same."""
     settings = config("simulated.noise_px=0.3")
     judged = refine_poses(seen(settings), disturbed(TRUE), settings)
@@ -137,7 +137,7 @@ def test_a_right_camera_stays() -> None:
     assert float(judged.intrinsics.camera.focal) == pytest.approx(400.0, rel=0.02)
 
 
-def test_frames_and_poses_that_have_no_partner() -> None:
+def test_unmatched_frames_and_poses_are_reported() -> None:
     """Are left out and counted."""
     settings = config()
     T_wc = se3_inverse(TRUE)
@@ -153,7 +153,7 @@ def test_frames_and_poses_that_have_no_partner() -> None:
         refine_poses(seen(settings), Trajectory.empty(), settings)
 
 
-def test_images_that_make_no_map() -> None:
+def test_images_without_a_map_are_reported() -> None:
     """The run says why, and has no poses."""
     settings, rest = config(), Walk(still(4))
     found = refine_poses(rest, disturbed(true_T_cw(rest)), settings)
@@ -167,8 +167,8 @@ def test_images_that_make_no_map() -> None:
     )
 
 
-def test_devices(device: torch.device) -> None:
-    """All of it works where it is asked to, and comes to the same."""
+def test_refinement_runs_on_the_device(device: torch.device) -> None:
+    """Refinement on the simulated accelerator gives the result of the CPU."""
     settings = config()
     walk = WALK.part(0, 6)
     found = refine_poses(seen(settings, walk), _first(6), settings, device=device)
@@ -182,7 +182,7 @@ def _first(count: int) -> Trajectory:
 
 
 @pytest.mark.data
-def test_a_kitchen(data_dir: Path) -> None:
+def test_a_real_sequence_is_refined(data_dir: Path) -> None:
     """Twenty real images, one in eight: the true poses are right to 1 to 3 cm, the focal length is 540 to 1 %."""
     sequence = open_sequence(data_dir / "redkitchen", limit=20, stride=8)
     assert sequence.groundtruth is not None

@@ -52,7 +52,7 @@ def edges(R_cw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return first, second, R_cw[second] @ R_cw[first].mT
 
 
-def test_exact_relative_rotations_are_met(generator: torch.Generator) -> None:
+def test_exact_relative_rotations_are_recovered(generator: torch.Generator) -> None:
     """Up to the turn that is common to all, which is the mean of what the given ones say."""
     true = so3_exp(0.5 * randn(generator, 12, 3))
     given = so3_exp(0.05 * randn(generator, 12, 3)) @ true
@@ -73,14 +73,14 @@ def test_wrong_relative_rotations_are_outvoted(generator: torch.Generator) -> No
     assert float(degrees(found[second] @ found[first].mT, R_21)[right].max()) < 0.2
 
 
-def test_rotations_that_agree_stay(generator: torch.Generator) -> None:
+def test_consistent_rotations_are_unchanged(generator: torch.Generator) -> None:
     true = so3_exp(0.5 * randn(generator, 6, 3))
     torch.testing.assert_close(average_rotations(true, *edges(true)), true, atol=1e-10, rtol=0)
     nothing = torch.zeros(0, dtype=torch.int64)
     assert average_rotations(true, nothing, nothing, true[:0]) is true
 
 
-def test_turning_leaves_the_centers(generator: torch.Generator) -> None:
+def test_rotation_averaging_keeps_the_centers(generator: torch.Generator) -> None:
     T_cw = rigid(so3_exp(0.3 * randn(generator, 3, 3)), randn(generator, 3, 3))
     off = T_cw.clone()
     off[1] = se3_exp(torch.tensor([0, 0, 0, 0.05, 0, 0], dtype=torch.float64)) @ T_cw[1]
@@ -95,7 +95,7 @@ def test_turning_leaves_the_centers(generator: torch.Generator) -> None:
 # --- tracks --------------------------------------------------------------------------------------------------
 
 
-def test_matches_that_hang_together_are_one_track() -> None:
+def test_connected_matches_are_one_track() -> None:
     pairs = [pair(0, 1, (4, 2), (5, 6)), pair(1, 2, (2, 0)), pair(0, 3, (7, 7))]
     tracks = join_matches(pairs, keyframes=4, keypoints=8)
     rows = list(zip(tracks.track.tolist(), tracks.keyframe.tolist(), tracks.keypoint.tolist(), strict=True))
@@ -103,7 +103,7 @@ def test_matches_that_hang_together_are_one_track() -> None:
     assert tracks.count == 3
 
 
-def test_two_keypoints_of_a_keyframe_contradict_each_other() -> None:
+def test_two_keypoints_of_one_keyframe_invalidate_a_track() -> None:
     """Nobody knows which is right: both are left out, the rest stays if it is of two keyframes."""
     around = [pair(0, 1, (0, 0)), pair(1, 2, (0, 0)), pair(0, 2, (0, 1))]
     tracks = join_matches(around, keyframes=3, keypoints=4)
@@ -111,7 +111,7 @@ def test_two_keypoints_of_a_keyframe_contradict_each_other() -> None:
     assert join_matches([pair(0, 1, (0, 0), (1, 0))], keyframes=2, keypoints=4).count == 0
 
 
-def test_the_largest_part_that_hangs_together() -> None:
+def test_the_largest_connected_component() -> None:
     assert largest_connected_part([pair(0, 1, (0, 0)), pair(2, 4, (0, 0)), pair(3, 4, (0, 0))], 5) == [
         2,
         3,
@@ -141,7 +141,7 @@ def test_long_tracks_are_triangulated(generator: torch.Generator) -> None:
     torch.testing.assert_close(short[:2], points_w[:2], atol=1e-9, rtol=0)
 
 
-def test_a_map_sees_what_the_tracks_say() -> None:
+def test_a_map_has_the_observations_of_the_tracks() -> None:
     scene, T_cw = Scene.of(40), sideways(3)
     views = [scene.view(index, T) for index, T in enumerate(T_cw)]
     tracks = Tracks(
@@ -160,7 +160,7 @@ def test_a_map_sees_what_the_tracks_say() -> None:
 # --- keyframes and pairs -------------------------------------------------------------------------------------
 
 
-def test_keyframes_are_where_the_image_has_moved() -> None:
+def test_keyframes_are_chosen_by_image_motion() -> None:
     """0.08 of 320 px are 26: at 4 m a point moves by 50 px per meter."""
     scene = Scene.of()
     T_cw = sideways(16, step=0.1)
@@ -172,7 +172,7 @@ def test_keyframes_are_where_the_image_has_moved() -> None:
     assert choose_keyframes(still, CAMERA.width, CONFIG) == [0]
 
 
-def test_pairs_look_the_same_way() -> None:
+def test_pairs_have_similar_view_directions() -> None:
     """Neighbors in time always; others only where the given poses do not look elsewhere."""
     scene, T_cw = Scene.of(), sideways(8, step=0.1)
     views = [scene.view(index, T) for index, T in enumerate(T_cw)]
@@ -185,7 +185,7 @@ def test_pairs_look_the_same_way() -> None:
     assert all(first < second for first, second in pairs)
 
 
-def test_matches_are_verified(generator: torch.Generator) -> None:
+def test_matches_are_verified_geometrically(generator: torch.Generator) -> None:
     """Wrong ones go; a pair whose rotation is not that of the given poses by far goes as a whole."""
     scene, T_cw = Scene.of(), sideways(3, step=0.3)
     views = [scene.view(index, T) for index, T in enumerate(T_cw)]
@@ -207,7 +207,7 @@ def test_matches_are_verified(generator: torch.Generator) -> None:
     assert [(p.first, p.second) for p in find_pairs(views, wrong, CAMERA, CONFIG)] == [(0, 1)]
 
 
-def test_images_that_are_reduced_have_the_same_pairs() -> None:
+def test_reduced_images_have_the_same_pairs() -> None:
     """What is noise at 640x480 is noise in four times as large an image, which is looked at reduced to that."""
     scene, T_cw = Scene.of(), sideways(3, step=0.4)
     small = [scene.view(index, T, noise=0.5) for index, T in enumerate(T_cw)]
@@ -224,7 +224,7 @@ def test_images_that_are_reduced_have_the_same_pairs() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> None:
+def test_a_map_from_perturbed_poses(generator: torch.Generator, noise: float) -> None:
     """Poses 2 degrees and 5 cm off at 4 m become those that the pixels say."""
     scene, T_cw = Scene.of(), sideways(8, step=0.2)
     views = [scene.view(index, T, noise=noise) for index, T in enumerate(T_cw)]
@@ -242,7 +242,7 @@ def test_a_map_of_disturbed_poses(generator: torch.Generator, noise: float) -> N
 # --- the frame of the given poses ----------------------------------------------------------------------------
 
 
-def test_back_to_the_given_frame(generator: torch.Generator) -> None:
+def test_the_result_is_in_the_given_frame(generator: torch.Generator) -> None:
     """The similarity that was lost is found, also of centers on a line, and one wild pose does not change it."""
     S = se3_exp(torch.tensor([1.0, -2, 0.5, 0.3, -0.4, 0.2], dtype=torch.float64))
     S[:3, :3] *= 1.6
@@ -258,7 +258,7 @@ def test_back_to_the_given_frame(generator: torch.Generator) -> None:
         torch.testing.assert_close(align_to_input(own, wild), S, atol=1e-9, rtol=0)
 
 
-def test_a_camera_in_one_place_keeps_its_unit(generator: torch.Generator) -> None:
+def test_without_translation_the_alignment_keeps_the_scale(generator: torch.Generator) -> None:
     given = rigid(so3_exp(randn(generator, 5, 3)), torch.zeros(5, 3, dtype=torch.float64))
     turn = se3_exp(torch.tensor([0, 0, 0, 0.3, -0.4, 0.2], dtype=torch.float64))
     torch.testing.assert_close(align_to_input(given @ turn, given), turn, atol=1e-9, rtol=0)

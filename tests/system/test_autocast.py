@@ -245,7 +245,7 @@ def results(case: Case, autocast: bool) -> list[Tensor]:
     return found + [g for g in gradients if g is not None]
 
 
-def test_no_public_function_is_forgotten() -> None:
+def test_every_public_function_is_covered() -> None:
     public = {
         name
         for module in (torchslam, geometry, solvers)
@@ -256,7 +256,7 @@ def test_no_public_function_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_autocast_changes_no_bit(name: str) -> None:
+def test_autocast_does_not_change_results(name: str) -> None:
     plain, cast = results(CASES[name], autocast=False), results(CASES[name], autocast=True)
     assert len(plain) == len(cast) > 0
     for expected, found in zip(plain, cast, strict=True):
@@ -267,7 +267,7 @@ def test_autocast_changes_no_bit(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["refine_pose", "bundle_adjust", "solve_graph", "pose_graph_optimize", "minimize"]
 )
-def test_autocast_does_not_reach_the_backward_pass_of_a_minimum(name: str) -> None:
+def test_autocast_does_not_affect_the_backward_pass(name: str) -> None:
     function, inputs = CASES[name]
     gradients = []
     for enabled in (False, True):

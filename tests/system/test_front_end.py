@@ -41,7 +41,7 @@ def test_only_much_larger_images_are_reduced(size: tuple[int, int], factor: floa
     assert FeaturesConfig(max_image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
 
 
-def test_what_is_not_said_in_units_of_a_scale_grows() -> None:
+def test_pixel_settings_grow_with_the_image() -> None:
     config = Config()
     assert config.for_size((1241, 376)) == config
     large = config.for_size((1920, 1440))
@@ -62,7 +62,7 @@ def seen(width: int, height: int, image_pixels: int = 640 * 480) -> Features:
 
 
 @pytest.mark.parametrize("size", [(1280, 960), (1920, 1440), (1500, 1000)])
-def test_a_large_image_shows_what_a_small_one_does(size: tuple[int, int]) -> None:
+def test_a_large_image_has_the_keypoints_of_a_small_one(size: tuple[int, int]) -> None:
     small, large = seen(640, 480), seen(*size)
     matches = match(small, large)
     first, second = matches.indices_1[0][matches.mask[0]], matches.indices_2[0][matches.mask[0]]
@@ -78,12 +78,12 @@ def test_a_large_image_shows_what_a_small_one_does(size: tuple[int, int]) -> Non
     assert bool((large.keypoints[0][:, 0] > 0.9 * size[0]).any())
 
 
-def test_images_that_are_not_reduced_are_taken_as_they_are() -> None:
+def test_images_that_are_not_reduced_are_unchanged() -> None:
     assert float(seen(1280, 960, 0).scales.min()) == 1
     assert float(seen(1280, 960).scales[0][seen(1280, 960).mask[0]].min()) == 2
 
 
-def test_a_mask_holds_for_the_large_image() -> None:
+def test_a_mask_applies_to_the_large_image() -> None:
     frame = resize(open_sequence(WALK), "1280x960")[0]
     wanted = (torch.arange(1280) < 333).expand(frame.image.shape)
     found = image_extractor(Config())(replace(frame, mask=wanted))
@@ -92,15 +92,15 @@ def test_a_mask_holds_for_the_large_image() -> None:
     assert int(found.mask.sum()) > 300  # the budget goes there
 
 
-def test_every_stage_is_told_for_the_size_and_the_configuration_stays() -> None:
+def test_every_stage_gets_the_scaled_configuration() -> None:
     slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
-    told = Config().for_size((1280, 960))
+    scaled = Config().for_size((1280, 960))
     assert slam.config == Config()
     initializer = slam._state_machine.initialization.initializer
     assert all(
-        one.config == told for one in (slam.mapper, slam.loop_closer, slam.non_static_filter, initializer)
+        one.config == scaled for one in (slam.mapper, slam.loop_closer, slam.non_static_filter, initializer)
     )
-    assert slam.tracker.settings == told.tracking
+    assert slam.tracker.settings == scaled.tracking
     assert slam.non_static_filter.static_overlay.evidence.shape == (121, 161)
 
 
@@ -109,7 +109,7 @@ def run(size: str) -> Run:
     return SLAM(walk.camera).run(walk)
 
 
-def test_a_walk_comes_out_alike_at_another_size() -> None:
+def test_a_trajectory_is_the_same_at_another_image_size() -> None:
     small, large = run("640x480"), run("1920x1440")
     assert all(result.T_cw is not None for result in large.results[5:])
     keyframes = [one.map.num_keyframes for one in (small, large)]

@@ -62,12 +62,12 @@ def run_with(say: Say) -> tuple[SLAM, Run]:
 
 
 @pytest.fixture(scope="module", params=[by_number, by_matrix], ids=["number", "matrix"])
-def told(request: pytest.FixtureRequest) -> tuple[SLAM, Run, Say]:
+def informed(request: pytest.FixtureRequest) -> tuple[SLAM, Run, Say]:
     return *run_with(request.param), request.param
 
 
-def test_a_run_carries_what_is_said(told: tuple[SLAM, Run, Say]) -> None:
-    _, run, say = told
+def test_a_run_uses_the_given_information(informed: tuple[SLAM, Run, Say]) -> None:
+    _, run, say = informed
     assert len(run.trajectory) == len(WALK)
     assert evaluate(run.trajectory, WALK.groundtruth).ate_m < 0.003
     graph, kept = run.graph, run.map.keyframes
@@ -80,13 +80,13 @@ def test_a_run_carries_what_is_said(told: tuple[SLAM, Run, Say]) -> None:
     assert solve_graph(graph).success.all()
 
 
-def test_a_number_is_the_matrix_that_it_stands_for(told: tuple[SLAM, Run, Say]) -> None:
-    other = run_with(by_matrix if told[2] is by_number else by_number)[1]
-    torch.testing.assert_close(told[1].trajectory.T_wc, other.trajectory.T_wc, atol=1e-6, rtol=0)
+def test_a_scalar_information_equals_its_matrix(informed: tuple[SLAM, Run, Say]) -> None:
+    other = run_with(by_matrix if informed[2] is by_number else by_number)[1]
+    torch.testing.assert_close(informed[1].trajectory.T_wc, other.trajectory.T_wc, atol=1e-6, rtol=0)
 
 
-def test_a_map_keeps_what_is_said(told: tuple[SLAM, Run, Say], tmp_path: Path) -> None:
-    slam, _, say = told
+def test_a_map_stores_the_information(informed: tuple[SLAM, Run, Say], tmp_path: Path) -> None:
+    slam, _, say = informed
     slam.save(tmp_path / "map")
     loaded = SLAM.load(tmp_path / "map", CONFIG, mapping=False)
     loaded.save(tmp_path / "again")
@@ -100,7 +100,7 @@ def test_a_map_keeps_what_is_said(told: tuple[SLAM, Run, Say], tmp_path: Path) -
 SAID = told_by(by_matrix)
 
 
-def test_a_checkpoint_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_a_resumed_run_with_information_ends_with_the_same_bytes(tmp_path: Path) -> None:
     whole = run_with(by_matrix)[1]
     slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
     for index in range(12):
@@ -114,18 +114,18 @@ def test_a_checkpoint_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     torch.testing.assert_close(resumed.trajectory.T_wc, whole.trajectory.T_wc, atol=1e-3, rtol=0)
 
 
-def test_keypoints_of_which_some_are_known_badly_are_worth_what_is_said() -> None:
+def test_information_downweights_inaccurate_keypoints() -> None:
     """Every third keypoint is several times as far off as the others; who says so comes out twice as well."""
     errors = {}
-    for name in ("told", "hidden"):
+    for name in ("informed", "hidden"):
 
-        def blurred(features: Features, told: bool = name == "told") -> Features:
+        def blurred(features: Features, informed: bool = name == "informed") -> Features:
             bad = features.descriptors[..., 0].remainder(3) == 0
             generator = torch.Generator().manual_seed(int(1e3 * float(features.keypoints.sum()) % 2**30))
             shift = 2.0 * torch.randn(features.keypoints.shape, generator=generator, dtype=torch.float64)
             keypoints = torch.where(bad[..., None], features.keypoints + shift, features.keypoints)
             information = 1 / ((0.3 * features.scales) ** 2 + torch.where(bad, 4.0, 0.0))
-            return replace(features, keypoints=keypoints, information=information if told else None)
+            return replace(features, keypoints=keypoints, information=information if informed else None)
 
         seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
         run = SLAM(WALK.camera, CONFIG).run(
@@ -133,7 +133,7 @@ def test_keypoints_of_which_some_are_known_badly_are_worth_what_is_said() -> Non
         )
         assert len(run.trajectory) == len(WALK), name
         errors[name] = evaluate(run.trajectory, WALK.groundtruth).ate_m
-    assert errors["told"] < 0.6 * errors["hidden"]
+    assert errors["informed"] < 0.6 * errors["hidden"]
 
 
 class Doubtful(nn.Module):
@@ -163,7 +163,7 @@ class Doubtful(nn.Module):
 
 
 @pytest.mark.parametrize("kind", ["number", "matrix"])
-def test_gradients_reach_what_says_the_information(kind: str) -> None:
+def test_gradients_reach_the_information(kind: str) -> None:
     walk = Walk(arc(6, length=1.0))
     images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
     eyes = Doubtful(walk, kind)

@@ -75,7 +75,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- checkpoints ---------------------------------------------------------------------------------------------
 
 
-def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
+def test_a_checkpoint_restores_the_state(checkpoint: Path) -> None:
     slam, so_far = half()
     resumed, loaded = read_checkpoint(checkpoint, WALK, CONFIG)
     assert loaded.next == so_far.next == STOP + 1
@@ -106,7 +106,7 @@ def test_what_had_been_done_comes_back(checkpoint: Path) -> None:
     assert torch.nonzero(resumed.non_static_filter.static_overlay.evidence).tolist() == [[3, 4]]
 
 
-def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_equals_an_uninterrupted_one(checkpoint: Path, tmp_path: Path) -> None:
     whole = SLAM(WALK.camera, CONFIG).run(WALK)
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
     resumed = run_sequence(slam, WALK, None, so_far)
@@ -119,7 +119,7 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_cut(checkpoint: Path, tmp_path
 
 
 @pytest.mark.parametrize("window", [3, 1000])  # few keyframes are enough to wait, or none are
-def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, window: int) -> None:
+def test_a_pending_adjustment_is_finished_after_resuming(tmp_path: Path, window: int) -> None:
     config = load_config(
         None, [*SETTINGS, "bundle_adjustment.delay_frames=3", f"bundle_adjustment.local_window={window}"]
     )
@@ -142,13 +142,13 @@ def test_an_adjustment_that_waits_is_waited_for_after_a_cut(tmp_path: Path, wind
     assert torch.equal(run.online.T_wc, whole.online.T_wc)
 
 
-def test_same_state_same_bytes(checkpoint: Path, tmp_path: Path) -> None:
+def test_the_same_state_gives_the_same_bytes(checkpoint: Path, tmp_path: Path) -> None:
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
     write_checkpoint(tmp_path / "again", slam, so_far, WALK)
     assert (tmp_path / "again").read_bytes() == checkpoint.read_bytes()
 
 
-def test_a_checkpoint_of_something_else_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_run_is_refused(checkpoint: Path, tmp_path: Path) -> None:
     for other in (Walk(PATH[:-1]), Walk(PATH)):
         if len(other) == FRAMES:
             other.camera = other.camera.with_params(other.camera.params + 1)
@@ -186,7 +186,7 @@ def test_damaged_checkpoints_are_refused(
         read_checkpoint(tmp_path / "damaged", WALK, CONFIG)
 
 
-def test_only_a_settled_system_is_kept(tmp_path: Path) -> None:
+def test_a_checkpoint_needs_a_settled_system(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="held back"):
         write_checkpoint(tmp_path / "x", SLAM(WALK.camera, CONFIG), RunProgress(), WALK)
 
@@ -227,7 +227,7 @@ def send(number: int) -> Callable[[], None]:
     return lambda: os.kill(os.getpid(), number)
 
 
-def test_a_power_cut_loses_nothing_before_the_last_checkpoint(
+def test_a_crash_keeps_the_last_checkpoint(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "cut"
@@ -250,7 +250,7 @@ def test_a_power_cut_loses_nothing_before_the_last_checkpoint(
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
 
 
-def test_checkpoints_can_be_left_out(
+def test_checkpoints_can_be_disabled(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut.do = staticmethod(power_cut)
@@ -263,7 +263,7 @@ def test_checkpoints_can_be_left_out(
     assert len(read_frames(tmp_path / "frames.csv")) == FRAMES
 
 
-def test_results_are_not_overwritten_unless_told(
+def test_results_are_not_overwritten_by_default(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "map.safetensors").write_bytes(b"the work of years")
@@ -347,7 +347,7 @@ def test_a_second_signal_ends_at_once(
     assert signal.getsignal(number) is before
 
 
-def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_become_rarer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from torchslam.cli import result_folder as folder
 
     taken: list[int] = []
@@ -369,13 +369,13 @@ def test_checkpoints_come_seldomer_as_the_map_grows(tmp_path: Path, monkeypatch:
     assert taken[-1] < 1000
 
 
-def test_a_saved_map_is_gone_on_in_and_localised_in(
+def test_a_saved_map_can_be_extended_and_localized_in(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second, third = (str(tmp_path / name) for name in ("first", "second", "third"))
     assert main(["run", "walk", "-o", first, *SET, "--seed", "5"]) == 0
     content = (tmp_path / "first" / "map.safetensors").read_bytes()
-    assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration beside the map
+    assert main(["run", "walk", "-o", second, "--map", first]) == 0  # with the configuration next to the map
     assert "session" in capsys.readouterr().out
     grown = read_atlas(tmp_path / "second" / "map.safetensors")
     (submap,) = grown.atlas
@@ -394,7 +394,7 @@ def test_a_saved_map_is_gone_on_in_and_localised_in(
     assert len(read_trajectory(tmp_path / "third" / "trajectory.txt")) == FRAMES
 
 
-def test_maps_that_cannot_be_gone_on_in(
+def test_unusable_maps_are_refused(
     tmp_path: Path, cut: type[Cut], capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = WALK.camera.with_params(WALK.camera.params + 1)
@@ -409,9 +409,7 @@ def test_maps_that_cannot_be_gone_on_in(
     assert "--localize requires --map" in capsys.readouterr().err
 
 
-def test_the_camera_of_a_map_is_known_to_as_many_digits_as_a_calibration_file_has(
-    tmp_path: Path, cut: type[Cut]
-) -> None:
+def test_the_camera_of_a_map_equals_that_of_a_calibration_file(tmp_path: Path, cut: type[Cut]) -> None:
     rounded = WALK.camera.with_params(WALK.camera.params * (1 + 4e-10))
     write_atlas(tmp_path / "map", [], rounded)
     assert command(tmp_path / "out", "--map", str(tmp_path / "map")) == 0
@@ -439,7 +437,7 @@ sys.exit(main(sys.argv[2:]))
 
 
 @pytest.mark.slow
-def test_a_killed_process_is_gone_on_with(tmp_path: Path) -> None:
+def test_a_killed_run_can_be_resumed(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     line = ["run", "walk", "--output", str(folder), *SET, "--checkpoint", "2"]
     env = os.environ | {"OMP_NUM_THREADS": "1"}

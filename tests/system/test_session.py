@@ -7,22 +7,22 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.map.simulated import CAMERA, simulated_world
+from tests.map.simulated import CAMERA, simulated_submap
 from torchslam.errors import ResultsError
 from torchslam.map.atlas import Atlas
 from torchslam.map.file import read_atlas
 from torchslam.system.session import Session
 
 
-def in_a_world() -> Session:
-    submap = simulated_world()
+def session_with_map() -> Session:
+    submap = simulated_submap()
     submap.map.points["last_seen_frame"][:] = 7
     return Session(CAMERA, Atlas(CAMERA.params, [submap], 1))
 
 
 def test_each_session_has_the_next_number(tmp_path: Path) -> None:
     path = tmp_path / "map"
-    in_a_world().save(path)
+    session_with_map().save(path)
     for number in (1, 2):
         session = Session.load(path)
         assert (session.number, session.count, session.mapping) == (number, number + 1, True)
@@ -30,9 +30,9 @@ def test_each_session_has_the_next_number(tmp_path: Path) -> None:
         session.save(path)
 
 
-def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Path) -> None:
+def test_a_localization_session_is_not_counted_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "map"
-    in_a_world().save(path)
+    session_with_map().save(path)
     session = Session.load(path, mapping=False)
     assert (session.number, session.count) == (1, 1)
     (submap,) = session.atlas
@@ -41,13 +41,13 @@ def test_one_that_only_localises_does_not_count_and_changes_nothing(tmp_path: Pa
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
-def test_where_the_map_may_change_frames_are_numbered_anew(tmp_path: Path) -> None:
-    in_a_world().save(tmp_path / "map")
+def test_frames_are_renumbered_when_the_map_may_change(tmp_path: Path) -> None:
+    session_with_map().save(tmp_path / "map")
     (submap,) = Session.load(tmp_path / "map").atlas
     assert (submap.map.points["last_seen_frame"] == -1).all()
 
 
-def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
+def test_localization_needs_a_map(tmp_path: Path) -> None:
     Session(CAMERA, Atlas(CAMERA.params)).save(tmp_path / "empty")
     assert read_atlas(tmp_path / "empty").sessions == 1
     assert len(Session.load(tmp_path / "empty").atlas) == 0

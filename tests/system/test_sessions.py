@@ -45,9 +45,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[SLAM, Run, Path]:
     return slam, run, path
 
 
-def test_a_saved_map_is_loaded_and_saved_with_the_same_bytes(
-    first: tuple[SLAM, Run, Path], tmp_path: Path
-) -> None:
+def test_a_loaded_map_is_saved_with_the_same_bytes(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
     loaded = SLAM.load(first[2], config_of(), mapping=False)
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == first[2].read_bytes()
@@ -55,7 +53,7 @@ def test_a_saved_map_is_loaded_and_saved_with_the_same_bytes(
     assert loaded.session.number == 1
 
 
-def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
+def test_a_new_session_extends_the_map(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
     slam = SLAM.load(first[2], config_of())
     assert slam.map.num_keyframes == first[1].map.num_keyframes
     assert len(slam.trajectory()) == 0
@@ -78,7 +76,9 @@ def test_a_new_session_goes_on_in_the_map(first: tuple[SLAM, Run, Path], tmp_pat
     assert SLAM.load(tmp_path / "grown", config_of()).session.number == 2
 
 
-def test_a_third_session_knows_the_keyframes_of_both(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
+def test_a_third_session_relocalizes_in_both_earlier_ones(
+    first: tuple[SLAM, Run, Path], tmp_path: Path
+) -> None:
     slam = SLAM.load(first[2], config_of())
     slam.run(SEEN.part(FIRST - 10))
     slam.save(tmp_path / "grown")
@@ -92,7 +92,7 @@ def columns_of(slam: SLAM) -> list[tuple[str, str, torch.Tensor]]:
     return [(kind, name, rows) for kind, table in tables.items() for name, rows in table.columns().items()]
 
 
-def test_localising_leaves_the_map_as_it_is(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
+def test_localization_does_not_change_the_map(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
     slam = SLAM.load(first[2], config_of(), mapping=False)
     before = {(kind, name): rows.clone() for kind, name, rows in columns_of(slam)}
     run = slam.run(SEEN.part(5, FIRST + 5))
@@ -105,7 +105,7 @@ def test_localising_leaves_the_map_as_it_is(first: tuple[SLAM, Run, Path], tmp_p
     assert (tmp_path / "after").read_bytes() == first[2].read_bytes()
 
 
-def test_localising_elsewhere_finds_nothing_and_begins_nothing(first: tuple[SLAM, Run, Path]) -> None:
+def test_localization_elsewhere_finds_no_pose_and_starts_no_map(first: tuple[SLAM, Run, Path]) -> None:
     slam = SLAM.load(first[2], config_of("relocalization.frames_before_new_submap=2"), mapping=False)
     run = slam.run(eyes(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
     assert {result.state for result in run.results} == {State.LOST}
@@ -115,7 +115,7 @@ def test_localising_elsewhere_finds_nothing_and_begins_nothing(first: tuple[SLAM
     assert run.graph is not None
 
 
-def test_there_must_be_a_world_to_localise_in(tmp_path: Path) -> None:
+def test_localization_needs_a_map(tmp_path: Path) -> None:
     SLAM(WALK.camera, config_of()).save(tmp_path / "empty")
     with pytest.raises(ResultsError, match="no submap in it to localize in"):
         SLAM.load(tmp_path / "empty", config_of(), mapping=False)
@@ -184,7 +184,7 @@ class Stumbling(Sequence):
         return replace(frame, timestamp=float(self.timestamps[11])) if index == 12 else frame
 
 
-def test_a_run_skips_frames_that_cannot_be() -> None:
+def test_a_run_skips_invalid_frames() -> None:
     slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

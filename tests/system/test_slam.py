@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.walks import T_cw as true_T_cw
-from tests.walks import Walk, arc, still, there_and_elsewhere, turn
+from tests.walks import Walk, arc, still, turn, walk_with_jump
 from torchslam import (
     SLAM,
     Config,
@@ -53,7 +53,7 @@ def test_exact_features_give_the_exact_trajectory() -> None:
 
 
 @pytest.mark.parametrize("scales", ["false", "true"])
-def test_noise_and_outliers_are_withstood(scales: str) -> None:
+def test_noise_and_outliers_are_tolerated(scales: str) -> None:
     walk = Walk(arc(60)[:30])
     noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "simulated.dropout_ratio=0.1")
     run = run_walk(walk, *noisy, f"simulated.with_scales={scales}")
@@ -62,13 +62,13 @@ def test_noise_and_outliers_are_withstood(scales: str) -> None:
     assert result.ate_m < 0.01 * result.path_length_m
 
 
-def test_the_scale_of_ground_truth() -> None:
+def test_the_scale_can_be_that_of_ground_truth() -> None:
     walk = Walk(arc(40)[:16])
     run = run_walk(walk, "scale=groundtruth")
     assert evaluate(run.trajectory, walk.groundtruth).scale == pytest.approx(1.0, rel=1e-3)
 
 
-def test_unit_scale_puts_the_median_depth_of_the_start_at_one() -> None:
+def test_unit_scale_sets_the_initial_median_depth_to_one() -> None:
     walk = Walk(arc(12))
     run = run_walk(walk, "bundle_adjustment.local=false", "mapping.cull=false")
     born = run.map.points["first_keyframe"] == 1
@@ -107,7 +107,7 @@ class Gap(Walk):
         return frame
 
 
-def test_lost_is_reported_and_tracking_comes_back() -> None:
+def test_loss_is_reported_and_tracking_recovers() -> None:
     walk = Gap(arc(60))
     run = run_walk(walk)
     states = [r.state for r in run.results]
@@ -124,7 +124,7 @@ def test_lost_is_reported_and_tracking_comes_back() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
 
-def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
+def test_frames_pending_at_the_end_have_uncertain_poses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Gap(arc(60)[:42])
@@ -141,7 +141,7 @@ def test_what_is_held_back_at_the_end_has_a_pose_that_stays_uncertain(
     assert torch.equal(run.trajectory.T_wc[:35], without.trajectory.T_wc)
     whole = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(Gap(arc(60)))
     states = [slam.step(whole[index]).state for index in range(42, 46)]
-    assert states[0] is State.UNCERTAIN  # whoever goes on still has to confirm
+    assert states[0] is State.UNCERTAIN  # the next frames still have to confirm it
     assert states[-1] is State.TRACKING
     frames = slam.posed_frames.frames["frame_index"]
     assert len(torch.unique(frames)) == len(frames) == 41
@@ -159,7 +159,7 @@ class FrameSnapshot(Walk):
         return frame if index < 25 else replace(frame, T_cw_groundtruth=away)
 
 
-def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
+def test_an_unconfirmed_relocalization_leaves_no_trace() -> None:
     run = run_walk(FrameSnapshot(arc(34)))
     states = [r.state for r in run.results]
     assert states[25:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
@@ -170,7 +170,7 @@ def test_a_place_that_is_not_confirmed_leaves_no_trace() -> None:
 
 
 @pytest.mark.parametrize(("least", "believed"), [(0.4, True), (0.6, False)])
-def test_a_start_must_explain_the_frames_since_its_reference(
+def test_an_initialization_must_explain_the_frames_since_its_reference(
     least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reference frame is explained, the one that starts the map is not."""
@@ -192,7 +192,7 @@ def test_a_start_must_explain_the_frames_since_its_reference(
 
 
 @pytest.mark.parametrize("explained", [True, False])
-def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
+def test_a_contradicting_initialization_replaces_a_provisional_map(
     explained: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No support is enough here: whatever start the first and the last frame make is a rival."""
@@ -226,7 +226,7 @@ def test_a_rival_takes_the_place_of_a_young_world_if_it_explains_the_frames(
         assert torch.equal(run.trajectory.T_wc, plain.trajectory.T_wc)
 
 
-def test_frames_from_before_the_map_have_their_poses_in_the_end() -> None:
+def test_frames_before_initialization_have_poses_in_the_end() -> None:
     """A camera that stands at first: there is nothing to begin with before it moves."""
     walk = Walk(torch.cat([still(6), arc(60)[1:20]]))
     run = run_walk(walk, "simulated.depth_near=0.6", "simulated.depth_far=2", "simulated.noise_px=0.2")
@@ -241,8 +241,8 @@ JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.nois
           "relocalization.frames_before_new_submap=3", "initialization.provisional_frames=8")  # fmt: skip
 
 
-def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
-    walk = Walk(there_and_elsewhere())
+def test_two_submaps_merge_when_the_second_reaches_the_first() -> None:
+    walk = Walk(walk_with_jump())
     run = run_walk(walk, *JOINED)
     submaps = [r.submap for r in run.results if r.T_cw is not None]
     assert set(submaps) == {0, 1}
@@ -254,8 +254,8 @@ def test_two_worlds_become_one_when_the_second_reaches_the_first() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 
 
-def test_worlds_that_do_not_meet_are_kept_beside_each_other() -> None:
-    walk = Walk(there_and_elsewhere()[4:33])
+def test_separate_submaps_are_kept() -> None:
+    walk = Walk(walk_with_jump()[4:33])
     run = run_walk(walk, *JOINED)
     assert [len(submap.posed_frames) for submap in run.submaps] == [12, 17]
     assert [submap.number for submap in run.submaps] == [0, 1]
@@ -279,7 +279,7 @@ def test_damaged_frames_are_skipped_with_a_warning_and_counted() -> None:
     assert len(run.trajectory) == 20
 
 
-def test_an_interrupt_keeps_what_there_is() -> None:
+def test_an_interrupt_keeps_the_results_so_far() -> None:
     def interrupt(result: StepResult) -> None:
         if result.index == 20:
             raise KeyboardInterrupt
@@ -297,7 +297,7 @@ def test_simulated_features_need_true_poses() -> None:
         slam.step(walk[0])
 
 
-def test_poses_are_rigid_and_results_tell_their_stages() -> None:
+def test_poses_are_rigid_and_results_have_stage_times() -> None:
     run = run_walk(Walk(arc(40)[:16]), "simulated.noise_px=0.5")
     R = run.trajectory.T_wc[:, :3, :3]
     assert torch.allclose(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), atol=1e-9)
@@ -307,7 +307,7 @@ def test_poses_are_rigid_and_results_tell_their_stages() -> None:
     assert keyframe.reason
 
 
-def test_every_frame_looks_at_a_bounded_part_of_the_map() -> None:
+def test_every_frame_uses_a_bounded_part_of_the_map() -> None:
     walk = Walk(arc(50, length=25.0))
     slam = SLAM(
         walk.camera, load_config(None, [*SIMULATED, "simulated.depth_near=0.032", "simulated.depth_far=0.16"])
@@ -338,14 +338,14 @@ def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m
 
 
 @pytest.mark.data
-def test_a_real_standstill_starts_no_map(data_dir: object) -> None:
+def test_a_real_static_camera_initializes_no_map(data_dir: object) -> None:
     sequence = open_sequence(f"{data_dir}/standstill")
     run = SLAM(sequence.camera).run(sequence)
     assert run.map.num_keyframes == 0
     assert "stands still" in run.failure
 
 
-def test_the_trajectory_of_a_run_is_the_minimiser_of_its_graph() -> None:
+def test_the_trajectory_of_a_run_minimizes_its_graph() -> None:
     walk = Walk(arc(40)[:20])
     run = run_walk(walk, "simulated.noise_px=0.5")
     graph = run.graph
@@ -381,7 +381,7 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
         assert float(pixels.grad.norm()) == pytest.approx(float(numeric), rel=1e-3)
 
 
-def test_covariances_tell_the_errors_of_the_map() -> None:
+def test_covariances_predict_the_errors_of_the_map() -> None:
     """Errors of keyframes and points, squared and normalised, average to their degrees of freedom.
 
     The map's scale is free; of all scales, the covariances belong to the one that least moves the keyframes.
@@ -452,19 +452,19 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
 
 
 def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
-    """When adjustments were asked for and taken over, of submaps that are no longer young."""
+    """Record when adjustments of confirmed submaps are requested and applied."""
     events: list[tuple[str, int]] = []
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides]))
-    ask, take_over = slam.mapper.adjustment.request, slam.mapper.adjustment.apply
+    request, apply = slam.mapper.adjustment.request, slam.mapper.adjustment.apply
 
     def asking(slam_map: Map, keyframe: int, due: int | None) -> None:
-        events.append(("asked", int(slam_map.keyframes["frame_index"][keyframe])))
-        ask(slam_map, keyframe, due)
+        events.append(("requested", int(slam_map.keyframes["frame_index"][keyframe])))
+        request(slam_map, keyframe, due)
 
     def taking_over(slam_map: Map) -> None:
         assert slam.last_frame is not None
-        events.append(("taken", slam.last_frame[0]))
-        take_over(slam_map)
+        events.append(("applied", slam.last_frame[0]))
+        apply(slam_map)
 
     monkeypatch.setattr(slam.mapper.adjustment, "request", asking)
     monkeypatch.setattr(slam.mapper.adjustment, "apply", taking_over)
@@ -480,30 +480,35 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
     return [event for event in events if event[1] in old[1:]]
 
 
-def test_an_adjustment_is_taken_over_after_some_frames_or_before_the_next_keyframe(
+def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
     at_once = asked_and_taken(monkeypatch, walk, "bundle_adjustment.delay_frames=0")
     assert len(at_once) >= 6
-    assert {(what, frame) for what, frame in at_once if what == "asked"} == {
-        ("asked", frame) for what, frame in at_once if what == "taken"
+    assert {(what, frame) for what, frame in at_once if what == "requested"} == {
+        ("requested", frame) for what, frame in at_once if what == "applied"
     }
     for delay in (1, 3):
         events = asked_and_taken(monkeypatch, walk, f"bundle_adjustment.delay_frames={delay}")
         kinds = [what for what, _ in events]
-        assert kinds[: len(kinds) // 2 * 2] == ["asked", "taken"] * (len(kinds) // 2)  # one after the other
-        waits = [taken - asked for (_, asked), (_, taken) in zip(events[::2], events[1::2], strict=False)]
+        assert kinds[: len(kinds) // 2 * 2] == ["requested", "applied"] * (
+            len(kinds) // 2
+        )  # one after the other
+        waits = [
+            applied - requested
+            for (_, requested), (_, applied) in zip(events[::2], events[1::2], strict=False)
+        ]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
     rare = asked_and_taken(
         monkeypatch, walk, "bundle_adjustment.delay_frames=2", "keyframes.max_translation=0.6"
     )
-    waits = [taken - asked for (_, asked), (_, taken) in zip(rare[::2], rare[1::2], strict=False)]
+    waits = [applied - requested for (_, requested), (_, applied) in zip(rare[::2], rare[1::2], strict=False)]
     assert 2 in waits
 
 
-def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
+def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
@@ -528,16 +533,19 @@ def test_in_a_small_map_it_is_found_between_two_frames_as_if_it_were_at_once(
     events = asked_and_taken(
         monkeypatch, walk, "bundle_adjustment.local_window=1000", "bundle_adjustment.delay_frames=2"
     )
-    assert [what for what, _ in events[:6]] == ["asked", "taken"] * 3
-    assert all(taken == asked + 1 for (_, asked), (_, taken) in zip(events[:6:2], events[1:6:2], strict=True))
+    assert [what for what, _ in events[:6]] == ["requested", "applied"] * 3
+    assert all(
+        applied == requested + 1
+        for (_, requested), (_, applied) in zip(events[:6:2], events[1:6:2], strict=True)
+    )
 
 
-def test_a_camera_that_is_lost_leaves_no_adjustment_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    walk = Walk(there_and_elsewhere())
+def test_a_lost_camera_leaves_no_pending_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
+    walk = Walk(walk_with_jump())
     events = asked_and_taken(
         monkeypatch, walk, "bundle_adjustment.delay_frames=1000", "keyframes.min_overlap=0"
     )
-    assert [what for what, _ in events if what == "taken"]
+    assert [what for what, _ in events if what == "applied"]
 
 
 def test_a_delay_costs_no_accuracy() -> None:

@@ -18,13 +18,13 @@ def result(index: int, reason: str) -> StepResult:
     return StepResult(index, float(index), State.INITIALIZING, None, None, None, False, 0, 0, reason)
 
 
-def test_a_video_without_texture_is_told_so() -> None:
+def test_a_video_without_texture_is_reported() -> None:
     few = "too few matches with the reference frame: 12, 100 are needed"
     results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
     assert why_no_map(results, []) == f"no map was initialized in 1000 frames: {few}"
 
 
-def test_a_reference_frame_alone_is_too_short_a_video() -> None:
+def test_a_single_reference_frame_is_reported_as_too_few_frames() -> None:
     assert "1 frames are too few" in why_no_map([result(0, Reason.NEW_REFERENCE)], [])
 
 
@@ -35,7 +35,7 @@ def slam() -> SLAM:
     )
 
 
-def test_states_follow_each_other_as_frames_come(slam: SLAM) -> None:
+def test_states_change_with_the_frames(slam: SLAM) -> None:
     sequence = open_sequence("synthetic:room?frames=40")
     assert slam.state is State.INITIALIZING
     results = [slam.step(sequence[index]) for index in range(25)]
@@ -49,7 +49,7 @@ def test_states_follow_each_other_as_frames_come(slam: SLAM) -> None:
     assert slam.submap is None
 
 
-def test_a_camera_without_a_view_is_lost_and_found_again(slam: SLAM) -> None:
+def test_a_camera_without_view_is_lost_and_relocalized(slam: SLAM) -> None:
     sequence = open_sequence("synthetic:room?frames=60")
     frames = [sequence[index] for index in range(46)]
     for index in range(35, 39):

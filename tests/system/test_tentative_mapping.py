@@ -70,7 +70,7 @@ def tables(slam: SLAM) -> dict[str, Tensor]:
     return {name: column for name, column in (points | keyframes).items() if name != "last_seen_frame"}
 
 
-def test_the_map_grows_on_trial_and_is_kept_when_it_is_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tentative_keyframes_are_committed_when_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, DOUBTED), Walk(arc(60)[: SEEN + 4])
     keyframes: list[int] = []
     states = shown(slam, walk, lambda _: keyframes.append(slam.map.num_keyframes))
@@ -84,7 +84,7 @@ def test_the_map_grows_on_trial_and_is_kept_when_it_is_confirmed(monkeypatch: py
     assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
 
 
-def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tentative_keyframes_are_rolled_back_when_the_camera_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two systems that see the same, but that one of them does not map what is doubtful."""
     walk = Leaving(arc(60)[:30], 27)
     slam = doubting(monkeypatch, DOUBTED)
@@ -104,7 +104,7 @@ def test_nothing_is_left_of_a_map_on_trial_when_the_camera_is_lost(monkeypatch: 
 
 
 @pytest.mark.parametrize("judge", ["check_pose_quality", "detect_independent_motion"])
-def test_a_pose_that_is_not_what_its_matches_say_is_not_mapped(
+def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     judge: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slam = doubting(
@@ -124,7 +124,7 @@ def test_a_pose_that_is_not_what_its_matches_say_is_not_mapped(
     assert len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) == 1
 
 
-def test_what_is_on_trial_at_the_end_keeps_its_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(60)[:36])
     slam = doubting(monkeypatch, range(22, 60))
     states = shown(slam, walk)
@@ -144,7 +144,7 @@ def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
     monkeypatch.setattr(beginning, "step", lambda view: ODD if view.index < LATE else step(view))
 
 
-def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
+def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_committed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
@@ -158,7 +158,7 @@ def test_what_seems_strange_on_the_way_back_is_mapped_on_trial_and_kept(
     assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
 
 
-def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
     monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
@@ -179,7 +179,7 @@ def test_nothing_is_left_of_a_way_back_that_ends_in_doubt(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(("end", "posed"), [(SLAM.finalize, 36), (SLAM.confirm_map, 22)])
-def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
+def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
     end: Callable[[SLAM], None], posed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was mapped on trial is kept before the way back adds to the map."""
@@ -195,7 +195,7 @@ def test_a_young_world_that_ends_in_doubt_is_followed_back_all_the_same(
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
 
 
-def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_tentative_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
     monkeypatch.setattr(probation, "MAX_PENDING_FRAMES", 5)
     walk = Leaving(arc(60)[:40], 34)
@@ -208,7 +208,7 @@ def test_only_so_many_frames_are_held_back(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
-def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_precheck_applies_to_its_own_keyframe_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """A keyframe whose adjustment is taken over without a look back, as before the first keyframe on trial."""
     slam, walk = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED)), Walk(arc(60)[:40])
     frames = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk)
@@ -221,13 +221,13 @@ def test_what_was_asked_of_one_keyframe_is_no_answer_for_another(monkeypatch: py
         ):
             break
     else:
-        pytest.fail("no keyframe was asked about")
-    asked: list[int] = []
+        pytest.fail("no keyframe was checked for loops")
+    queried: list[int] = []
     loop_detector, submap = slam.loop_closer.loop_detector, slam.submap
     assert submap is not None
-    monkeypatch.setattr(loop_detector, "detect", lambda _, keyframe: asked.append(keyframe))
+    monkeypatch.setattr(loop_detector, "detect", lambda _, keyframe: queried.append(keyframe))
     slam._state_machine.keyframe_actions.detect_and_close()
-    assert not asked  # it is known already
+    assert not queried  # the answer is known already
     slam.loop_closer.loop_precheck = -1, False
     slam._state_machine.keyframe_actions.detect_and_close()
-    assert asked == [newest]
+    assert queried == [newest]

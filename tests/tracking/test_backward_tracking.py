@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, pose, sideways, world_in
+from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from torchslam.config import Config, PoseValidationConfig
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking import backward_tracking as backwards
@@ -50,8 +50,8 @@ class Ledger:
 
 
 def walked(T_cw: Tensor, judge: PoseValidationConfig | None = None, noise: float = 0.0) -> Ledger:
-    """What became of cameras at T_cw (F, 4, 4), the first the one before the world's first keyframe, frame 100."""
-    submap = world_in(SCENE, sideways(4), first=100)
+    """The results of cameras at T_cw (F, 4, 4), the first one before the map's first keyframe, frame 100."""
+    submap = submap_of_scene(SCENE, sideways(4), first=100)
     config = replace(Config(), pose_validation=judge or PoseValidationConfig())
     tracker, ledger = Tracker(CAMERA, config), Ledger()
     tracker.reset_to_keyframe(submap, 0)
@@ -71,8 +71,10 @@ def back(
 
 def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
     """The frames that come as these to be judged, from the first on, seem strange."""
-    asked = count()
-    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD if next(asked) in doubtful else None)
+    confirming = count()
+    monkeypatch.setattr(
+        backwards, "check_map_agreement", lambda *_: ODD if next(confirming) in doubtful else None
+    )
 
 
 def test_frames_before_the_map_get_their_true_poses() -> None:
@@ -83,26 +85,26 @@ def test_frames_before_the_map_get_their_true_poses() -> None:
         torch.testing.assert_close(found, T_cw[99 - index], atol=1e-7, rtol=0)
 
 
-def test_a_few_frames_that_see_nothing_are_passed_over() -> None:
+def test_a_few_blank_frames_are_skipped() -> None:
     T_cw = sideways(12, -0.02, start=-0.02)
     T_cw[2 : 2 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
     T_cw[8 : 8 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
     assert back(T_cw)[0] == [99, 98, 93, 92]
 
 
-def test_many_frames_that_see_nothing_end_the_way() -> None:
+def test_many_blank_frames_end_backward_tracking() -> None:
     T_cw = sideways(10, -0.02, start=-0.02)
     T_cw[1 : 1 + MAX_CONSECUTIVE_FAILURES] = AWAY
     assert back(T_cw)[0] == [99]
 
 
-def test_frames_whose_poses_are_not_sound_are_not_taken() -> None:
+def test_frames_with_invalid_poses_are_not_accepted() -> None:
     T_cw = sideways(3, -0.05, start=-0.05)
     assert back(T_cw, noise=0.5)[0] == [99, 98, 97]
     assert back(T_cw, PoseValidationConfig(max_rotation_std_deg=1e-6), noise=0.5)[0] == []
 
 
-def test_a_jump_from_where_the_motion_leads_is_doubted() -> None:
+def test_a_jump_from_the_predicted_motion_is_uncertain() -> None:
     T_cw = sideways(4, -0.05, start=-0.05)
     # the first frame has no motion to be compared with; the motion from the first to the third is too large
     judge = PoseValidationConfig(max_jump=0.03)
@@ -110,7 +112,7 @@ def test_a_jump_from_where_the_motion_leads_is_doubted() -> None:
     assert back(T_cw, judge)[0] == [99, 98]
 
 
-def test_strange_frames_are_kept_where_the_way_leads_to_the_earliest_one(
+def test_uncertain_frames_are_kept_when_tracking_reaches_the_first_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     doubting(monkeypatch, range(2, 100))
@@ -122,7 +124,7 @@ def test_strange_frames_are_kept_where_the_way_leads_to_the_earliest_one(
     torch.testing.assert_close(ledger.taken[90], T_cw[9], atol=1e-7, rtol=0)
 
 
-def test_strange_frames_are_not_kept_where_the_way_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uncertain_frames_are_dropped_when_tracking_ends_early(monkeypatch: pytest.MonkeyPatch) -> None:
     doubting(monkeypatch, range(2, 100))
     T_cw = sideways(12, -0.02, start=-0.02)
     T_cw[6 : 6 + MAX_CONSECUTIVE_FAILURES] = AWAY
@@ -131,12 +133,12 @@ def test_strange_frames_are_not_kept_where_the_way_ends(monkeypatch: pytest.Monk
     assert ledger.dropped == 1
 
 
-def test_strange_frames_are_kept_once_as_many_certain_ones_as_are_asked_for_follow(
+def test_uncertain_frames_are_kept_after_enough_certain_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = PoseValidationConfig().num_confirming_frames
+    confirming = PoseValidationConfig().num_confirming_frames
     T_cw = sideways(15, -0.02, start=-0.02)
-    for certain, posed in ((asked - 1, [99]), (asked, list(range(99, 96 - asked, -1)))):
+    for certain, posed in ((confirming - 1, [99]), (confirming, list(range(99, 96 - confirming, -1)))):
         doubting(monkeypatch, {1, 2})
         away = T_cw.clone()
         away[3 + certain : 3 + certain + MAX_CONSECUTIVE_FAILURES] = AWAY
@@ -159,20 +161,20 @@ def indices(unposed: UnposedFrames) -> list[int]:
     return [view.index for view in unposed]
 
 
-def test_the_latest_frames_wait_in_order() -> None:
+def test_the_latest_unposed_frames_are_kept_in_order() -> None:
     unposed = unposed_frames(3, 0, 1, 2, 3)
     unposed.add(*views(5))
     assert indices(unposed) == [2, 3, 5]
     assert len(unposed) == 3
 
 
-def test_frames_from_in_between_find_their_place() -> None:
+def test_frames_are_inserted_in_order() -> None:
     unposed = unposed_frames(10, 1, 2, 7, 8)
     unposed.add(*views(4, 5))
     assert indices(unposed) == [1, 2, 4, 5, 7, 8]
 
 
-def test_frames_that_were_posed_wait_no_longer() -> None:
+def test_posed_frames_are_removed() -> None:
     unposed = unposed_frames(10, 1, 2, 3, 4)
     unposed.remove(views(2, 4, 9))
     assert indices(unposed) == [1, 3]
@@ -180,11 +182,11 @@ def test_frames_that_were_posed_wait_no_longer() -> None:
     assert indices(unposed) == [1, 3]
 
 
-def test_nobody_waits_where_nobody_may() -> None:
+def test_no_frames_are_kept_when_disabled() -> None:
     assert len(unposed_frames(0, 1, 2)) == 0
 
 
-def test_a_young_world_counts_its_frames_from_the_start_on() -> None:
+def test_a_provisional_map_counts_frames_from_its_initialization() -> None:
     submap = Atlas(CAMERA.params).create()
     youth = ProvisionalMap(submap, views(0, 1))
     assert youth.age == 0

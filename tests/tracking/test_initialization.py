@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, centre, pose
+from tests.scene import CAMERA, Scene, camera_center, pose
 from torchslam.config import InitializationConfig, load_config
 from torchslam.geometry import KeypointNoise, Triangulation, transform
 from torchslam.tracking.initialization import Initializer, check_two_view_map, is_good, refine_pair
@@ -44,7 +44,7 @@ def pair(T_cw: Tensor) -> Tensor:
     return torch.stack([pose(), T_cw])
 
 
-def test_a_start_has_the_motion_and_the_points_in_units_of_its_baseline() -> None:
+def test_an_initialization_has_motion_and_points_in_units_of_its_baseline() -> None:
     start, reason = tried(pair(SIDE))
     assert start is not None, reason
     assert reason == ""
@@ -59,7 +59,7 @@ def test_a_start_has_the_motion_and_the_points_in_units_of_its_baseline() -> Non
     assert len(shown) > 150
 
 
-def test_the_first_view_is_the_reference_until_it_is_too_old() -> None:
+def test_the_first_frame_is_the_reference_until_it_is_too_old() -> None:
     initializer = Initializer(CAMERA, load_config(None, ["initialization.max_reference_age=3"]))
     for index, reason in (
         (0, "took"),
@@ -73,7 +73,7 @@ def test_the_first_view_is_the_reference_until_it_is_too_old() -> None:
     assert [view.index for view in initializer.views] == [3, 4]
 
 
-def test_too_few_matches_make_a_new_reference() -> None:
+def test_too_few_matches_replace_the_reference() -> None:
     views = [SCENE.view(index, T) for index, T in enumerate(pair(SIDE))]
     both = len(torch.nonzero(views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)]))
     assert tried(pair(SIDE), f"initialization.min_matches={both}")[0] is not None
@@ -85,7 +85,7 @@ def test_too_few_matches_make_a_new_reference() -> None:
     assert initializer.views == [views[1]]
 
 
-def test_a_camera_that_stands_is_told_from_one_that_moves() -> None:
+def test_a_static_camera_is_distinguished_from_a_moving_one() -> None:
     """The points are four away, on the average: a pixel is about 0.02 of a step to the side."""
     assert "stands still: the image moved by 0.0 px" in tried(pair(pose()))[1]
     views = [SCENE.view(index, pose()) for index in range(2)]
@@ -110,7 +110,7 @@ def static(
     return replace(view, keypoints=keypoints, mask=mask, scales=scales)
 
 
-def test_a_scene_behind_a_picture_that_stands_still_starts_a_map() -> None:
+def test_a_scene_behind_a_static_overlay_initializes_a_map() -> None:
     views = [SCENE.view(0, pose()), SCENE.view(1, SIDE)]
     half = static(views[1], 0.6, SCENE.shows(1), views[0], SCENE.shows(0))
     start, reason = tried_views(
@@ -129,7 +129,7 @@ ROLLED = pose(-0.6, 0.3, 0.1, 0.02, -0.02, 0.05)  # what stays in place is on no
 
 
 @pytest.mark.parametrize("share", [0.15, 0.4])
-def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
+def test_static_image_points_are_excluded_from_initialization(share: float) -> None:
     """Most of the image moves with the scene, but some of it stays."""
     views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
     some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
@@ -144,7 +144,7 @@ def test_what_stays_in_place_is_left_out_of_a_start(share: float) -> None:
 
 
 @pytest.mark.parametrize("T_cw", [pose(-0.5, 0.0, 0.0, 0.0, -0.03, 0.0), SIDE])
-def test_what_stays_on_epipolar_lines_but_behind_the_camera_is_left_out(T_cw: Tensor) -> None:
+def test_points_behind_the_camera_are_excluded(T_cw: Tensor) -> None:
     """Sideways, what stays in place is near its epipolar line; the turn says that it would be behind the camera."""
     views = [SCENE.view(0, pose(), noise=0.2), SCENE.view(1, T_cw, noise=0.2)]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
@@ -158,9 +158,7 @@ def test_what_stays_on_epipolar_lines_but_behind_the_camera_is_left_out(T_cw: Te
 
 
 @pytest.mark.parametrize(("turn", "left_out"), [(-0.003, False), (-0.012, True)])
-def test_what_is_as_far_as_infinity_within_the_noise_belongs_to_the_scene(
-    turn: float, left_out: bool
-) -> None:
+def test_points_at_infinity_within_noise_are_inliers(turn: float, left_out: bool) -> None:
     """A turn of 0.003 moves the image of infinity by 0.6 pixels, less than the threshold of 1.5."""
     views = [SCENE.view(0, pose()), SCENE.view(1, pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0))]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
@@ -170,7 +168,7 @@ def test_what_is_as_far_as_infinity_within_the_noise_belongs_to_the_scene(
     assert (len(initializer.static_pixels) > 80) is left_out
 
 
-def test_a_thing_that_moves_before_a_camera_that_stands_is_no_scene() -> None:
+def test_a_moving_object_before_a_static_camera_is_no_scene() -> None:
     """A flat thing: one homography explains its motion."""
     views = [SCENE.view(0, pose()), SCENE.view(1, pose())]
     moving = torch.argsort(SCENE.shows(1))[150:]
@@ -183,7 +181,7 @@ def test_a_thing_that_moves_before_a_camera_that_stands_is_no_scene() -> None:
     assert re_any(reason, "something may move before a camera that stands still", "not clear what moves")
 
 
-def test_a_camera_that_turns_has_no_depth() -> None:
+def test_a_rotating_camera_gives_no_depth() -> None:
     assert "only turns" in tried(pair(pose(0, 0, 0, 0.02, 0.1, 0.05)), noise=0.2)[1]
 
 
@@ -192,7 +190,7 @@ WALL = Scene(SCENE.points_w * torch.tensor([1.0, 1.0, 0.0]).double() + torch.ten
 TURNED = pose(-1.2, 0.1, 0.5, 0.0, -0.25, 0.0)
 
 
-def test_a_plane_is_believed_after_a_while() -> None:
+def test_a_plane_is_accepted_after_several_frames() -> None:
     poses = torch.stack([pose(), *[TURNED] * 4])
     for patience, believed in ((4, True), (5, False)):
         start, reason = tried(
@@ -224,7 +222,7 @@ def test_planes_seen_with_an_earlier_reference_do_not_count() -> None:
     assert "looks planar" in reason
 
 
-def test_a_step_too_small_leaves_depths_uncertain() -> None:
+def test_a_short_baseline_leaves_depths_uncertain() -> None:
     # sigma / (f a): one to three pixels of scale; at 200 px and a tenth a parallax of 0.05 to 0.15 is needed
     start, reason = tried(pair(pose(-0.1)), noise=0.1)
     assert start is None
@@ -257,7 +255,7 @@ def good(angles: list[float], sigma: float = 1.0, off: float = 0.0, **rest: Any)
     return is_good(triangulated, off**2 * ones, sigma * ones, CAMERA, settings).tolist()
 
 
-def test_a_point_is_good_when_its_depth_is_known_to_a_tenth() -> None:
+def test_a_point_is_good_when_its_depth_is_certain_to_a_tenth() -> None:
     assert good([0.0501, 0.0499]) == [True, False]  # 1 / (200 * 0.05)
     assert good([0.1002, 0.0998], sigma=2.0) == [True, False]
     assert good([0.0, 1.0], mask=False) == [False, False]
@@ -265,7 +263,7 @@ def test_a_point_is_good_when_its_depth_is_known_to_a_tenth() -> None:
     assert good([1.0, 1.0], off=3.01) == [False, False]
 
 
-def test_by_parallax_a_point_is_good_from_an_angle_on() -> None:
+def test_with_the_parallax_criterion_a_point_needs_an_angle() -> None:
     assert good([math.radians(3.01), math.radians(2.99)], criterion="parallax") == [True, False]
 
 
@@ -275,7 +273,7 @@ def reason_for(count: int, total: int, matches: int, share: float = 0.15, **chan
     return str(check_two_view_map(good, seen([math.radians(4.9)] * total), matches, settings, share) or "")
 
 
-def test_why_points_are_no_start() -> None:
+def test_rejected_initializations_have_a_reason() -> None:
     assert reason_for(60, 100, 100) == ""
     assert reason_for(59, 100, 100) == "too little parallax: 59 points have enough, 60 are needed"
     assert reason_for(60, 100, 400) == ""
@@ -306,7 +304,7 @@ def refined(scales: Tensor, off: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return refine_pair(SIDE, points_w, pixels[0], pixels[1] + off, KeypointNoise.of(scales, None), CAMERA)
 
 
-def test_a_pair_that_is_right_stays_as_it_is() -> None:
+def test_an_exact_pair_is_unchanged_by_refinement() -> None:
     T_cw, points_w, agrees = refined(torch.ones(200).double(), torch.zeros(200, 2).double())
     torch.testing.assert_close(T_cw, SIDE, atol=1e-8, rtol=0)
     torch.testing.assert_close(points_w, SCENE.points_w[:200], atol=1e-6, rtol=0)
@@ -320,12 +318,12 @@ def test_the_baseline_keeps_its_length_and_noise_weighs_by_its_variance() -> Non
     T_cw, _, agrees = refined(scales, 0.5 * scales[:, None] * noise)
     assert float(T_cw[:3, 3].norm()) == pytest.approx(float(SIDE[:3, 3].norm()))
     blunt, _, _ = refined(torch.ones(200).double(), 0.5 * scales[:, None] * noise)
-    off, much = ((centre(T) - centre(SIDE)).norm() for T in (T_cw, blunt))
+    off, much = ((camera_center(T) - camera_center(SIDE)).norm() for T in (T_cw, blunt))
     assert off < 0.7 * much
     assert agrees.double().mean() > 0.9
 
 
-def test_coarse_keypoints_move_the_pose_by_what_their_variance_says() -> None:
+def test_coarse_keypoints_are_weighted_by_their_variance() -> None:
     """Half of the keypoints are six times as coarse and 3 px too low: 3 / 37 px are left of that."""
     coarse = torch.arange(200) % 2 == 1
     off = torch.zeros(200, 2, dtype=torch.float64)
@@ -335,7 +333,7 @@ def test_coarse_keypoints_move_the_pose_by_what_their_variance_says() -> None:
     assert float((sunk[1] - sunk[0]).median()) == pytest.approx(3 / 37, rel=0.4)
 
 
-def test_what_disagrees_with_both_views_is_told() -> None:
+def test_points_that_disagree_with_both_views_are_flagged() -> None:
     off = torch.zeros(200, 2, dtype=torch.float64)
     off[:10, 1] = 12.0  # across the epipolar lines: shared by the two views, six each
     ones = torch.ones(200, dtype=torch.float64)

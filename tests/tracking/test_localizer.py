@@ -1,4 +1,4 @@
-"""The localizer on a scene of which every answer is known: whose guess is heard, who agrees, and who has a voice."""
+"""The localizer on a scene of which every answer is known: whose guess is tried, who agrees, and who has a voice."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from tests.map.simulated import tracked_at
-from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from tests.map.simulated import estimate_at
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, transform
 from torchslam.map.atlas import Submap
@@ -25,39 +25,39 @@ def localizer(*overrides: str) -> Localizer:
 
 
 def submap() -> Submap:
-    return world_in(SCENE, sideways(4))
+    return submap_of_scene(SCENE, sideways(4))
 
 
 @pytest.mark.parametrize(
-    ("poses", "chosen", "heard"),
+    ("poses", "chosen", "tried"),
     [
-        ([(50, 100), (90, 100)], 0, 1),  # half agree: nobody else is heard
+        ([(50, 100), (90, 100)], 0, 1),  # half agree: no other candidate is tried
         ([(49, 100), None, (60, 61), (90, 90)], 2, 3),
         ([None, (40, 100), (45, 100), (20, 60)], 2, 4),
         ([None, None], None, 2),
     ],
 )
-def test_where_few_of_the_matches_agree_others_are_heard(
-    poses: list[tuple[int, int] | None], chosen: int | None, heard: int, monkeypatch: pytest.MonkeyPatch
+def test_with_few_inliers_other_candidates_are_tried(
+    poses: list[tuple[int, int] | None], chosen: int | None, tried: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, finder = submap(), localizer()
     answers = [
         None
         if found is None
-        else tracked_at(pose(), torch.arange(found[0]), torch.arange(found[0]), matches=found[1])
+        else estimate_at(pose(), torch.arange(found[0]), torch.arange(found[0]), matches=found[1])
         for found in poses
     ]
-    asked = iter(answers)
-    monkeypatch.setattr(finder, "_locate", lambda *_: next(asked))
-    nobody = MatchIndices(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
+    remaining = iter(answers)
+    monkeypatch.setattr(finder, "_locate", lambda *_: next(remaining))
+    no_matches = MatchIndices(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
     view = SCENE.view(50, pose())
-    estimate = finder.locate(here.map, view, iter([nobody] * len(poses)), here.tracking.local_points)
+    estimate = finder.locate(here.map, view, iter([no_matches] * len(poses)), here.tracking.local_points)
     assert estimate is (None if chosen is None else answers[chosen])
-    assert len(list(asked)) == len(poses) - heard
+    assert len(list(remaining)) == len(poses) - tried
 
 
-def test_what_is_found_elsewhere_in_the_map_brings_its_surroundings() -> None:
-    here, finder = world_in(SCENE, sideways(12, step=0.6)), localizer("tracking.local_keyframes=1")
+def test_a_pose_elsewhere_in_the_map_uses_the_local_map_there() -> None:
+    here, finder = submap_of_scene(SCENE, sideways(12, step=0.6)), localizer("tracking.local_keyframes=1")
     Tracker(CAMERA, load_config(None, ["tracking.local_keyframes=1"])).reset_to_keyframe(here, 11)
     T_cw = sideways(1, start=0.05)[0]
     view = SCENE.view(50, T_cw)
@@ -97,7 +97,7 @@ def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
 def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
     here = submap()
     seen = here.map.observed_points(torch.tensor([0]))
-    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the world lies along y of the image
+    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the map lies along y of the image
     T_cw = roll @ here.map.T_cw[0]
     points_c = transform(T_cw, here.map.positions_w[seen])
     pixels, depth = CAMERA.project(points_c)[0], points_c[:, 2]
@@ -114,7 +114,7 @@ def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: 
         assert agreeing.all() if agrees else not agreeing.any()
 
 
-def test_points_behind_the_camera_agree_with_nothing() -> None:
+def test_points_behind_the_camera_are_no_inliers() -> None:
     here = submap()
     seen = here.map.observed_points(torch.tensor([0]))
     T_cw = pose(0, 0, 0, 0, math.pi)
@@ -127,7 +127,7 @@ def test_points_behind_the_camera_agree_with_nothing() -> None:
         ).any()
 
 
-def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
+def test_a_keypoint_is_weighted_by_its_inverse_variance() -> None:
     """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
     here = submap()
     T_cw = here.map.T_cw[0]
@@ -145,7 +145,7 @@ def test_a_keypoint_weighs_as_much_as_its_variance_says() -> None:
     torch.testing.assert_close(errors, wanted)
 
 
-def test_what_is_far_off_has_no_voice_in_the_refinement() -> None:
+def test_outliers_do_not_affect_the_refinement() -> None:
     here = submap()
     T_cw = here.map.T_cw[0]
     seen = here.map.observed_points(torch.tensor([0]))

@@ -36,25 +36,25 @@ def run_with(matcher: Matcher | None) -> tuple[SLAM, Run]:
 
 
 class Wrapped:
-    """torchslam's own matcher as somebody else's, which remembers what it was asked."""
+    """Wrap torchslam's own matcher as a plugin and record the kinds of its calls."""
 
     def __init__(self, wants_images: bool = False) -> None:
         self.own, self.wants_images = DescriptorMatcher(CONFIG.matching), wants_images
-        self.asked: set[str] = set()
+        self.kinds: set[str] = set()
 
     def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         kind = "anywhere" if prior is None else "lines" if prior.radius_px is None else "near"
-        self.asked.add(kind)
+        self.kinds.add(kind)
         assert (view_2.image is not None) == self.wants_images
         if kind != "near":
             assert (view_1.image is not None) == self.wants_images
         return self.own(view_1, view_2, prior)
 
 
-def test_its_own_matcher_in_the_hook_gives_the_same_bytes() -> None:
+def test_the_default_matcher_as_a_plugin_gives_the_same_bytes() -> None:
     matcher = Wrapped()
     one, other = run_with(None)[1], run_with(matcher)[1]
-    assert matcher.asked == {"anywhere", "lines", "near"}
+    assert matcher.kinds == {"anywhere", "lines", "near"}
     assert len(one.trajectory) == len(WALK)
     assert torch.equal(one.trajectory.T_wc, other.trajectory.T_wc)
     for table in ("points", "keyframes"):
@@ -63,21 +63,21 @@ def test_its_own_matcher_in_the_hook_gives_the_same_bytes() -> None:
 
 
 class Counting(Wrapped):
-    """Counts who asks, by the modules that a call comes through."""
+    """Count calls by the modules on the call stack."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked_by: Counter[str] = Counter()
+        self.calls_by: Counter[str] = Counter()
 
     def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         modules = {Path(frame.filename).stem for frame in traceback.extract_stack()}
-        # Relocalisation asks through the tracker, which then is not tracking.
+        # Relocalization calls through the tracker, which then is not tracking.
         stages = ("initialization", "provisional_map", "new_points", "relocalization", "tracker")
-        self.asked_by[next(stage for stage in stages if stage in modules)] += 1
+        self.calls_by[next(stage for stage in stages if stage in modules)] += 1
         return super().__call__(view_1, view_2, prior)
 
 
-def test_it_is_asked_in_all_stages() -> None:
+def test_a_matcher_is_called_in_all_stages() -> None:
     """A walk, a look backwards that loses it, and the walk again."""
     poses = arc(36)
     behind = poses[18:20].clone()
@@ -89,10 +89,10 @@ def test_it_is_asked_in_all_stages() -> None:
     assert states[18:20] == [State.LOST, State.LOST]
     assert states[-1] is State.TRACKING
     assert len(run.submaps) == 1
-    asked = matcher.asked_by
-    assert set(asked) == {"initialization", "provisional_map", "tracker", "new_points", "relocalization"}
-    assert asked["tracker"] >= 20  # near the prediction, in every frame that is followed
-    assert asked["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
+    calls = matcher.calls_by
+    assert set(calls) == {"initialization", "provisional_map", "tracker", "new_points", "relocalization"}
+    assert calls["tracker"] >= 20  # near the prediction, in every tracked frame
+    assert calls["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
 
 
 def test_a_matcher_that_wants_images_gets_those_of_keyframes_too() -> None:
@@ -148,7 +148,7 @@ def matches(**changes: object) -> Matches:
         (matches(weights=torch.ones(1, 2)), "weights must be positive floats"),
     ],
 )
-def test_a_wrong_answer_is_named(answer: Matches | None, words: str) -> None:
+def test_an_invalid_matcher_output_is_named(answer: Matches | None, words: str) -> None:
     def odd(view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         return answer  # type: ignore[return-value]
 

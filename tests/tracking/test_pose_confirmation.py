@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.map.simulated import tracked_at
+from tests.map.simulated import estimate_at
 from tests.scene import Scene, pose
 from torchslam.config import Config, load_config
 from torchslam.map.atlas import TrackingState
@@ -19,17 +19,17 @@ ODD = Rejection(Reason.PURE_ROTATION)
 def frame(index: int) -> tuple[FrameFeatures, PoseEstimate, TrackingState]:
     tracking = TrackingState.empty(torch.zeros(1, dtype=torch.float64))
     tracking.T_cr, tracking.reference = pose(0.1 * index), 100 + index
-    return SCENE.view(index, pose()), tracked_at(pose(index), torch.arange(5), torch.arange(5)), tracking
+    return SCENE.view(index, pose()), estimate_at(pose(index), torch.arange(5), torch.arange(5)), tracking
 
 
-def test_nothing_is_held_at_first() -> None:
+def test_nothing_is_pending_at_first() -> None:
     confirmation = PoseConfirmation(Config())
     assert not confirmation.is_holding
     assert not confirmation.is_relocalized
     assert confirmation.views() == []
 
 
-def test_two_certain_frames_confirm_a_doubtful_one() -> None:
+def test_two_certain_frames_confirm_an_uncertain_one() -> None:
     confirmation = PoseConfirmation(Config())
     confirmation.push(*frame(0), ODD)
     assert confirmation.is_holding
@@ -43,7 +43,7 @@ def test_two_certain_frames_confirm_a_doubtful_one() -> None:
     assert [view.index for view in confirmation.views()] == [0, 1, 2]
 
 
-def test_another_doubt_begins_the_count_again() -> None:
+def test_another_uncertain_frame_restarts_the_count() -> None:
     confirmation = PoseConfirmation(Config())
     for index, doubt in enumerate([ODD, None, ODD, None]):
         confirmation.push(*frame(index), doubt)
@@ -52,7 +52,7 @@ def test_another_doubt_begins_the_count_again() -> None:
     assert not confirmation.is_holding
 
 
-def test_what_came_back_needs_more_confirmations() -> None:
+def test_relocalized_frames_need_more_confirmations() -> None:
     confirmation = PoseConfirmation(load_config(None, ["relocalization.num_confirming_frames=3"]))
     confirmation.start_after_relocalization(*frame(0))
     assert confirmation.is_holding
@@ -69,14 +69,14 @@ def test_what_came_back_needs_more_confirmations() -> None:
     assert [view.index for view in confirmation.views()] == [0, 1, 2, 3, 4, 5]
 
 
-def test_coming_back_forgets_what_was_held_before() -> None:
+def test_relocalization_discards_pending_frames() -> None:
     confirmation = PoseConfirmation(Config())
     confirmation.push(*frame(7), ODD)
     confirmation.start_after_relocalization(*frame(8))
     assert [view.index for view in confirmation.views()] == [8]
 
 
-def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
+def test_confirmed_frames_keep_their_submap_and_reference() -> None:
     confirmation = PoseConfirmation(Config())
     frames = [frame(index) for index in range(3)]
     confirmation.start_after_relocalization(*frames[0])
@@ -93,7 +93,7 @@ def test_what_is_released_is_what_was_held_with_its_place_in_the_map() -> None:
     assert [one[3] for one in released] == [100, 101, 102]
 
 
-def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
+def test_popped_frames_still_have_to_be_confirmed() -> None:
     confirmation = PoseConfirmation(Config())
     confirmation.push(*frame(0), ODD)
     confirmation.push(*frame(1), None)
@@ -105,7 +105,7 @@ def test_what_is_handed_over_still_has_to_be_confirmed() -> None:
     assert [held[0].index for held in confirmation.confirm()] == [2]
 
 
-def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_ones() -> None:
+def test_mapped_frames_need_as_many_certain_frames_as_were_uncertain() -> None:
     confirmation = PoseConfirmation(Config())
     for index in range(5):
         confirmation.push(*frame(index), ODD, is_mapped=index > 2)
@@ -120,7 +120,7 @@ def test_what_was_mapped_takes_as_many_certain_frames_as_there_were_doubtful_one
     assert confirmation.reason == "to be confirmed by 2 more frames"
 
 
-def test_no_more_than_so_many_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_pending_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.tracking.pose_confirmation.MAX_PENDING_FRAMES", 3)
     confirmation = PoseConfirmation(Config())
     for index in range(3):

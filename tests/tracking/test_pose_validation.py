@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.map.simulated import tracked_at
+from tests.map.simulated import estimate_at
 from tests.scene import pose
 from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
@@ -22,7 +22,7 @@ HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
 
 
 def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> PoseEstimate:
-    return tracked_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
+    return estimate_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
 
 
 def doubt(
@@ -32,7 +32,7 @@ def doubt(
     return str(validate_pose(estimate, expected, tracking, SETTINGS) or "")
 
 
-def test_a_certain_pose_is_believed() -> None:
+def test_a_certain_pose_is_accepted() -> None:
     assert doubt(seen()) == ""
     assert doubt(seen(), HERE) == ""
 
@@ -44,18 +44,18 @@ def test_half_of_the_matches_must_agree() -> None:
     assert doubt(seen(0, 0)).startswith("only 0% of 0")
 
 
-def test_errors_over_many_frames_must_be_noise() -> None:
+def test_errors_averaged_over_frames_must_be_noise() -> None:
     assert doubt(seen(), error=SETTINGS.max_squared_error - 0.01) == ""
     assert doubt(seen(), error=SETTINGS.max_squared_error) == ""
     assert doubt(seen(), error=9.0).startswith("the matches of the last frames are off by 3.0 times")
 
 
-def test_enough_of_the_image_must_show_what_is_expected() -> None:
+def test_coverage_of_the_image_must_suffice() -> None:
     assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio)) == ""
     assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio - 0.01)).startswith("only 19% of the image")
 
 
-def test_the_map_must_explain_some_of_the_image_over_many_frames() -> None:
+def test_the_explained_fraction_must_suffice_over_many_frames() -> None:
     least = SETTINGS.min_explained_ratio
     assert doubt(seen(), explained_ratio=least) == ""
     assert doubt(seen(explained_ratio=0.0)) == ""  # one frame alone proves nothing
@@ -69,14 +69,14 @@ def covariance(position: float = 0.0, rotation: float = 0.0) -> Tensor:
     return torch.diag(torch.tensor([0, position, 0, 0, 0, rotation], dtype=torch.float64) ** 2)
 
 
-def test_deviations_are_in_units_of_the_depth_and_degrees() -> None:
+def test_deviations_are_relative_to_depth_and_in_degrees() -> None:
     every = torch.diag(torch.tensor([0.01, 0.02, 0.02, 0.003, 0.006, 0.006], dtype=torch.float64) ** 2)
     position, rotation = deviations(seen(covariance=every, depth=2.0))
     assert position == pytest.approx(0.015)
     assert rotation == pytest.approx(math.degrees(0.009))
 
 
-def test_the_position_must_be_known_in_units_of_the_depth() -> None:
+def test_the_position_must_be_certain_relative_to_depth() -> None:
     limit = SETTINGS.max_position_std
     assert doubt(seen(covariance=covariance(2.99 * limit), depth=3.0)) == ""
     assert doubt(seen(covariance=covariance(3.01 * limit), depth=3.0)).startswith(
@@ -84,7 +84,7 @@ def test_the_position_must_be_known_in_units_of_the_depth() -> None:
     )
 
 
-def test_the_rotation_must_be_known() -> None:
+def test_the_rotation_must_be_certain() -> None:
     limit = math.radians(SETTINGS.max_rotation_std_deg)
     assert doubt(seen(covariance=covariance(rotation=0.99 * limit))) == ""
     assert "the rotation is known to 0.91 degrees" in doubt(
@@ -92,7 +92,7 @@ def test_the_rotation_must_be_known() -> None:
     )
 
 
-def test_the_motion_must_be_possible() -> None:
+def test_the_motion_must_be_plausible() -> None:
     side = pose(2.0)  # half the depth
     assert doubt(seen(), pose(1.99) @ HERE) == ""
     assert doubt(seen(), pose(2.01) @ HERE) == "jumped by 0.50 of the scene's depth and 0 degrees"
@@ -105,7 +105,7 @@ def test_the_motion_must_be_possible() -> None:
     )
 
 
-def test_a_jump_is_measured_in_the_camera_that_made_it() -> None:
+def test_a_jump_is_measured_in_its_camera_frame() -> None:
     tangent = torch.tensor([0.3, -0.1, 0.5, 0.0, 0.0, 0.4], dtype=torch.float64)
     expected = se3_exp(-tangent) @ HERE
     moved, turned = jump(seen(depth=0.5), expected)
@@ -113,5 +113,5 @@ def test_a_jump_is_measured_in_the_camera_that_made_it() -> None:
     assert turned == pytest.approx(math.degrees(0.4))
 
 
-def test_a_scene_without_depth_is_never_certain() -> None:
+def test_a_scene_without_depth_is_uncertain() -> None:
     assert doubt(replace(seen(), depth=0.0)).startswith("the position")

@@ -1,4 +1,4 @@
-"""When two frames alone contradict a young world, and when they do not."""
+"""When two frames contradict a provisional map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, pose, world_in
+from tests.scene import CAMERA, Scene, pose, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
 from torchslam.tracking.initialization import Initializer
@@ -29,8 +29,8 @@ def swung(degrees: float) -> Tensor:
 
 
 def young(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
-    """A world with a frame at the origin and one at SIDE that the map has at T_cw, in a frame of its own."""
-    submap = world_in(SCENE, torch.stack([pose(), SIDE]))
+    """A submap with a frame at the origin and one at SIDE that the map has at T_cw, in its own frame."""
+    submap = submap_of_scene(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
     submap.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
     youth = ProvisionalMap(submap, [SCENE.view(0, pose())])
@@ -52,7 +52,7 @@ def supported(start: TwoViewMap, T_21: Tensor) -> float:
     return support(pixels_1, start.view.keypoints[start.keypoints_2], T_21, CAMERA, THRESHOLD)
 
 
-def test_a_world_that_has_the_camera_where_it_was_has_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_consistent_map_has_no_contradicting_initialization(monkeypatch: pytest.MonkeyPatch) -> None:
     assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
     looked: list[FrameFeatures] = []
     monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view))
@@ -62,7 +62,7 @@ def test_a_world_that_has_the_camera_where_it_was_has_no_rival(monkeypatch: pyte
     assert len(looked) == 2
 
 
-def test_the_rival_of_a_wrong_world_has_the_right_motion() -> None:
+def test_the_initialization_that_contradicts_a_wrong_map_has_the_true_motion() -> None:
     start = young(swung(60)).find_contradicting_initialization(CAMERA, Config())
     assert start is not None
     wanted = SIDE.clone()
@@ -72,19 +72,19 @@ def test_the_rival_of_a_wrong_world_has_the_right_motion() -> None:
 
 
 @pytest.mark.parametrize("age", range(1, 2 * CHECK_INTERVAL + 1))
-def test_every_few_frames_are_looked_at(age: int) -> None:
+def test_every_few_frames_are_checked(age: int) -> None:
     assert (young(swung(60), age).find_contradicting_initialization(CAMERA, Config()) is not None) is (
         age % CHECK_INTERVAL == 0
     )
 
 
-def test_frames_that_make_no_start_contradict_nothing() -> None:
+def test_frames_without_initialization_contradict_nothing() -> None:
     youth = young(swung(60))
     youth.views[1] = SCENE.view(1, pose())
     assert youth.find_contradicting_initialization(CAMERA, Config()) is None
 
 
-def test_a_world_is_contradicted_when_it_has_less_than_half_of_the_support() -> None:
+def test_a_map_with_less_than_half_of_the_support_is_contradicted() -> None:
     start, decided = two_views(), set()
     for degrees in torch.linspace(2.5, 4.5, 21).tolist():
         T_21 = swung(degrees)

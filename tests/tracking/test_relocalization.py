@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, pose, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.map.atlas import Submap
 from torchslam.tracking.correspondences import (
@@ -27,8 +27,8 @@ def relocalizer(*overrides: str) -> Relocalizer:
     return Relocalizer(Tracker(CAMERA, config), config)
 
 
-def worlds() -> tuple[Submap, Submap]:
-    return world_in(SCENE, sideways(6)), world_in(FAR, sideways(6), number=1)
+def submaps() -> tuple[Submap, Submap]:
+    return submap_of_scene(SCENE, sideways(6)), submap_of_scene(FAR, sideways(6), number=1)
 
 
 def found(
@@ -43,55 +43,55 @@ def found(
     return submap
 
 
-def test_a_frame_is_found_where_it_is_without_knowing_anything() -> None:
-    right, _ = worlds()
+def test_a_lost_frame_is_relocalized() -> None:
+    right, _ = submaps()
     right.tracking.local_points = right.tracking.local_points[:0]
     assert found(ANYWHERE, [(right, 0)]) is right
     assert found(sideways(1, start=0.6)[0], [(right, 0)]) is right
 
 
-def test_the_first_candidate_that_gives_a_pose_decides() -> None:
-    right, wrong = worlds()
+def test_the_first_candidate_with_a_pose_is_used() -> None:
+    right, wrong = submaps()
     assert found(ANYWHERE, [(wrong, 0), (right, 2)]) is right
-    twin = world_in(SCENE, sideways(6), number=2)
+    twin = submap_of_scene(SCENE, sideways(6), number=2)
     assert found(ANYWHERE, [(twin, 1), (right, 1)]) is twin
     assert found(ANYWHERE, []) is None
 
 
-def test_only_so_many_are_tried() -> None:
-    right, wrong = worlds()
-    others = [world_in(FAR, sideways(2), number=number) for number in range(3, 6)]
+def test_the_number_of_candidates_is_bounded() -> None:
+    right, wrong = submaps()
+    others = [submap_of_scene(FAR, sideways(2), number=number) for number in range(3, 6)]
     candidates = [(other, 0) for other in others]
     assert found(ANYWHERE, [*candidates, (right, 0)]) is None
     assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
     assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.max_candidates=4") is right
-    # those beside one that failed are not tried, nor do they count
+    # neighbors of a failed candidate are not tried and do not count
     assert (
         found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.max_candidates=2")
         is right
     )
 
 
-def test_those_beside_one_that_failed_in_another_world_are_tried() -> None:
-    right, wrong = worlds()
+def test_neighbors_of_a_candidate_that_failed_in_another_submap_are_tried() -> None:
+    right, wrong = submaps()
     assert found(ANYWHERE, [(wrong, 3), (right, 3)]) is right
 
 
-def test_beside_a_candidate_are_as_many_as_the_local_map_has() -> None:
-    right, _ = worlds()
+def test_candidate_neighborhoods_have_the_size_of_the_local_map() -> None:
+    right, _ = submaps()
     localizer = relocalizer("tracking.local_keyframes=2").tracker.localizer
     assert localizer.local_keyframes(right.map, 5).tolist() == [5, 4, 3]
 
 
-def test_a_pose_that_is_doubted_is_no_pose() -> None:
-    right, _ = worlds()
+def test_an_uncertain_pose_does_not_relocalize() -> None:
+    right, _ = submaps()
     assert found(ANYWHERE, [(right, 0)], "pose_validation.max_position_std=1e-6") is None
     assert found(ANYWHERE, [(right, 0)], "pose_validation.max_squared_error=1e-3") is None
     assert found(ANYWHERE, [(right, 0)], "pose_validation.max_jump=1e-9") is right  # nothing was expected
 
 
-def test_a_keyframe_matches_by_its_own_descriptors() -> None:
-    right, _ = worlds()
+def test_a_candidate_matches_by_its_own_descriptors() -> None:
+    right, _ = submaps()
     right.map.points["descriptors"][:] = 0  # of other observations
     view = SCENE.view(50, ANYWHERE)
     pairs = match_keyframe(right.map, 2, view, relocalizer().tracker.matcher)
@@ -101,8 +101,8 @@ def test_a_keyframe_matches_by_its_own_descriptors() -> None:
     assert set(points.tolist()) <= set(right.map.observed_points(torch.tensor([2])).tolist())
 
 
-def test_points_match_by_descriptor_wherever_they_are() -> None:
-    right, _ = worlds()
+def test_points_match_by_descriptor_at_any_position() -> None:
+    right, _ = submaps()
     view = SCENE.view(50, ANYWHERE)
     ids = right.map.valid_points().flip(0)
     pairs = match_points(right.map, ids, view, relocalizer().tracker.matching)
@@ -112,7 +112,7 @@ def test_points_match_by_descriptor_wherever_they_are() -> None:
     assert len(match_points(right.map, ids[:0], view, relocalizer().tracker.matching).first) == 0
 
 
-def test_thresholds_of_bits_and_of_floats() -> None:
+def test_thresholds_of_binary_and_float_descriptors() -> None:
     bits, floats = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 2)
     settings = load_config(
         None, ["matching.max_hamming_distance=50", "matching.max_cosine_distance=0.3"]

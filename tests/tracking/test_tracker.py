@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, centre, moved, pose, rows_of, sideways, world_in
+from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.map.atlas import Submap
@@ -40,7 +40,7 @@ def tracker(*overrides: str) -> Tracker:
 
 
 def submap(count: int = 4, **options: float) -> Submap:
-    return world_in(SCENE, sideways(count), **options)  # type: ignore[arg-type]
+    return submap_of_scene(SCENE, sideways(count), **options)  # type: ignore[arg-type]
 
 
 def followed(where: Submap, view: FrameFeatures, by: Tracker | None = None) -> PoseEstimate:
@@ -52,7 +52,7 @@ def followed(where: Submap, view: FrameFeatures, by: Tracker | None = None) -> P
 # --- the track --------------------------------------------------------------------------------------------------
 
 
-def test_follow_goes_on_from_a_keyframe() -> None:
+def test_tracking_continues_from_a_keyframe() -> None:
     here = submap(4)
     here.tracking.velocity, here.tracking.error, here.tracking.explained_ratio = pose(0.1), 0.7, 0.4
     tracker().reset_to_keyframe(here, 2)
@@ -76,7 +76,7 @@ def test_the_local_map_is_bounded() -> None:
     assert torch.equal(here.tracking.local_points, here.map.observed_points(torch.arange(3)))
 
 
-def test_the_local_map_may_be_what_was_seen_lately() -> None:
+def test_the_local_map_may_be_the_recently_seen_points() -> None:
     here, recent = submap(4), tracker("tracking.recent_frames=5")
     last_seen = here.map.points["last_seen_frame"]
     last_seen[:] = 10
@@ -105,7 +105,7 @@ def test_a_prediction_repeats_the_last_motion() -> None:
     torch.testing.assert_close(follower.predict(here), here.T_cw)
 
 
-def test_a_frame_that_cannot_be_located_ends_the_motion() -> None:
+def test_a_lost_frame_resets_the_motion_model() -> None:
     here = submap()
     here.tracking.velocity = pose(0.1)
     before = here.T_cw.clone()
@@ -114,7 +114,7 @@ def test_a_frame_that_cannot_be_located_ends_the_motion() -> None:
     assert torch.equal(here.T_cw, before)
 
 
-def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() -> None:
+def test_the_reference_keyframe_shares_the_most_points() -> None:
     here, follower = submap(5, noise=0.0), tracker()
     follower.reset_to_keyframe(here, 4)
     T_cw = sideways(1, start=0.16)[0]
@@ -135,7 +135,7 @@ def test_the_reference_is_the_local_keyframe_that_sees_most_of_what_is_seen() ->
     assert (last_seen[others] == 0).all()
 
 
-def test_the_track_remembers_the_last_ten_frames_or_so() -> None:
+def test_running_averages_span_about_ten_frames() -> None:
     here, follower = submap(), tracker()
     here.tracking.error, here.tracking.explained_ratio = 2.0, 0.5
     estimate = followed(here, SCENE.view(50, sideways(1, start=0.4)[0], noise=0.5), follower)
@@ -144,7 +144,7 @@ def test_the_track_remembers_the_last_ten_frames_or_so() -> None:
     assert EMA_RATE == 0.1
 
 
-def test_a_track_begins_anew_where_a_frame_was_found() -> None:
+def test_the_tracking_state_restarts_after_relocalization() -> None:
     here, follower = submap(5), tracker()
     here.tracking.velocity, here.tracking.error, here.tracking.explained_ratio = pose(0.1), 3.0, 0.1
     view = SCENE.view(50, sideways(1, start=0.02)[0])
@@ -162,7 +162,7 @@ def test_a_track_begins_anew_where_a_frame_was_found() -> None:
 # --- one frame --------------------------------------------------------------------------------------------------
 
 
-def test_a_frame_is_where_it_is_and_sees_what_it_sees() -> None:
+def test_a_frame_has_the_true_pose_and_observations() -> None:
     here, T_cw = submap(), se3_exp(3 * STEP)
     view = SCENE.view(50, T_cw)
     visible = here.map.points["times_visible"].clone()
@@ -179,7 +179,7 @@ def test_a_frame_is_where_it_is_and_sees_what_it_sees() -> None:
     assert torch.equal(here.map.points["times_visible"], visible)  # it is not believed yet
 
 
-def test_a_frame_that_is_believed_speaks_for_what_it_saw_and_should_have_seen() -> None:
+def test_an_accepted_frame_counts_visible_and_found_points() -> None:
     here, follower = submap(), tracker()
     points, estimate = here.map.points, followed(here, SCENE.view(50, se3_exp(3 * STEP)))
     estimate = replace(estimate, point_ids=estimate.point_ids[:50])
@@ -213,7 +213,7 @@ def few(here: Submap, count: int) -> None:
 
 
 @pytest.mark.parametrize(("setting", "count"), [("min_matches", 30), ("min_inliers", 30)])
-def test_fewer_points_than_are_needed_give_no_pose(setting: str, count: int) -> None:
+def test_too_few_points_give_no_pose(setting: str, count: int) -> None:
     here = submap(2)
     few(here, count)
     view = SCENE.view(50, sideways(1, start=0.1)[0])
@@ -222,7 +222,7 @@ def test_fewer_points_than_are_needed_give_no_pose(setting: str, count: int) -> 
     assert tracker(f"tracking.{setting}={count + 1}").track(here.fork(), view) is None
 
 
-def test_enough_matches_must_agree_in_the_end() -> None:
+def test_enough_matches_must_be_inliers() -> None:
     here = submap(2)
     few(here, 40)
     view = SCENE.view(50, sideways(1, start=0.1)[0])
@@ -241,12 +241,12 @@ def located(here: Submap, view: FrameFeatures, T_cw: Tensor) -> PoseEstimate | N
     aside.tracking.T_cr = T_cw @ se3_inverse(here.map.T_cw[here.tracking.reference])
     aside.tracking.velocity = None
     other = view.descriptors.clone()
-    other[:, 0] ^= 255  # eight bits of noise: no nearest neighbour is a billion times nearer than the second
+    other[:, 0] ^= 255  # eight bits of noise: no nearest neighbor is a billion times nearer than the second
     return tracker("matching.max_ratio=1e-9").track(aside, replace(view, descriptors=other))
 
 
 @pytest.mark.parametrize(("pixels", "found"), [(10.0, True), (35.0, True), (110.0, False)])
-def test_matches_are_looked_for_near_the_prediction(pixels: float, found: bool) -> None:
+def test_matches_are_searched_near_the_prediction(pixels: float, found: bool) -> None:
     """Scales are one to three pixels: the first window is 12 to 36 pixels wide, the second 36 to 108.
 
     With a ratio test that nothing passes, matches without a place are out of the question.
@@ -258,7 +258,7 @@ def test_matches_are_looked_for_near_the_prediction(pixels: float, found: bool) 
     assert (estimate is not None) is found
 
 
-def test_without_a_place_to_look_descriptors_alone_decide() -> None:
+def test_without_a_prediction_matching_is_by_descriptor() -> None:
     here = submap(3)
     T_cw = sideways(1, start=0.2)[0]
     here.tracking.T_cr = AWAY
@@ -267,7 +267,7 @@ def test_without_a_place_to_look_descriptors_alone_decide() -> None:
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
 
 
-def test_points_that_died_are_not_looked_for() -> None:
+def test_invalid_points_are_not_matched() -> None:
     here = submap(3)
     dead = here.tracking.last_inlier_points[:20]
     here.map.remove_points(dead)
@@ -300,7 +300,7 @@ def test_cells_number_the_image_row_by_row() -> None:
     assert GRID == (8, 6)
 
 
-def test_old_points_are_heard_alone_where_they_are_enough() -> None:
+def test_mature_points_are_used_alone_where_they_suffice() -> None:
     times = torch.tensor(
         [MATURE_OBSERVATIONS, MATURE_OBSERVATIONS - 1, MATURE_OBSERVATIONS + 5, 0, MATURE_OBSERVATIONS]
     )
@@ -308,7 +308,7 @@ def test_old_points_are_heard_alone_where_they_are_enough() -> None:
     assert select_mature(times, 4).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_every_cell_has_a_voice() -> None:
+def test_every_cell_is_sampled() -> None:
     crowd = torch.tensor([[10.0, 10.0]]).expand(12, 2)
     pixels = torch.cat([crowd, torch.tensor([[300.0, 200.0], [100.0, 10.0]]), crowd]).double()
     chosen = subsample_per_cell(pixels, (320, 240))
@@ -316,14 +316,14 @@ def test_every_cell_has_a_voice() -> None:
     assert MAX_MATCHES_PER_CELL == 5
 
 
-def test_a_crowd_has_no_more_to_say_than_a_few() -> None:
+def test_the_weight_of_a_cell_is_bounded() -> None:
     crowd = torch.tensor([[10.0, 10.0]]).expand(2 * MAX_CELL_WEIGHT, 2)
     few = torch.tensor([[100.0, 10.0]]).expand(MAX_CELL_WEIGHT, 2)
     weights = grid_weights(torch.cat([crowd, few, few[:1] + 100]).double(), (320, 240))
     assert weights.tolist() == [0.5] * 2 * MAX_CELL_WEIGHT + [1.0] * (MAX_CELL_WEIGHT + 1)
 
 
-def test_what_is_explained_is_the_share_of_the_cells_with_keypoints_that_are_used() -> None:
+def test_the_explained_fraction_counts_cells_with_inliers() -> None:
     places = (
         [(10.0, 10.0)] * 3
         + [(100.0, 10.0)] * 2
@@ -355,7 +355,7 @@ def test_a_tracker_that_does_not_count_leaves_the_map_as_it_is() -> None:
     assert int(found.max()) == 1
 
 
-def test_coverage_is_the_share_of_the_cells_that_have_a_fifth_of_what_is_expected() -> None:
+def test_coverage_counts_cells_with_a_fifth_of_the_expected_points() -> None:
     here = submap()
     ids = here.map.valid_points()[:30]
     here.map.points["times_found"][ids] = MATURE_OBSERVATIONS
@@ -401,7 +401,7 @@ def test_the_expected_scale_falls_with_the_distance() -> None:
 
 
 @pytest.mark.parametrize("limit", [20.0, 40.0])
-def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
+def test_points_seen_from_another_side_are_excluded(limit: float) -> None:
     here = submap(1)
     here.map.points["is_valid"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
     middle = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
@@ -409,7 +409,7 @@ def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
     turn = pose(0, 0, 0, 0, angle)
     T_cw = turn.clone()
     T_cw[:3, 3] = middle - turn[:3, :3] @ middle  # looks at the middle of the scene from 30 degrees aside
-    rays = here.map.positions_w - centre(T_cw)
+    rays = here.map.positions_w - camera_center(T_cw)
     between = (rays * here.map.positions_w).sum(-1) / (rays.norm(dim=-1) * here.map.positions_w.norm(dim=-1))
     alike = torch.rad2deg(between.acos()) < limit
     kept = projected(here, T_cw, limit).ids
@@ -420,8 +420,8 @@ def test_points_seen_from_another_side_are_left_out(limit: float) -> None:
     assert torch.equal(kept, torch.nonzero(wanted)[:, 0])
 
 
-def test_a_track_of_a_moved_world_is_the_same_track() -> None:
-    """Nothing depends on where the origin of the world is, nor on its unit."""
+def test_tracking_does_not_depend_on_the_map_frame() -> None:
+    """Nothing depends on the origin or the scale of the map frame."""
     S = torch.eye(4, dtype=torch.float64)
     S[:3] = se3_exp(torch.tensor([1.0, -2.0, 3.0, 0.3, 1.0, -0.5], dtype=torch.float64))[:3]
     S[:3, :3] *= 2.5
@@ -437,7 +437,7 @@ def test_a_track_of_a_moved_world_is_the_same_track() -> None:
     torch.testing.assert_close(two.covariance, units[:, None] * one.covariance * units, rtol=1e-3, atol=1e-12)
 
 
-def test_where_the_last_frames_are_in_doubt_the_pose_is_not_looked_for_next_to_them(
+def test_after_uncertain_frames_the_pose_search_starts_from_scratch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls: list[bool] = []

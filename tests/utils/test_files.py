@@ -35,7 +35,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_no_reader_waits_or_reads_without_end(tmp_path: Path, name: str) -> None:
+def test_bounded_reads_neither_block_nor_run_forever(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / "pipe")
     os.mkfifo(tmp_path / "pipe.mp4")
     (tmp_path / "endless").symlink_to("/dev/zero")
@@ -46,7 +46,7 @@ def test_no_reader_waits_or_reads_without_end(tmp_path: Path, name: str) -> None
         assert str(caught.value).isprintable()
 
 
-def test_a_list_names_a_pipe(tmp_path: Path) -> None:
+def test_a_pipe_in_a_list_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
     (tmp_path / "rgb.txt").write_text("0 a.png\n1 /dev/zero\n2 a\0.png\n")
     with pytest.raises(TorchslamError, match=r"rgb\.txt:1: .*a\.png cannot be read: not a regular file"):
@@ -67,14 +67,14 @@ def test_limits(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="a file that does not know its size")
-def test_a_file_that_says_it_is_empty() -> None:
+def test_a_file_of_size_zero_is_read() -> None:
     assert b"Name:" in read_bytes("/proc/self/status", 1 << 20, "a text")
     with pytest.raises(OSError, match="more than the 100 of a text"):
         read_bytes("/proc/self/status", 100, "a text")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", "9" * 5000])
-def test_json_that_python_does_not_read(text: str) -> None:
+def test_json_that_python_cannot_parse_is_refused(text: str) -> None:
     with pytest.raises(ValueError):
         parse_json(text)
 

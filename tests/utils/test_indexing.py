@@ -10,13 +10,13 @@ IDS = st.lists(st.integers(-20, 200), max_size=60)
 
 
 @given(st.lists(st.booleans(), max_size=60))
-def test_true_indices_are_those_of_nonzero(values: list[bool]) -> None:
+def test_true_indices_equal_nonzero(values: list[bool]) -> None:
     mask = torch.tensor(values, dtype=torch.bool)
     assert torch.equal(true_indices(mask), mask.nonzero().squeeze(1))
 
 
 @given(IDS)
-def test_distinct_ones_and_their_ranks_are_those_of_unique(values: list[int]) -> None:
+def test_distinct_values_and_ranks_equal_unique(values: list[int]) -> None:
     ids = torch.tensor(values, dtype=torch.int64)
     expected, ranks = torch.unique(ids, return_inverse=True)
     assert torch.equal(distinct(ids), expected)
@@ -24,7 +24,7 @@ def test_distinct_ones_and_their_ranks_are_those_of_unique(values: list[int]) ->
 
 
 @given(IDS, IDS)
-def test_membership_is_that_of_isin(values: list[int], others: list[int]) -> None:
+def test_membership_equals_isin(values: list[int], others: list[int]) -> None:
     ids, among = (torch.tensor(each, dtype=torch.int64) for each in (values, others))
     before = ids.clone()
     assert torch.equal(is_among(ids, among), torch.isin(ids, among))

@@ -23,7 +23,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, file: io.StringIO) -> str:
     return file.getvalue()
 
 
-def test_a_log_has_lines_and_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_has_few_progress_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     text = shown(monkeypatch, io.StringIO())
     assert "\r" not in text
     first, last = text.splitlines()

@@ -20,7 +20,7 @@ def wait(monkeypatch: pytest.MonkeyPatch):
     return passes
 
 
-def test_the_rest_is_what_no_stage_inside_has(wait) -> None:
+def test_the_remainder_is_the_time_of_no_inner_stage(wait) -> None:
     clock = Stopwatch()
     with clock("features"):
         wait(5)
@@ -36,7 +36,7 @@ def test_the_rest_is_what_no_stage_inside_has(wait) -> None:
     assert clock.take() == {"total": 0}
 
 
-def test_a_stage_that_fails_has_taken_its_time(wait) -> None:
+def test_a_failing_stage_is_timed(wait) -> None:
     clock = Stopwatch()
 
     def fail() -> None:

@@ -44,7 +44,7 @@ def params_of(given: GivenPoses, camera: Camera) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["images.bin", "images.txt"])
-def test_colmap_is_read_as_it_was_written(scene: Scene, tmp_path: Path, name: str) -> None:
+def test_colmap_poses_round_trip(scene: Scene, tmp_path: Path, name: str) -> None:
     """Binary and text, by folder and by file; of a folder with both the binary."""
     write_colmap(tmp_path, scene)
     (tmp_path / ("images.txt" if name == "images.bin" else "images.bin")).unlink()
@@ -55,7 +55,7 @@ def test_colmap_is_read_as_it_was_written(scene: Scene, tmp_path: Path, name: st
         assert params_of(given, scene.camera) == pytest.approx(scene.camera.params.tolist())
 
 
-def test_nerfstudio_is_read_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
+def test_nerfstudio_poses_round_trip(scene: Scene, tmp_path: Path) -> None:
     """From the file or its folder; the axes of its cameras are turned."""
     write_nerfstudio(tmp_path, scene, torch.eye(3, dtype=torch.float64))
     for path in (tmp_path, tmp_path / "transforms.json"):
@@ -66,7 +66,7 @@ def test_nerfstudio_is_read_as_it_was_written(scene: Scene, tmp_path: Path) -> N
 
 
 def test_a_transforms_without_a_camera(tmp_path: Path) -> None:
-    """Then somebody else must know it; a camera at rest looks along -z of OpenGL, y up."""
+    """Then the camera must be given; a camera at the origin looks along -z of OpenGL, y up."""
     frames = [{"file_path": "./train/r_0", "transform_matrix": torch.eye(4).tolist(), "fl_x": 3.0}]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     given = read_poses(tmp_path)
@@ -75,8 +75,8 @@ def test_a_transforms_without_a_camera(tmp_path: Path) -> None:
     assert given.rows(Named("data/train/r_0.png", "data/train/r_1.png")).tolist() == [0, -1]
 
 
-def test_images_are_known_by_the_end_of_their_names() -> None:
-    """As much of it as tells them apart; doubtful names are nobody's."""
+def test_images_are_matched_by_the_end_of_their_names() -> None:
+    """The shortest unique suffix of a path; ambiguous names match nothing."""
     T_cw = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
     given = GivenPoses("colmap", Path("model"), T_cw, names=("a/1.png", "b/1.png", "b/2.png"))
     assert given.rows(Named("rgb/b/2.png", "rgb/a/1.png", "rgb/b/1.png", "rgb/c.png")).tolist() == [
@@ -90,7 +90,7 @@ def test_images_are_known_by_the_end_of_their_names() -> None:
         given.rows(Named("x/3.png"))
 
 
-def test_images_are_known_by_their_times() -> None:
+def test_images_are_matched_by_their_times() -> None:
     """Within 20 ms, and no pose is that of two images."""
     T_cw = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
     times = torch.tensor([0.015, 0.2, 5.0], dtype=torch.float64)
@@ -121,7 +121,7 @@ def test_images_are_known_by_their_times() -> None:
         ("nothing.txt", "", "neither images.bin"),
     ],
 )
-def test_what_is_no_pose(tmp_path: Path, name: str, content: str | bytes, message: str) -> None:
+def test_invalid_poses_are_refused(tmp_path: Path, name: str, content: str | bytes, message: str) -> None:
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(TrajectoryError, match=message):

@@ -29,7 +29,7 @@ RED = GREEN[..., [1, 0, 2]]
         (GREEN[..., 1:2], "gray", 200),
     ],
 )
-def test_channels(image: np.ndarray, channels: str, gray: float) -> None:
+def test_images_of_every_channel_count_are_accepted(image: np.ndarray, channels: str, gray: float) -> None:
     tensor = image_tensor(image, channels)
     assert (tensor.shape, tensor.dtype) == ((1, 1, 4, 6), torch.float32)
     assert float(tensor.mean()) == pytest.approx(gray / 255, abs=0.6 / 255)
@@ -56,7 +56,7 @@ def test_wrong_images(image: np.ndarray, channels: str, message: str) -> None:
         image_tensor(image, channels)
 
 
-def test_step_image_is_step() -> None:
+def test_step_accepts_an_image_array() -> None:
     sequence = open_sequence("synthetic:planar").part(0, 3)
     frames, images = (
         SLAM(sequence.camera, load_config(None, ["features.kind=opencv-orb"])) for _ in range(2)

@@ -52,7 +52,7 @@ def test_damaged_png(tmp_path: Path, write_picture: Callable) -> None:
         read_gray(path, "here")
 
 
-def test_header_that_promises_too_much(tmp_path: Path) -> None:
+def test_a_header_that_declares_too_many_pixels_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.pgm"
     path.write_bytes(b"P5\n3000000 3000000\n255\n" + bytes(100))
     with pytest.raises(FrameError, match="not an image"):

@@ -39,21 +39,21 @@ def test_same_pixels_as_opencv(shape: tuple[int, ...], dtype: type, seed: int) -
     np.testing.assert_array_equal(gray, by_opencv(data))
 
 
-def test_every_mixture_of_colors_is_the_gray_that_opencv_makes_of_it() -> None:
+def test_color_to_gray_agrees_with_opencv() -> None:
     levels = np.arange(0, 256, 5, dtype=np.uint8)
     colors = np.stack(np.meshgrid(levels, levels, np.arange(256, dtype=np.uint8), indexing="ij"), -1)
     data = encoded(colors.reshape(len(levels), -1, 3))
     np.testing.assert_array_equal(decode_png_gray(data), by_opencv(data))
 
 
-def test_text_in_front_of_the_pixels_changes_nothing() -> None:
+def test_text_chunks_before_the_pixels_are_ignored() -> None:
     text = PngImagePlugin.PngInfo()
     text.add_text("camera", "left")
     image = np.arange(256, dtype=np.uint8).reshape(8, 32)
     np.testing.assert_array_equal(decode_png_gray(encoded(image, pnginfo=text, dpi=(72, 72))), image)
 
 
-def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
+def test_chunks_that_change_pixels_are_left_to_opencv() -> None:
     colors = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
     gamma = PngImagePlugin.PngInfo()
     gamma.add(b"gAMA", (45455).to_bytes(4, "big"))
@@ -71,7 +71,7 @@ def test_what_bears_on_the_pixels_is_left_to_opencv() -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.integers(8, 400), st.integers(0, 255), st.integers(0, 400))
-def test_damage_is_never_read_as_something_else(at: int, value: int, lost: int) -> None:
+def test_damaged_files_are_never_read_as_valid(at: int, value: int, lost: int) -> None:
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[at % len(data)] = value
     gray = decode_png_gray(bytes(data[: len(data) - lost % len(data)]))
@@ -82,7 +82,7 @@ def test_damage_is_never_read_as_something_else(at: int, value: int, lost: int) 
 
 @settings(max_examples=200, deadline=None)
 @given(st.integers(0, 100), st.integers(0, 100), st.binary(min_size=5, max_size=5))
-def test_headers_that_promise_something_else_are_left_to_opencv(width: int, height: int, kind: bytes) -> None:
+def test_unsupported_headers_are_left_to_opencv(width: int, height: int, kind: bytes) -> None:
     data = bytearray(encoded(np.arange(400, dtype=np.uint8).reshape(20, 20)))
     data[16:29] = width.to_bytes(4, "big") + height.to_bytes(4, "big") + kind
     data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
@@ -90,7 +90,7 @@ def test_headers_that_promise_something_else_are_left_to_opencv(width: int, heig
     assert gray is None or theirs is None or np.array_equal(gray, theirs)
 
 
-def test_a_header_that_promises_too_much_is_not_decoded() -> None:
+def test_a_header_that_declares_too_many_pixels_is_not_decoded() -> None:
     data = bytearray(encoded(np.zeros((8, 8), np.uint8)))
     data[16:20] = (1 << 30).to_bytes(4, "big")
     data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")

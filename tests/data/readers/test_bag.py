@@ -253,7 +253,7 @@ def test_bayer(encoding: str, place: tuple[int, int]) -> None:
     assert float(gray[4:-4, 4:-4].mean()) == pytest.approx(0.299 * 200, abs=1.5)
 
 
-def test_bytes_the_other_way_round() -> None:
+def test_big_endian_images_are_read() -> None:
     image = (np.arange(8).reshape(2, 4) * 1000).astype(">u2")
     gray = to_gray(Image(image, "mono16", 4, 8, big=1), "here")
     assert gray.dtype == np.uint16

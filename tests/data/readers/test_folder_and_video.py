@@ -41,7 +41,7 @@ def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
     assert float(open_sequence(tmp_path, str(tmp_path / "mine.txt")).camera.fx) == 62.0
 
 
-def test_unknown_camera_is_a_first_guess(tmp_path: Path, write_picture: Callable) -> None:
+def test_an_unknown_camera_gets_an_initial_guess(tmp_path: Path, write_picture: Callable) -> None:
     for index in range(3):
         write_picture(tmp_path / f"{index}.png")
     (tmp_path / "calibration.txt").write_text("60 60 32 24")

@@ -52,7 +52,7 @@ def test_rotation(tmp_path: Path, degrees: int, corner: tuple[int, int]) -> None
         assert float((shown > 0.5).float().mean()) == pytest.approx(144 / 3072, abs=0.02)
 
 
-def test_thinned_by_time(clip: Path) -> None:
+def test_frames_are_subsampled_by_time(clip: Path) -> None:
     set_durations(clip, MILLISECONDS)
     sequence = open_sequence(clip, CAMERA, fps=10)
     assert (sequence.timestamps * 1000).round().to(int).tolist() == [0, 240, 590, 716]
@@ -69,7 +69,7 @@ def test_a_video_is_read_without_a_camera(clip: Path) -> None:
     assert open_sequence(clip, CAMERA).calibrated is Calibrated.GIVEN
 
 
-def test_a_camera_found_later(clip: Path) -> None:
+def test_a_camera_can_be_set_later(clip: Path) -> None:
     sequence, given = open_sequence(clip), open_sequence(clip, CAMERA).camera
     sequence.camera = given
     assert (sequence.camera, sequence.calibrated) == (given, Calibrated.GIVEN)
@@ -77,5 +77,5 @@ def test_a_camera_found_later(clip: Path) -> None:
         sequence.camera = Camera.pinhole(1, 1, 1, 1, size=(2, 2))
 
 
-def test_times_that_do_not_rise_are_left_out() -> None:
+def test_frames_with_non_increasing_times_are_dropped() -> None:
     assert _rising([0.0, 0.1, 0.1, 0.05, 0.2, float("nan"), 0.3]) == [0, 1, 4, 6]

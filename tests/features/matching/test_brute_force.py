@@ -60,13 +60,13 @@ def test_match_equals_brute_force(floats: int | None, mutual: bool, seed: int, r
 @pytest.mark.parametrize("floats", [None, 16])
 @given(seed=st.integers(0, 1000), ratio=st.sampled_from([0.9, math.inf]), limited=st.booleans())
 @settings(max_examples=15, deadline=None)
-def test_pairs_that_are_not_allowed_count_as_infinitely_far(
+def test_forbidden_pairs_have_infinite_distance(
     floats: int | None, seed: int, ratio: float, limited: bool
 ) -> None:
     first = features(2, 30, seed, floats)
     second = disturbed(first, seed + 1)
     allowed = torch.rand(2, 30, 30, generator=torch.Generator().manual_seed(seed)) < 0.5
-    allowed[:, 3] = False  # one that may match nobody
+    allowed[:, 3] = False  # a column without allowed pairs
     limit = (40 if floats is None else 0.2) if limited else None
     matches = match(first, second, None if ratio == math.inf else ratio, True, limit, allowed=allowed)
     d = distances_between(first, second).masked_fill(~allowed, math.inf)
@@ -119,7 +119,7 @@ def test_many_columns_need_wider_keys(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("rows", [0, 5])
-def test_match_of_nothing(rows: int) -> None:
+def test_match_of_empty_sets(rows: int) -> None:
     matches = match(features(2, rows), features(2, 0))
     assert matches.mask.shape == (2, rows)
     assert not matches.mask.any()
@@ -169,7 +169,7 @@ def test_soft_weights_are_a_dual_softmax(floats: int | None) -> None:
     torch.testing.assert_close(matches.weights, chosen * matches.mask)
 
 
-def test_soft_weights_and_distances_have_right_gradients() -> None:
+def test_soft_weights_and_distances_pass_gradcheck() -> None:
     base = features(1, 6, 7, 5)
     first, second = base.descriptors.double(), disturbed(base, 8).descriptors.double()
 
@@ -210,7 +210,7 @@ def test_descriptors_of_another_length_are_an_error(wrong: float) -> None:
         match_pairs(descriptors[0], spoilt[0], torch.arange(5), torch.arange(5), 0.5)
 
 
-def test_descriptors_of_half_precision_and_of_no_keypoint_are_none() -> None:
+def test_half_precision_and_missing_descriptors_are_refused() -> None:
     generator = torch.Generator().manual_seed(0)
     descriptors = torch.nn.functional.normalize(torch.randn(1, 5, 8, generator=generator), dim=-1)
     descriptors = descriptors.bfloat16().float()

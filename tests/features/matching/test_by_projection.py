@@ -90,14 +90,14 @@ def test_match_by_projection_with_one_radius_and_no_limits() -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
-def test_match_by_projection_of_nothing(rows: int, columns: int) -> None:
+def test_match_by_projection_of_empty_sets(rows: int, columns: int) -> None:
     query = features(1, rows)
     matches = match_by_projection(query.descriptors, query.keypoints, 10.0, features(1, columns))
     assert matches.mask.shape == (1, rows)
     assert not matches.mask.any()
 
 
-def test_match_by_projection_with_nothing_in_the_windows() -> None:
+def test_match_by_projection_with_empty_windows() -> None:
     first = features(1, 10)
     matches = match_by_projection(first.descriptors, first.keypoints + 1000, 5.0, first)
     assert not matches.mask.any()

@@ -56,7 +56,7 @@ def test_hamming_equals_counting_bits(fast: bool, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("size", [8, 32, 248])
-def test_hamming_of_pairs(size: int) -> None:
+def test_hamming_distances_of_given_pairs(size: int) -> None:
     first, second = random_descriptors(20, size), random_descriptors(20, size, seed=1)
     first[0], second[0] = 0, 255
     first[1], second[1] = 255, 255
@@ -81,5 +81,5 @@ def test_hamming_between_rows(size: int, by_numpy: bool, monkeypatch: pytest.Mon
     assert torch.equal(distances, hamming(first, second)[rows, columns].long())
 
 
-def test_hamming_of_nothing() -> None:
+def test_hamming_distances_of_empty_sets() -> None:
     assert hamming(random_descriptors(0, 32), random_descriptors(4, 32)).shape == (0, 4)

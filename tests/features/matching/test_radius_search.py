@@ -24,7 +24,7 @@ from torchslam.features.matching.radius_search import nearest_of_pairs, pairs_wi
 @settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )  # of the fixture nothing is kept
-def test_windows_hold_what_is_near(
+def test_pairs_within_a_radius_equal_brute_force(
     device: torch.device, seed: int, batch: int, spread: float, largest: float
 ) -> None:
     """Wherever keypoints are, in front of the first cell and behind the last one too."""
@@ -47,7 +47,7 @@ def test_windows_hold_what_is_near(
     seed=st.integers(0, 1000), ratio=st.sampled_from([None, 0.5, 0.9]), pairs=st.sampled_from([0, 1, 40, 400])
 )
 @settings(max_examples=60, deadline=None)
-def test_the_nearest_of_pairs(seed: int, ratio: float | None, pairs: int) -> None:
+def test_the_nearest_of_the_pairs_is_found(seed: int, ratio: float | None, pairs: int) -> None:
     """As one finds it pair by pair, on the CPU and elsewhere, with many ties."""
     generator = torch.Generator().manual_seed(seed)
     key = torch.randperm(30 * 20, generator=generator)[:pairs].sort().values

@@ -30,7 +30,7 @@ def read(folder: Path, reader: str) -> pycolmap.Reconstruction:
     return made
 
 
-def test_reprojection_error_is_ours(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_colmap_computes_our_reprojection_error(scene: Scene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made, ours = read(tmp_path, reader), reprojection_error(scene)
     assert made.compute_mean_reprojection_error() == pytest.approx(ours, abs=1e-9)  # as written
@@ -38,7 +38,7 @@ def test_reprojection_error_is_ours(scene: Scene, tmp_path: Path, reader: str) -
     assert made.compute_mean_reprojection_error() == pytest.approx(ours, abs=1e-6)  # by its own projection
 
 
-def test_points_tracks_and_images_are_those_written(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_points_tracks_and_images_round_trip(scene: Scene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made = read(tmp_path, reader)
     assert [made.image(number).name for number in (1, 2, 3, 4)] == scene.image_names
@@ -59,7 +59,7 @@ def test_points_tracks_and_images_are_those_written(scene: Scene, tmp_path: Path
     assert seen == len(scene.pixels)
 
 
-def test_its_camera_projects_as_ours_does(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_the_colmap_camera_projects_like_ours(scene: Scene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made = read(tmp_path, reader)
     points_c = transform(scene.T_cw[0], scene.points_w)
@@ -69,7 +69,7 @@ def test_its_camera_projects_as_ours_does(scene: Scene, tmp_path: Path, reader: 
     assert (made.camera(1).width, made.camera(1).height) == scene.camera.size
 
 
-def test_every_model_has_a_name(scene: Scene) -> None:
+def test_every_camera_model_has_a_colmap_name(scene: Scene) -> None:
     model, params = colmap_camera(scene.camera)
     k3 = scene.camera.params.tolist()[8:9]
     expected = {"pinhole": "PINHOLE", "fisheye": "OPENCV_FISHEYE"}.get(scene.camera.model)
@@ -86,7 +86,7 @@ def test_without_distortion_the_error_is_that_of_the_new_pixels(scene: Scene, tm
     assert made.compute_mean_reprojection_error() == pytest.approx(reprojection_error(flat), abs=1e-6)
 
 
-def test_an_image_that_sees_nothing_is_written_too(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_an_image_without_observations_is_written(scene: Scene, tmp_path: Path, reader: str) -> None:
     seen = scene.frame_index != 1
     blind = replace(
         scene,

@@ -36,10 +36,10 @@ def test_colors_are_the_mean_over_what_keyframes_see(slam_map: Map) -> None:
         frames = slam_map.keyframes["frame_index"][seen.keyframe_index[rows]]
         expected = torch.cat((frames[:, None], seen.pixels[rows].round()), dim=1).double().mean(dim=0)
         assert slam_map.points["colors"][point].tolist() == (expected + 0.5).floor().tolist()
-    assert slam_map.points["colors"][3].tolist() == [0, 0, 0]  # nobody sees a dead point
+    assert slam_map.points["colors"][3].tolist() == [0, 0, 0]  # an invalid point has no observations
 
 
-def test_other_sessions_and_missing_images_leave_colors_as_they_are(slam_map: Map) -> None:
+def test_other_sessions_and_missing_images_keep_colors(slam_map: Map) -> None:
     slam_map.keyframes["session"][1:] = 1
     slam_map.points["colors"][:] = 77
     sequence = Painted(arc(30))

@@ -45,14 +45,14 @@ def folder(tmp_path: Path, lens: Camera) -> Path:
 def test_every_frame_gets_its_own_image(seen: Scene, folder: Path, tmp_path: Path) -> None:
     images = open_images(str(folder), seen)
     (tmp_path / "out").mkdir()
-    stale, foreign = tmp_path / "out" / "000001.png", tmp_path / "out" / "holiday.png"
-    for other in (stale, foreign):
+    stale, unrelated = tmp_path / "out" / "000001.png", tmp_path / "out" / "holiday.png"
+    for other in (stale, unrelated):
         other.write_bytes(b"")
     write_images(tmp_path / "out", seen, images)
     for index, name in zip(seen.frame_ids.tolist(), seen.image_names, strict=True):
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out" / name)), picture(index, seen.camera))
     assert not stale.exists()
-    assert foreign.exists()
+    assert unrelated.exists()
 
 
 def test_without_distortion(seen: Scene, folder: Path) -> None:
@@ -90,7 +90,7 @@ def test_images_have_the_size_that_the_run_saw(seen: Scene, folder: Path) -> Non
     assert np.abs(image.mean((0, 1)) - picture(3, seen.camera).mean((0, 1))).max() < 1
 
 
-def test_a_sequence_that_is_gone_is_named(seen: Scene, tmp_path: Path) -> None:
+def test_a_missing_sequence_is_named(seen: Scene, tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match=r"nowhere: does not exist; use --sequence.*--no-images"):
         open_images(str(tmp_path / "nowhere"), seen)
 
@@ -107,7 +107,7 @@ def test_a_video_has_colors_at_every_frame(seen: Scene, tmp_path: Path) -> None:
         assert np.abs(images.bgr(index).astype(int) - picture(index, seen.camera)).mean() < 4
 
 
-def test_a_rendered_sequence_is_gray_three_times() -> None:
+def test_a_rendered_sequence_has_three_equal_channels() -> None:
     sequence = open_sequence("synthetic:room?frames=2&blank=1").part(1)
     assert sequence.color(0).shape == (480, 640, 3)
     assert sequence.color(0).unique().tolist() == [128]

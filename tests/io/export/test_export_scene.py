@@ -19,7 +19,7 @@ def test_errors_are_those_of_the_points(scene: Scene) -> None:
     assert 0.4 < float(scene.errors().mean()) < 0.9  # 0.63 expected of the noise
 
 
-def test_turning_the_world_changes_no_pixel(scene: Scene) -> None:
+def test_rotating_the_map_changes_no_pixel(scene: Scene) -> None:
     R = so3_exp(torch.tensor((0.3, 2.0, -0.7), dtype=torch.float64))
     turned = scene.turned(R)
     torch.testing.assert_close(turned.errors(), scene.errors())
@@ -71,7 +71,7 @@ def test_all_frames_come_in_order_of_time(submap: Submap, camera: Camera) -> Non
     torch.testing.assert_close(made.T_cw[made.is_keyframe], submap.map.T_cw)
 
 
-def test_rows_of_the_map_may_stand_in_any_order(submap: Submap, camera: Camera) -> None:
+def test_map_rows_may_be_in_any_order(submap: Submap, camera: Camera) -> None:
     """Keyframes that were found on the way back come later in the map."""
     facing(submap.map)
     before = scene_of(submap, camera, 0, keyframes_alone=True)
@@ -82,7 +82,7 @@ def test_rows_of_the_map_may_stand_in_any_order(submap: Submap, camera: Camera) 
         assert torch.equal(getattr(after, name), getattr(before, name)), name
 
 
-def test_frames_between_bring_their_observations(submap: Submap, camera: Camera) -> None:
+def test_non_keyframes_bring_their_observations(submap: Submap, camera: Camera) -> None:
     facing(submap.map)
     point = torch.nonzero(submap.map.points["times_observed"] >= 2)[:1, 0]
     view = replace(submap.map.frame_features(0), index=29, timestamp=200.0)
@@ -95,7 +95,7 @@ def test_frames_between_bring_their_observations(submap: Submap, camera: Camera)
     assert made.frame_index[-1] == len(made.T_cw) - 1
 
 
-def test_other_sessions_have_no_part(submap: Submap, camera: Camera) -> None:
+def test_other_sessions_are_excluded(submap: Submap, camera: Camera) -> None:
     facing(submap.map)
     submap.map.keyframes["session"][3:] = 1
     assert len(scene_of(submap, camera, 1, keyframes_alone=True).T_cw) == 3

@@ -56,7 +56,7 @@ def test_points_fall_on_their_keypoints(scene: Scene, folder: Path) -> None:
     assert np.mean(total / count) == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
 
 
-def test_the_world_is_upright_and_says_how(scene: Scene, folder: Path) -> None:
+def test_the_map_is_upright_and_the_transform_is_written(scene: Scene, folder: Path) -> None:
     about = json.loads((folder / "transforms.json").read_text())
     up = np.mean([np.array(frame["transform_matrix"])[:3, 1] for frame in about["frames"]], axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), (0, 0, 1), atol=1e-9)

@@ -44,7 +44,7 @@ def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator
     assert seen[5:].tolist() == [list(CAMERA_COLOR)] * 2
 
 
-def test_another_program_reads_it(tmp_path: Path, generator: torch.Generator) -> None:
+def test_another_program_reads_the_ply_file(tmp_path: Path, generator: torch.Generator) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
     points_w = torch.randn(4, 3, generator=generator)
     colors = torch.randint(0, 256, (4, 3), generator=generator, dtype=torch.uint8)
@@ -57,7 +57,7 @@ def test_another_program_reads_it(tmp_path: Path, generator: torch.Generator) ->
         np.testing.assert_array_equal(point.color, colors[number - 1])
 
 
-def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
+def test_a_map_is_rotated_upright(tmp_path: Path, slam_map: Map) -> None:
     """By a rotation alone: up for the cameras is z, normals look at the observer as before."""
     slam_map.points["colors"][:] = torch.arange(len(slam_map.points))[:, None].to(torch.uint8)
     slam_map.keyframes["session"][4:] = 1
@@ -78,7 +78,7 @@ def test_a_map_is_stood_upright(tmp_path: Path, slam_map: Map) -> None:
     np.testing.assert_allclose(columns(cameras, "x", "y", "z"), centers_w @ R.mT, atol=1e-6)
 
 
-def test_the_same_map_in_a_turned_world_stands_as_high(tmp_path: Path, slam_map: Map) -> None:
+def test_the_upright_map_does_not_depend_on_the_map_frame(tmp_path: Path, slam_map: Map) -> None:
     write_map_cloud(tmp_path / "before.ply", slam_map, session=0)
     turn = rigid(so3_exp(torch.tensor((0.4, 1.0, -2.0), dtype=torch.float64)), torch.zeros(3).double())
     slam_map.keyframes["T_cw"][:] = slam_map.T_cw @ se3_inverse(turn)

@@ -31,7 +31,7 @@ def flat(scene: Scene) -> Scene:
 
 @pytest.fixture
 def recorded(flat: Scene, tmp_path: Path) -> Rows:
-    sequence = Walk(arc(91))  # as many images as the frames ask for
+    sequence = Walk(arc(91))  # one image per frame
     images = Images(sequence, {index: index for index in range(91)}, flat.camera)
     write_recording(tmp_path / "it.rrd", flat, upright_rotation(flat.T_wc), images)
     return read(tmp_path / "it.rrd")
@@ -110,14 +110,14 @@ def test_the_path_is_broken_where_frames_are_missing(flat: Scene, recorded: Rows
     assert [len(strip) for strip in strips] == [3, 1]  # frame 90 comes long after frame 6
 
 
-def test_keyframes_have_their_image_beside_their_camera(flat: Scene, recorded: Rows) -> None:
+def test_keyframes_have_their_image(flat: Scene, recorded: Rows) -> None:
     logged = recorded["/world/keyframe", "EncodedImage:blob"]
     assert [frame for frame, _ in logged] == flat.frame_ids[flat.is_keyframe].tolist()
     content = np.array(logged[0][1], dtype=np.uint8).reshape(-1)
     assert cv2.imdecode(content, cv2.IMREAD_COLOR).shape == (240, 320, 3)
 
 
-def test_without_rerun_there_is_a_word_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_rerun_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ResultsError, match=r"pip install 'torchslam\[rerun\]'"):
         import_rerun()

@@ -18,7 +18,7 @@ def border(camera: Camera) -> torch.Tensor:
     return torch.from_numpy(np.stack((u[outer], v[outer]), axis=1)).double()
 
 
-def test_all_of_the_new_image_is_seen_and_its_edges_touch(lens: Camera) -> None:
+def test_the_undistorted_image_is_the_largest_valid_one(lens: Camera) -> None:
     pinhole = pinhole_within(lens)
     rays = torch.nn.functional.pad(pinhole.normalize(border(pinhole)), (0, 1), value=1.0)
     pixels, valid = lens.project(rays)
@@ -30,7 +30,7 @@ def test_all_of_the_new_image_is_seen_and_its_edges_touch(lens: Camera) -> None:
     assert torch.equal(pinhole.params[:2], lens.params[:2])
 
 
-def test_keypoints_are_those_of_opencv(scene: Scene) -> None:
+def test_undistorted_keypoints_agree_with_opencv(scene: Scene) -> None:
     flat, (K, k) = undistorted(scene), (scene.camera.K.numpy(), scene.camera.params[4:].numpy())
     undistort = cv2.fisheye.undistortPoints if scene.camera.model == "fisheye" else cv2.undistortPoints
     if scene.camera.model == "pinhole":
@@ -40,7 +40,7 @@ def test_keypoints_are_those_of_opencv(scene: Scene) -> None:
     np.testing.assert_allclose(flat.pixels, expected, atol=1e-3)
 
 
-def test_images_are_those_of_opencv(lens: Camera) -> None:
+def test_undistorted_images_agree_with_opencv(lens: Camera) -> None:
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.integers(0, 256, (*reversed(lens.size), 3), dtype=np.uint8), (0, 0), 2)
     new, K = pinhole_within(lens).K.numpy(), lens.K.numpy()
@@ -59,11 +59,11 @@ def test_a_point_keeps_its_ray(scene: Scene) -> None:
     )
 
 
-def test_only_a_pinhole_camera_stays(scene: Scene) -> None:
+def test_only_a_pinhole_camera_is_unchanged(scene: Scene) -> None:
     assert (undistorted(scene) is scene) == (scene.camera.model == "pinhole")
 
 
-def test_a_wide_view_does_not_make_a_huge_image() -> None:
+def test_the_size_of_an_undistorted_image_is_bounded() -> None:
     """The left and right edges are 100 degrees from the axis, where a pinhole camera sees nothing."""
     wide = pinhole_within(Camera.fisheye(90.0, 90.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))
     assert wide.size[0] in (640, 641)
@@ -71,6 +71,6 @@ def test_a_wide_view_does_not_make_a_huge_image() -> None:
     assert float(wide.fx) < 1.0
 
 
-def test_a_view_that_no_pinhole_camera_has_is_refused() -> None:
+def test_a_field_of_view_beyond_pinhole_is_refused() -> None:
     with pytest.raises(ResultsError, match="too wide"):
         pinhole_within(Camera.fisheye(90.0, 90.0, 600.0, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))

@@ -1,4 +1,4 @@
-"""Frames are shown as they pass: in a recording of rerun, and in a film."""
+"""Frames are shown during a run: in a rerun recording, and in a video."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Kept:
     """A screen that keeps what it is shown, with the pose of the frame and its pixels by the map of then."""
 
     def __init__(self) -> None:
-        self.glimpses: list[FrameSnapshot] = []
+        self.snapshots: list[FrameSnapshot] = []
         self.runs: list[Run] = []
         self.closed = 0
 
-    def show(self, glimpse: FrameSnapshot) -> None:
-        self.glimpses.append(glimpse)
+    def show(self, snapshot: FrameSnapshot) -> None:
+        self.snapshots.append(snapshot)
 
     def end(self, run: Run) -> None:
         self.runs.append(run)
@@ -72,24 +72,24 @@ def watched(slam: SLAM, walk: Walk, *screens: Kept | LiveView | Film) -> Run:
     return run
 
 
-def test_screens_see_every_frame_once() -> None:
+def test_viewers_see_every_frame_once() -> None:
     walk, kept = Pictured(), Kept()
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
     run = watched(slam, walk, kept)
     assert walk.reads == [1] * FRAMES
-    assert [glimpse.result for glimpse in kept.glimpses] == run.results
-    assert all((glimpse.image == GRAY).all() for glimpse in kept.glimpses)
+    assert [snapshot.result for snapshot in kept.snapshots] == run.results
+    assert all((snapshot.image == GRAY).all() for snapshot in kept.snapshots)
     assert (kept.runs, kept.closed) == ([run], 1)
-    for glimpse in kept.glimpses:
-        count = glimpse.result.inliers
-        assert len(glimpse.tracked) == count or glimpse.result.state is not State.TRACKING or count == 0
-        ours = (glimpse.tracked[:, None] == glimpse.keypoints).all(dim=-1).any(dim=-1)
+    for snapshot in kept.snapshots:
+        count = snapshot.result.inliers
+        assert len(snapshot.tracked) == count or snapshot.result.state is not State.TRACKING or count == 0
+        ours = (snapshot.tracked[:, None] == snapshot.keypoints).all(dim=-1).any(dim=-1)
         assert ours.all()
-    assert len(kept.glimpses[-1].tracked) > 50
+    assert len(kept.snapshots[-1].tracked) > 50
     assert len(tracked_pixels(slam, FRAMES)) == 0
 
 
-def test_without_screens_the_sequence_is_run_as_it_is() -> None:
+def test_without_viewers_the_sequence_is_unchanged() -> None:
     walk = Pictured()
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
     with FrameViewers(slam, walk, []) as watching:
@@ -97,7 +97,7 @@ def test_without_screens_the_sequence_is_run_as_it_is() -> None:
         watching.show(StepResult(0, 0.0, State.LOST, None))
 
 
-def test_what_is_watched_is_the_same_run() -> None:
+def test_watching_does_not_change_the_run() -> None:
     runs = []
     for screens in ([], [Kept()]):
         walk = Pictured()
@@ -143,14 +143,14 @@ def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, dist
     assert rows["/state", "TextLog:text"]
 
 
-def test_a_camera_no_pinhole_can_stand_for_is_refused() -> None:
+def test_a_camera_without_pinhole_equivalent_is_refused() -> None:
     pytest.importorskip("rerun")
     wide = Camera.fisheye(90.0, 90.0, 600.0, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240))
     with pytest.raises(ResultsError, match="too wide"):
         LiveView(SLAM(wide, load_config(None, SIMULATED)), None)
 
 
-def test_a_window_that_was_closed_does_not_spoil_the_run() -> None:
+def test_a_closed_window_does_not_stop_the_run() -> None:
     class Gone:
         def log(self, *what: object, **more: object) -> None: ...
 
@@ -165,7 +165,7 @@ def test_a_window_that_was_closed_does_not_spoil_the_run() -> None:
         view.close()
 
 
-def test_a_viewer_that_does_not_start_has_a_word_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_does_not_start_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     rr = pytest.importorskip("rerun")
 
     def fail(**options: object) -> None:
@@ -176,7 +176,7 @@ def test_a_viewer_that_does_not_start_has_a_word_about_it(monkeypatch: pytest.Mo
         LiveView.spawn(SLAM(Walk(arc(3)).camera, load_config(None, SIMULATED)))
 
 
-def test_without_rerun_the_run_does_not_begin(
+def test_without_rerun_the_run_does_not_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
@@ -186,21 +186,21 @@ def test_without_rerun_the_run_does_not_begin(
 
 
 def frames_of(path: Path) -> list[np.ndarray]:
-    film = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path))
     images = []
-    while (read := film.read())[0]:
+    while (read := video.read())[0]:
         images.append(read[1])
     return images
 
 
-def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> None:
+def test_a_video_has_every_frame_and_marks_tracked_points(tmp_path: Path) -> None:
     gray = np.full((120, 1920), GRAY, np.uint8)
     result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
-    glimpse = FrameSnapshot(result, gray, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
-    film = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
-    for shown in (glimpse, replace(glimpse, tracked=torch.zeros(0, 2))):
-        film.show(shown)
-    film.close()
+    snapshot = FrameSnapshot(result, gray, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
+    video = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
+    for shown in (snapshot, replace(snapshot, tracked=torch.zeros(0, 2))):
+        video.show(shown)
+    video.close()
     first, second = (image.astype(int) for image in frames_of(tmp_path / "it.mp4"))
     assert first.shape == (60 + BAR, 960, 3)  # half of it
     marked, unmarked = first[24:37, 494:507], second[24:37, 494:507]
@@ -210,11 +210,11 @@ def test_a_film_has_every_frame_and_marks_what_is_tracked(tmp_path: Path) -> Non
     assert (first[60:] > 120).any()  # the words
 
 
-def test_a_film_is_as_fast_as_its_sequence(tmp_path: Path) -> None:
+def test_a_video_has_the_frame_rate_of_its_sequence(tmp_path: Path) -> None:
     walk = Pictured()
     film_of(walk, tmp_path).close()
-    film = film_of(SimpleNamespace(known_length=None, timestamps=[], size=(64, 48)), tmp_path)  # type: ignore[arg-type]
-    film.close()
+    video = film_of(SimpleNamespace(known_length=None, timestamps=[], size=(64, 48)), tmp_path)  # type: ignore[arg-type]
+    video.close()
     slam = SLAM(walk.camera, load_config(None, SIMULATED))
     watched(slam, walk, film_of(walk, tmp_path))
     written = cv2.VideoCapture(str(tmp_path / "tracked.mp4"))
@@ -222,6 +222,6 @@ def test_a_film_is_as_fast_as_its_sequence(tmp_path: Path) -> None:
     assert len(frames_of(tmp_path / "tracked.mp4")) == FRAMES
 
 
-def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match="cannot write it"):
         Film(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)

@@ -48,7 +48,7 @@ def array(packed: dict[str, str], *shape: int) -> np.ndarray:
     return decoded(packed).reshape(-1, *shape)
 
 
-def test_numbers_come_back() -> None:
+def test_numbers_of_the_page_round_trip() -> None:
     for values, kind in (([1, -2], "int32"), ([255], "uint8"), ([0.1, np.nan], "float32"), ([], "float64")):
         packed = json.loads(json.dumps(encoded(values, kind)))
         np.testing.assert_array_equal(decoded(packed), np.array(values, dtype=kind))
@@ -57,8 +57,8 @@ def test_numbers_come_back() -> None:
 def test_the_page_loads_nothing(kept: Results) -> None:
     text = page(kept)
     assert "default-src 'none'" in text
-    for foreign in ("http://", "https://", "src=", "@import", "url(", "fetch(", "import(", "{{"):
-        assert foreign not in text, foreign
+    for external in ("http://", "https://", "src=", "@import", "url(", "fetch(", "import(", "{{"):
+        assert external not in text, external
     assert page(kept) == text
 
 
@@ -85,7 +85,7 @@ def test_the_page_holds_the_map_and_the_path(kept: Results) -> None:
     assert (poses[:, :, 3] < box[1]).all()
 
 
-def test_the_page_holds_what_happened_to_every_frame(kept: Results) -> None:
+def test_the_page_holds_the_state_of_every_frame(kept: Results) -> None:
     data = data_of(page(kept))
     frames = data["frames"]
     assert decoded(frames["index"]).tolist() == list(range(30))
@@ -100,7 +100,7 @@ def test_the_page_holds_what_happened_to_every_frame(kept: Results) -> None:
     np.testing.assert_allclose(corners[[0, 1, 3], :2] / corners[2, :2], [[-1, -1], [1, -1], [-1, 1]])
 
 
-def test_with_ground_truth_lengths_are_meters_and_errors_known(kept: Results) -> None:
+def test_with_ground_truth_the_page_has_meters_and_errors(kept: Results) -> None:
     T_wc = kept.trajectory.T_wc.clone()
     T_wc[:, :3, 3] = 2 * T_wc[:, :3, 3] + 1e6  # far away, as in a map of a country
     T_wc[4, 1, 3] += 0.1
@@ -132,7 +132,7 @@ def test_the_path_is_broken_where_poses_are_missing(kept: Results) -> None:
     assert submap["path_length"] == pytest.approx(float(steps.sum() - steps[2]), rel=1e-6)
 
 
-def test_a_map_that_has_seen_no_image_has_no_colors(kept: Results) -> None:
+def test_a_map_without_images_has_no_colors(kept: Results) -> None:
     kept.map.points["colors"][:] = 0
     (submap,) = data_of(page(kept))["submaps"]
     assert submap["colors"]["data"] == ""
@@ -155,7 +155,7 @@ def test_large_maps_and_long_runs_are_thinned(kept: Results, monkeypatch: pytest
     np.testing.assert_allclose(array(submap["poses"], 3, 4), poses, atol=1e-5)
 
 
-def test_a_page_has_a_largest_size(kept: Results) -> None:
+def test_the_size_of_a_page_is_bounded(kept: Results) -> None:
     """Any number of points and of frames fits."""
     count, frames = 200_000, 40_000
     many = kept.map.points
@@ -168,7 +168,7 @@ def test_a_page_has_a_largest_size(kept: Results) -> None:
     assert len(page(long).encode()) < MAX_BYTES
 
 
-def test_every_world_with_poses_is_there_the_main_one_first(tmp_path: Path, two: Run) -> None:
+def test_every_submap_with_poses_is_shown_the_main_one_first(tmp_path: Path, two: Run) -> None:
     write(two, tmp_path)
     submaps = data_of(page(read_results(tmp_path)))["submaps"]
     assert [submap["name"] for submap in submaps] == ["0, the main one", "3"]
@@ -176,7 +176,7 @@ def test_every_world_with_poses_is_there_the_main_one_first(tmp_path: Path, two:
     assert decoded(submaps[1]["keyframe"]).tolist() == [18]
 
 
-def test_without_a_map_the_page_says_why(tmp_path: Path, run: Run) -> None:
+def test_without_a_map_the_page_gives_the_reason(tmp_path: Path, run: Run) -> None:
     why = "no map was initialized: </script> & <b>"
     write(replace(run, submaps=(), failure=why), tmp_path)
     text = write_view(read_results(tmp_path), tmp_path).read_text()
@@ -206,7 +206,7 @@ def browse(path: Path, *arguments: str, at: str = "") -> str:
     return done.stdout
 
 
-def test_a_browser_shows_the_frame_that_is_asked_for(tmp_path: Path, kept: Results) -> None:
+def test_a_browser_shows_the_selected_frame(tmp_path: Path, kept: Results) -> None:
     dom = browse(write_view(kept, tmp_path), "--dump-dom", at="#frame=19")
     (ready,) = re.findall(r'data-ready="([^"]*)"', dom)
     assert ready == "frame 19 · 0.63 s · lost · no pose here · few matches: 8, &quot;20&quot; are needed"
@@ -226,7 +226,7 @@ def test_a_browser_draws_the_points_in_their_colors(tmp_path: Path, kept: Result
     assert middle < 0.47 * len(green), "what the strip of frames leaves has another middle than the window"
 
 
-def test_a_browser_says_why_there_is_no_map(tmp_path: Path, run: Run) -> None:
+def test_a_browser_shows_the_reason_for_no_map(tmp_path: Path, run: Run) -> None:
     write(replace(run, submaps=(), failure="the camera <i>stands</i> still"), tmp_path)
     dom = browse(write_view(read_results(tmp_path), tmp_path), "--dump-dom")
     assert 'role="alert">the camera &lt;i&gt;stands&lt;/i&gt; still<' in dom

@@ -76,7 +76,7 @@ def test_tiles_do_not_change_the_answer(bundle_scene, monkeypatch):
         torch.testing.assert_close(one.points_w, other.points_w)
 
 
-def test_tiles_are_lower_where_many_frames_see_the_same(monkeypatch):
+def test_tiles_are_smaller_where_many_frames_share_points(monkeypatch):
     monkeypatch.setattr(schur, "_MANY_FRAMES", 4)
     for frames, height in ((4, schur._TILE_POINTS), (5, schur._TILE_POINTS_OF_MANY)):
         slots = torch.arange(frames).repeat_interleave(1000)
@@ -105,7 +105,7 @@ def test_same_input_same_bytes(bundle_scene):
     assert torch.equal(first.points_w, second.points_w)
 
 
-def test_what_is_fixed_stays(bundle_scene):
+def test_fixed_parameters_do_not_change(bundle_scene):
     scene = bundle_scene()
     mask = torch.zeros(5, dtype=torch.bool)
     mask[[1, 3]] = True
@@ -173,7 +173,7 @@ def test_two_maps_without_a_common_point_are_not_determined(bundle_scene):
     assert (pixels.grad == 0).all()
 
 
-def test_broken_observations_and_lonely_rows_do_not_count(bundle_scene):
+def test_invalid_observations_and_unobserved_rows_are_ignored(bundle_scene):
     scene = bundle_scene(frames=6, points=30)
     problem = scene.problem
     T_cw = torch.cat((problem.T_cw, problem.T_cw[:1], torch.full((1, 4, 4), torch.nan).double()))
@@ -313,7 +313,7 @@ def test_dtype_and_device_come_from_the_inputs(bundle_scene, dtype, device):
     torch.testing.assert_close(solution.T_cw.cpu().double(), scene.T_cw, atol=0.03, rtol=0)
 
 
-def test_wrong_input_is_named(bundle_scene):
+def test_invalid_input_is_rejected_by_name(bundle_scene):
     problem = bundle_scene().problem
     with pytest.raises(ValueError, match=r"frame_index must lie in 0 ... 4"):
         bundle_adjust(replace(problem, frame_index=problem.frame_index + 1))

@@ -48,7 +48,7 @@ def test_every_camera_is_found(bundle_scene, directions):
     assert solution.covariance().camera.shape == (size, size)
 
 
-def test_two_equal_cameras_are_one(bundle_scene, model):
+def test_two_equal_cameras_give_the_result_of_one(bundle_scene, model):
     problem = bundle_scene(model=model).problem
     index = torch.tensor([0, 1, 0, 1, 1])
     cameras = problem.camera.with_params(problem.camera.params.expand(2, -1))
@@ -72,7 +72,7 @@ def pose_prior(problem: BundleProblem, T_cw: torch.Tensor, weights: list[float])
     return PosePrior(T_cw, torch.tensor(weights, dtype=torch.float64)[:, None, None] * eye)
 
 
-def test_a_strong_prior_is_a_fixed_frame(bundle_scene):
+def test_a_strong_prior_acts_like_a_fixed_frame(bundle_scene):
     """And one without information is none."""
     problem = bundle_scene(frames=5, points=40).problem
     fixed = bundle_adjust(replace(problem, fixed_frames=(0, 1, 3)), **CONVERGED)
@@ -127,7 +127,7 @@ def test_a_prior_weighs_against_pixels(bundle_scene):
     torch.testing.assert_close(solution.cost, sum(costs).detach())
 
 
-def test_a_frame_that_sees_too_little_has_its_prior(bundle_scene):
+def test_a_frame_with_too_few_observations_stays_at_its_prior(bundle_scene):
     problem = bundle_scene(frames=5, points=30, noise=0.0).problem
     T_cw = torch.cat((problem.T_cw, problem.T_cw[-1:]))
     expected = se3_exp(torch.tensor([0.1, 0, 0, 0, 0.1, 0], dtype=torch.float64)) @ T_cw
@@ -141,7 +141,7 @@ def test_a_frame_that_sees_too_little_has_its_prior(bundle_scene):
     )
 
 
-def test_a_camera_between_its_prior_and_the_pixels(bundle_scene):
+def test_the_camera_lies_between_its_prior_and_the_data(bundle_scene):
     problem = bundle_scene(frames=8, points=80, noise=0.3).problem
     mean = problem.camera.params + torch.tensor([10.0, 10.0, 0.0, 0.0], dtype=torch.float64)
     found = []

@@ -75,7 +75,7 @@ def test_both_backends_of_the_dense_formulation_agree(
 
 @pytest.mark.parametrize("weights", ["none", "numbers", "matrices"])
 @pytest.mark.parametrize("fixed", [(0, 1), (0,), (3, 1), ()])
-def test_it_finds_what_bundle_adjust_finds(bundle_scene, fixed, weights) -> None:
+def test_it_reaches_the_solution_of_bundle_adjust(bundle_scene, fixed, weights) -> None:
     """Whatever is fixed: what that leaves open stays where it is, in the same sense."""
     problem = astray(bundle_scene(frames=6, points=60, fixed_frames=fixed).problem)
     problem = replace(problem, weights=weights_of(problem, weights))
@@ -86,7 +86,7 @@ def test_it_finds_what_bundle_adjust_finds(bundle_scene, fixed, weights) -> None
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])
-def test_its_steps_are_those_of_bundle_adjust(bundle_scene, iterations) -> None:
+def test_its_steps_equal_those_of_bundle_adjust(bundle_scene, iterations) -> None:
     """One by one, without a kernel's curvature at first and then with it."""
     problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     found, wanted = both(problem, iterations, 1e-14)
@@ -94,7 +94,7 @@ def test_its_steps_are_those_of_bundle_adjust(bundle_scene, iterations) -> None:
     assert_same(found, wanted, atol=1e-9)
 
 
-def test_it_stops_where_steps_promise_little(bundle_scene) -> None:
+def test_it_stops_when_the_predicted_decrease_is_small(bundle_scene) -> None:
     problem = astray(bundle_scene(frames=6, points=60).problem)
     found, wanted = both(problem, 30, 1e-3)
     exact, _ = both(problem)
@@ -102,7 +102,7 @@ def test_it_stops_where_steps_promise_little(bundle_scene) -> None:
     assert exact.cost < found.cost < 1.001 * exact.cost
 
 
-def test_what_steps_promise_is_what_bundle_adjust_says(bundle_scene) -> None:
+def test_the_predicted_decrease_equals_that_of_bundle_adjust(bundle_scene) -> None:
     """So that both stop together, whatever the tolerance."""
     problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     costs = set()
@@ -113,7 +113,7 @@ def test_what_steps_promise_is_what_bundle_adjust_says(bundle_scene) -> None:
     assert len(costs) > 4
 
 
-def test_a_distortion_is_passed_once(bundle_scene, model) -> None:
+def test_distortion_is_linearized_at_the_keypoint(bundle_scene, model) -> None:
     """Errors of pixels are small enough for the slope at the keypoint."""
     problem = bundle_scene(frames=6, points=80, model=model).problem
     found, wanted = both(problem)
@@ -122,7 +122,7 @@ def test_a_distortion_is_passed_once(bundle_scene, model) -> None:
     assert off < (1e-7 if model == "pinhole" else 0.02 * moved)
 
 
-def test_points_behind_a_camera_pull_nowhere(bundle_scene) -> None:
+def test_points_behind_a_camera_have_no_gradient(bundle_scene) -> None:
     scene = bundle_scene(frames=6, points=60, noise=0.1)
     points_w = scene.problem.points_w.clone()
     points_w[:3, 2] = -4.0
@@ -133,10 +133,10 @@ def test_points_behind_a_camera_pull_nowhere(bundle_scene) -> None:
     assert float(se3_log(found.T_cw @ se3_inverse(scene.T_cw)).norm(dim=-1).max()) < 0.01
 
 
-def test_frames_and_points_that_nobody_sees_stay(bundle_scene) -> None:
+def test_unobserved_frames_and_points_do_not_move(bundle_scene) -> None:
     problem = bundle_scene(frames=7, points=50).problem
-    nobody = torch.tensor([11, 49])
-    seen = (problem.frame_index != 4) & ~torch.isin(problem.point_index, nobody)
+    unobserved = torch.tensor([11, 49])
+    seen = (problem.frame_index != 4) & ~torch.isin(problem.point_index, unobserved)
     problem = replace(
         problem,
         frame_index=problem.frame_index[seen],
@@ -146,15 +146,15 @@ def test_frames_and_points_that_nobody_sees_stay(bundle_scene) -> None:
     found, wanted = both(problem)
     assert_same(found, wanted)
     assert torch.equal(found.T_cw[4], problem.T_cw[4])
-    assert torch.equal(found.points_w[nobody], problem.points_w[nobody])
+    assert torch.equal(found.points_w[unobserved], problem.points_w[unobserved])
 
 
-def test_points_alone_are_adjusted_too(bundle_scene) -> None:
+def test_points_alone_can_be_adjusted(bundle_scene) -> None:
     found, wanted = both(bundle_scene(frames=4, points=20, fixed_frames=(0, 1, 2, 3)).problem)
     assert_same(found, wanted)
 
 
-def test_the_order_of_what_is_given_does_not_matter(bundle_scene) -> None:
+def test_the_order_of_the_inputs_does_not_matter(bundle_scene) -> None:
     problem = astray(bundle_scene(frames=6, points=60).problem)
     order = torch.randperm(len(problem.pixels), generator=torch.Generator().manual_seed(0))
     shuffled = replace(
@@ -168,7 +168,7 @@ def test_the_order_of_what_is_given_does_not_matter(bundle_scene) -> None:
     torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
 
 
-def test_exact_observations_leave_nothing(bundle_scene) -> None:
+def test_exact_observations_leave_no_residual(bundle_scene) -> None:
     scene = bundle_scene(noise=0.0)
     found = bundle_adjust_numpy(scene.problem, SCALE, 20, 1e-8)
     assert found.cost < 1e-12
@@ -177,7 +177,7 @@ def test_exact_observations_leave_nothing(bundle_scene) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("frame_index", 5), ("point_index", 30)])
 @pytest.mark.parametrize("wrong", [-1, 30])
-def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong) -> None:
+def test_an_index_out_of_range_is_an_error(bundle_scene, name, size, wrong) -> None:
     problem = bundle_scene().problem
     index = getattr(problem, name).clone()
     index[3] = wrong
@@ -186,7 +186,7 @@ def test_an_index_that_does_not_fit_is_an_error(bundle_scene, name, size, wrong)
 
 
 @pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
-def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
+def test_unsupported_problems_are_an_error(bundle_scene, name) -> None:
     problem = bundle_scene().problem
     rows = torch.zeros(len(problem.T_cw), dtype=torch.int64)
     given = {"mask": problem.frame_index > 0, "camera_index": rows, "fixed_points": rows[:1]}
@@ -200,7 +200,7 @@ def test_what_it_does_not_take_is_an_error(bundle_scene, name) -> None:
         bundle_adjust_numpy(problem, SCALE, 1, 1e-6)
 
 
-def test_the_type_of_the_inputs_is_kept(bundle_scene, device) -> None:
+def test_the_dtype_of_the_inputs_is_kept(bundle_scene, device) -> None:
     problem = bundle_scene().problem
     single = BundleProblem(
         *(tensor.to(device, torch.float32) for tensor in (problem.T_cw, problem.points_w)),

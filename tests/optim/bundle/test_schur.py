@@ -60,13 +60,13 @@ def flat(tangent):
     return torch.cat((tangent.frames.flatten(), tangent.points.flatten(), tangent.camera))
 
 
-def test_solves_the_dense_system(system):
+def test_schur_complement_solves_the_dense_system(system):
     equations, dense, gradient = system
     solution = equations.factorized().solve(equations.gradient)
     torch.testing.assert_close(flat(solution), torch.linalg.solve(dense, gradient))
 
 
-def test_damping_grows_the_diagonal(system):
+def test_damping_increases_the_diagonal(system):
     equations, dense, gradient = system
     damping = torch.tensor([0.3], dtype=torch.float64)
     damped = dense + torch.diag(0.3 * dense.diagonal())
@@ -87,7 +87,7 @@ def test_marginals_are_blocks_of_the_inverse(system):
     torch.testing.assert_close(marginals.camera, inverse[-2:, -2:])
 
 
-def test_a_singular_system_is_flagged_and_solved_by_zero(system):
+def test_a_singular_system_is_flagged_and_has_a_zero_solution(system):
     equations, _, _ = system
     fields = vars(equations) | {"frames": torch.zeros_like(equations.frames)}
     factorized = NormalEquations(**fields).factorized()

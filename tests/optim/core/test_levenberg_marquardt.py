@@ -41,7 +41,7 @@ class Rosenbrock:
 STARTS = torch.tensor([[-1.2, 1.0], [2.0, -3.0], [1.0, 1.0]], dtype=torch.float64)
 
 
-def test_finds_the_minimum_and_reports():
+def test_the_minimum_is_found_and_reported():
     model, report = minimize_batch(Rosenbrock(3), STARTS, iterations=60, tolerance=1e-14)
     torch.testing.assert_close(model.x, torch.ones_like(STARTS))
     assert report.converged.all()
@@ -50,7 +50,7 @@ def test_finds_the_minimum_and_reports():
     assert (report.iterations < 60).all()
 
 
-def test_elements_do_not_see_each_other():
+def test_elements_of_a_batch_are_independent():
     together, report = minimize_batch(Rosenbrock(3), STARTS, iterations=7, tolerance=1e-14)
     for row in range(3):
         alone, one = minimize_batch(Rosenbrock(1), STARTS[row : row + 1], iterations=7, tolerance=1e-14)
@@ -64,7 +64,7 @@ def test_cost_never_rises():
         assert (after <= before * (1 + 1e-12)).all()
 
 
-def test_what_is_not_solvable_stays():
+def test_unsolvable_elements_stay_at_their_start():
     problem = Rosenbrock(3)
     problem.solvable = torch.tensor([True, False, True])
     model, report = minimize_batch(problem, STARTS, iterations=60, tolerance=1e-14)
@@ -72,9 +72,9 @@ def test_what_is_not_solvable_stays():
     assert report.iterations[1] == 0
 
 
-def test_tells_its_progress_before_each_iteration():
-    told = []
+def test_progress_is_reported_before_each_iteration():
+    reported = []
     _, report = minimize_batch(
-        Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: told.append(now)
+        Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: reported.append(now)
     )
-    assert told == [(iteration, 60) for iteration in range(int(report.iterations.max()))]
+    assert reported == [(iteration, 60) for iteration in range(int(report.iterations.max()))]

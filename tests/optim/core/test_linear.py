@@ -26,7 +26,7 @@ def test_definiteness_does_not_depend_on_units():
     assert factorize(units[:, None] * matrix * units).definite
 
 
-def test_gradients_stay_finite_beside_a_singular_matrix():
+def test_gradients_stay_finite_next_to_a_singular_matrix():
     matrices = torch.stack((torch.eye(2), torch.zeros(2, 2))).double().requires_grad_()
     solution = factorize(matrices, strict=False).solve(torch.ones(2, 2, 1, dtype=torch.float64))
     solution.sum().backward()

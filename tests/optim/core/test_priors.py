@@ -13,7 +13,7 @@ def make_prior(generator):
     return PosePrior(T_cw, A @ A.mT), offset @ T_cw
 
 
-def test_error_vanishes_at_the_prior_and_its_jacobian_is_right(generator):
+def test_the_prior_error_vanishes_at_the_prior_and_has_the_right_jacobian(generator):
     prior, T_cw = make_prior(generator)
     error, _ = prior_error(prior, prior.T_cw)
     torch.testing.assert_close(error, torch.zeros_like(error), atol=1e-12, rtol=0)
@@ -24,7 +24,7 @@ def test_error_vanishes_at_the_prior_and_its_jacobian_is_right(generator):
     torch.testing.assert_close(J, expected[rows, :, rows])
 
 
-def test_expansion_and_exact_hessian_against_autograd(generator):
+def test_expansion_and_exact_hessian_agree_with_autograd(generator):
     prior, T_cw = make_prior(generator)
     zero = torch.zeros(3, 6, dtype=torch.float64)
 

@@ -28,7 +28,7 @@ def make_observations(make_camera, generator):
 
 
 @pytest.mark.parametrize("free_camera", [False, True])
-def test_jacobians_against_autograd(make_observations, model, free_camera):
+def test_jacobians_agree_with_autograd(make_observations, model, free_camera):
     observations, points_c = make_observations(model)
     lin = linearize(observations, points_c, free_camera)
 
@@ -45,7 +45,7 @@ def test_jacobians_against_autograd(make_observations, model, free_camera):
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure"])
 @pytest.mark.parametrize("free_camera", [False, True])
-def test_exact_expansion_against_autograd(make_observations, model, kernel, free_camera):
+def test_the_exact_expansion_agrees_with_autograd(make_observations, model, kernel, free_camera):
     observations, points_c = make_observations(model, kernel)
     expansion = exact_expansion(observations, points_c, free_camera)
     for row in range(len(points_c)):
@@ -81,7 +81,7 @@ def test_gauss_newton_expansion_is_semi_definite_and_exact_for_small_residuals(m
     torch.testing.assert_close(expansion.hessian.movedim(-1, 0), exact.hessian, atol=1e-4, rtol=1e-6)
 
 
-def test_a_point_behind_the_camera_costs_much_and_pulls_nowhere(make_observations, model, dtype, device):
+def test_a_point_behind_the_camera_has_a_high_cost_without_gradient(make_observations, model, dtype, device):
     observations, points_c = make_observations(model, "none")
     camera = observations.camera.to(device).to(dtype)
     pixels, weights = observations.pixels.to(device, dtype), torch.ones(6, dtype=dtype, device=device)
@@ -96,7 +96,7 @@ def test_a_point_behind_the_camera_costs_much_and_pulls_nowhere(make_observation
     assert expansion.hessian.dtype == dtype
 
 
-def test_usable_leaves_out_what_is_not_finite_or_negative():
+def test_usable_excludes_non_finite_and_negative_rows():
     pixels, points, weights = torch.zeros(5, 2), torch.zeros(5, 3), torch.ones(5)
     pixels[0, 1], points[1, 2], weights[2], weights[3] = torch.nan, torch.inf, torch.nan, -1
     assert usable(pixels, points, weights).tolist() == [False, False, False, False, True]

@@ -28,7 +28,7 @@ def test_pull_back_is_the_gradient_in_the_tangent(generator):
     torch.testing.assert_close(pull_back(T, G), expected)
 
 
-def test_motion_of_points(generator):
+def test_points_move_by_the_tangent(generator):
     points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
     direction = torch.randn(6, generator=generator, dtype=torch.float64)
     eye = torch.eye(4, dtype=torch.float64)

@@ -30,7 +30,7 @@ def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseObser
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
-def test_gradient_is_that_of_the_cost(camera: Camera, generator: torch.Generator) -> None:
+def test_the_gradient_agrees_with_autograd(camera: Camera, generator: torch.Generator) -> None:
     T_cw, observations = scene(camera, generator)
     xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
     (expected,) = torch.autograd.grad(observations.expand(retract(T_cw, xi), NONE).cost.sum(), xi)
@@ -38,7 +38,7 @@ def test_gradient_is_that_of_the_cost(camera: Camera, generator: torch.Generator
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
-def test_curvature_is_that_of_linear_residuals(camera: Camera, generator: torch.Generator) -> None:
+def test_the_curvature_is_exact_for_linear_residuals(camera: Camera, generator: torch.Generator) -> None:
     """Hessian and curvature term make the Hessian of the cost, with the residual in its place linear in xi."""
     T_cw, observations = scene(camera, generator)
     inputs = observations.observations
@@ -63,7 +63,7 @@ def test_curvature_is_that_of_linear_residuals(camera: Camera, generator: torch.
     assert (torch.linalg.eigvalsh(found.curvature_term) < 1e-6).all()
 
 
-def test_curvature_is_added_where_it_is_asked_for(generator: torch.Generator) -> None:
+def test_second_order_curvature_is_added_on_request(generator: torch.Generator) -> None:
     T_cw, observations = scene(PINHOLE, generator)
     everywhere = observations.expand(T_cw, ALL)
     somewhere = observations.expand(T_cw, torch.tensor([True, False]))
@@ -72,7 +72,7 @@ def test_curvature_is_added_where_it_is_asked_for(generator: torch.Generator) ->
     assert (observations.expand(T_cw, NONE).curvature_term == 0).all()
 
 
-def test_the_short_way_for_pinhole_cameras_is_the_general_one(generator: torch.Generator) -> None:
+def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Generator) -> None:
     T_cw, short = scene(PINHOLE, generator)
     inputs = short.observations
     straight = Observations(inputs.pixels, inputs.weights, STRAIGHT, inputs.kernel, inputs.scale)

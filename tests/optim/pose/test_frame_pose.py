@@ -23,7 +23,7 @@ def apart(T_cw: Tensor, other: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("kernel", ["cauchy", "huber"])
-def test_it_finds_what_refine_pose_finds(pose_scene, kernel, model):
+def test_it_reaches_the_pose_of_refine_pose(pose_scene, kernel, model):
     far = 0.2 if model == "pinhole" else 0.0  # the first order of a distortion says nothing so far away
     scene = pose_scene(batch=1, count=200, outliers=far, model=model, perturbation=0.01)
     noise = KeypointNoise.of(1 + torch.arange(200).double() % 3, None)
@@ -49,7 +49,7 @@ def test_it_finds_what_refine_pose_finds(pose_scene, kernel, model):
     )
 
 
-def test_errors_and_depths_are_those_at_the_pose(pose_scene):
+def test_errors_and_depths_are_evaluated_at_the_pose(pose_scene):
     scene = pose_scene(batch=1, outliers=0.2)
     noise = KeypointNoise.of(torch.full((40,), 2.0).double(), None)
     linearization = problem_of(scene, noise).linearize(scene.T_cw[0])
@@ -60,7 +60,7 @@ def test_errors_and_depths_are_those_at_the_pose(pose_scene):
     assert torch.equal(linearization.T_cw, scene.T_cw[0])
 
 
-def test_the_rows_are_the_derivatives_of_the_errors(pose_scene, model):
+def test_the_jacobian_agrees_with_autograd(pose_scene, model):
     scene = pose_scene(batch=1, model=model)
     problem, step = problem_of(scene), 1e-6
     rows = torch.from_numpy(problem.linearize(scene.T_cw[0]).rows)
@@ -72,7 +72,7 @@ def test_the_rows_are_the_derivatives_of_the_errors(pose_scene, model):
         torch.testing.assert_close(slope, rows[axis], rtol=1e-5, atol=1e-3)
 
 
-def test_points_behind_the_camera_fit_nothing_and_pull_nowhere(pose_scene):
+def test_points_behind_the_camera_are_outliers_without_gradient(pose_scene):
     scene = pose_scene(batch=1, noise=0.0)
     points_w = scene.points_w.clone()
     points_w[0, :5] = se3_inverse(scene.T_cw[0])[:3, 3] - 0.5 * (
@@ -86,7 +86,7 @@ def test_points_behind_the_camera_fit_nothing_and_pull_nowhere(pose_scene):
 
 
 @pytest.mark.parametrize("usable", [0, 2])
-def test_too_few_points_leave_the_pose_where_it_is(pose_scene, usable):
+def test_too_few_points_leave_the_pose_unchanged(pose_scene, usable):
     scene = pose_scene(batch=1)
     problem = problem_of(scene)
     found = problem.minimize(problem.linearize(scene.start[0]), (torch.arange(40) < usable).double(), "huber")

@@ -28,7 +28,7 @@ def test_exact_matches_give_the_exact_pose(pose_scene, model):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2])
-def test_what_is_wrong_does_not_move_it(pose_scene, share):
+def test_outliers_do_not_move_the_pose(pose_scene, share):
     scene = pose_scene(batch=1, count=100, noise=0.0, outliers=share, perturbation=0.01)
     assert off(found(scene, scene.start[0]), scene) < 1e-6
 
@@ -41,7 +41,7 @@ def test_a_majority_must_agree(pose_scene, wrong, is_found):
     assert (found(scene, scene.T_cw[0]) is not None) is is_found
 
 
-def test_agreeing_is_to_the_threshold(pose_scene):
+def test_inliers_are_within_the_threshold(pose_scene):
     scene = pose_scene(batch=1, count=100)
     scene.pixels[0, :30, 0] += THRESHOLD * torch.tensor([1.0, -1.0]).repeat(15) * 0.9
     assert found(scene, scene.T_cw[0]) is not None
@@ -49,7 +49,7 @@ def test_agreeing_is_to_the_threshold(pose_scene):
     assert found(scene, scene.T_cw[0]) is None
 
 
-def test_it_is_not_drawn_to_the_prediction(pose_scene):
+def test_the_pose_is_not_biased_towards_the_prediction(pose_scene):
     """From either side the same pose, though a quarter is wrong."""
     scene = pose_scene(batch=1, count=100, outliers=0.2, noise=0.5)
     step = se3_exp(torch.tensor([0.02, -0.01, 0.02, 0.01, -0.01, 0.0], dtype=torch.float64))

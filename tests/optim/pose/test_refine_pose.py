@@ -29,7 +29,7 @@ def test_robust_kernels_survive_outliers(pose_scene, kernel):
     assert (errors(refined.T_cw, scene.T_cw) < 0.3 * errors(plain.T_cw, scene.T_cw)).all()
 
 
-def test_the_gradient_of_the_cost_vanishes_at_the_answer(pose_scene, model):
+def test_the_gradient_of_the_cost_vanishes_at_the_solution(pose_scene, model):
     scene = pose_scene(outliers=0.2, model=model)
     refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, scale=2.0, **CONVERGED)
     xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
@@ -65,7 +65,7 @@ def test_same_input_same_bytes_with_and_without_gradient(pose_scene):
     assert second.T_cw.requires_grad
 
 
-def test_masked_and_broken_rows_do_not_count(pose_scene):
+def test_masked_and_non_finite_rows_are_ignored(pose_scene):
     scene = pose_scene(count=40)
     mask = torch.arange(40).expand(2, 40) >= 5
     pixels, points, weights = scene.pixels.clone(), scene.points_w.clone(), torch.ones(2, 40).double()
@@ -87,7 +87,7 @@ def test_masked_and_broken_rows_do_not_count(pose_scene):
         assert (tensor.grad[:, 5:] != 0).any()
 
 
-def test_points_behind_the_camera_do_not_count(pose_scene):
+def test_points_behind_the_camera_are_ignored(pose_scene):
     scene = pose_scene(count=40)
     points = scene.points_w.clone()
     center = se3_inverse(scene.T_cw)[:, None, :3, 3]
@@ -100,7 +100,7 @@ def test_points_behind_the_camera_do_not_count(pose_scene):
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unroll", "truncated", "detached"])
-def test_failure_is_a_flag_and_no_gradient(pose_scene, backward):
+def test_failures_are_flagged_and_have_no_gradient(pose_scene, backward):
     scene = pose_scene(batch=5, count=20)
     points, start = scene.points_w.clone(), scene.start.clone()
     points[2] = points[2, :1]  # one point, twenty times
@@ -238,7 +238,7 @@ def test_dtype_and_device_come_from_the_inputs(pose_scene, dtype, device):
     assert errors(refined.T_cw.cpu().double(), scene.T_cw).max() < 0.02
 
 
-def test_wrong_input_is_named(pose_scene):
+def test_invalid_input_is_rejected_by_name(pose_scene):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"\(B, 4, 4\)"):
         refine_pose(scene.start[0], scene.points_w, scene.pixels, scene.camera)

@@ -90,7 +90,7 @@ def cost_of(graph: PoseGraph, S_cw: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, math.pi - 1e-6, 4.0])
 @pytest.mark.parametrize("sigma", [0.0, 1e-7, -0.7, 3.0])
-def test_left_jacobian_of_sim3(angle: float, sigma: float) -> None:
+def test_left_jacobian_of_sim3_agrees_with_autograd(angle: float, sigma: float) -> None:
     """Against the integral of exp(s ad) over s, as the corner of an exponential of twice the size."""
     xi = rotation_of(angle, sigma)
     at_zero = torch.zeros(7, dtype=torch.float64)
@@ -107,7 +107,7 @@ def test_left_jacobian_of_sim3(angle: float, sigma: float) -> None:
 @pytest.mark.parametrize("angle", [0.0, 0.5, math.pi - 1e-3])
 @pytest.mark.parametrize("sigma", [0.0, 2.5])
 @pytest.mark.parametrize("dims", [6, 7])
-def test_derivatives_of_an_edge_are_those_of_autograd(angle: float, sigma: float, dims: int) -> None:
+def test_derivatives_of_an_edge_agree_with_autograd(angle: float, sigma: float, dims: int) -> None:
     """Gradient and exact Hessian over both ends of one edge, for a large residual and a robust kernel."""
     S_cw = sim3_exp(torch.stack((rotation_of(1.0, 0.4), rotation_of(2.0, -0.3, seed=1))))
     S_ji = sim3_exp(-rotation_of(angle, sigma, seed=2)) @ S_cw[1] @ sim3_inverse(S_cw[0])
@@ -154,7 +154,7 @@ def test_exact_measurements_give_the_exact_nodes(with_scale: bool) -> None:
     assert (solution.cost < 1e-12).all()
 
 
-def test_known_answer_of_a_loop_in_log_scale() -> None:
+def test_a_loop_in_log_scale_has_the_known_solution() -> None:
     """Scale drift 0.3 around a loop of three equal edges: a third of it on each of them."""
     eye = torch.eye(4, dtype=torch.float64)
     S_ji = eye.repeat(3, 1, 1)
@@ -166,7 +166,7 @@ def test_known_answer_of_a_loop_in_log_scale() -> None:
     assert float(solution.cost) == pytest.approx(0.5 * 3 * 0.1**2)
 
 
-def test_weights_scale_the_identity_and_none_is_one() -> None:
+def test_a_scalar_weight_scales_the_identity_and_none_means_one() -> None:
     scene = make_scene()
     weights = torch.linspace(1, 5, len(scene.graph.edges), dtype=torch.float64)
     eye = torch.eye(7, dtype=torch.float64)
@@ -179,7 +179,7 @@ def test_weights_scale_the_identity_and_none_is_one() -> None:
 
 
 @pytest.mark.parametrize("with_scale", [True, False])
-def test_the_gradient_of_the_cost_vanishes_at_the_answer(with_scale: bool) -> None:
+def test_the_gradient_of_the_cost_vanishes_at_the_solution(with_scale: bool) -> None:
     scene = make_scene(with_scale=with_scale)
     dims = 7 if with_scale else 6
     solution = pose_graph_optimize(scene.graph, kernel="none", **CONVERGED)
@@ -203,7 +203,7 @@ def test_robust_kernels_survive_wrong_edges(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("with_scale", [True, False])
-def test_optimum_of_gtsam(with_scale: bool) -> None:
+def test_the_optimum_equals_that_of_gtsam(with_scale: bool) -> None:
     gtsam = pytest.importorskip("gtsam")
     scene = make_scene(nodes=30, batch=1, with_scale=with_scale)
     graph = scene.graph
@@ -241,7 +241,7 @@ def test_optimum_of_gtsam(with_scale: bool) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
-def test_optimum_of_scipy(kernel: str) -> None:
+def test_the_optimum_equals_that_of_scipy(kernel: str) -> None:
     optimize = pytest.importorskip("scipy.optimize")
     scene = make_scene(nodes=4, batch=1, outliers=1)
     graph = scene.graph
@@ -313,7 +313,7 @@ def test_backward_modes_agree_where_they_should(backward: str) -> None:
     assert bias < 1e-5 if backward == "unroll" else 1e-4 < bias < 1
 
 
-def test_what_is_not_joined_stays_and_has_no_gradient() -> None:
+def test_unconnected_nodes_stay_and_have_no_gradient() -> None:
     """Nodes 10 and 11 only see each other; node 9 is joined by an edge without weight, one that is NaN, one masked."""
     for backward in ("implicit", "unroll", "truncated", "detached"):
         scene = make_scene(batch=1)
@@ -345,7 +345,7 @@ def test_what_is_not_joined_stays_and_has_no_gradient() -> None:
             assert (gradient[~cut].flatten(1) if gradient.ndim > 1 else gradient[~cut]).abs().max() > 0
 
 
-def test_failure_is_a_flag_and_no_gradient() -> None:
+def test_failures_are_flagged_and_have_no_gradient() -> None:
     """Nothing fixed that is finite; information that leaves the position of node 3 open; nothing but masked edges."""
     scene = make_scene(nodes=6, batch=4)
     S_cw = scene.graph.S_cw.clone()
@@ -415,7 +415,7 @@ def test_order_and_direction_of_edges_do_not_matter() -> None:
         torch.testing.assert_close(other.cost, plain.cost)
 
 
-def test_two_measurements_of_one_pair_count_twice() -> None:
+def test_two_measurements_of_one_pair_both_count() -> None:
     scene = make_scene()
     graph = scene.graph
     doubled = replace(
@@ -430,7 +430,7 @@ def test_two_measurements_of_one_pair_count_twice() -> None:
     torch.testing.assert_close(one.cost, other.cost)
 
 
-def test_scales_stay_without_scale() -> None:
+def test_scales_stay_fixed_without_scale_estimation() -> None:
     scene = make_scene()
     graph = replace(scene.graph, information=None, with_scale=False)
     solution = pose_graph_optimize(graph)
@@ -496,7 +496,7 @@ def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch
     torch.testing.assert_close(solution.S_cw.cpu().double(), expected.S_cw, rtol=0, atol=1e-2)
 
 
-def test_wrong_input_is_named() -> None:
+def test_invalid_input_is_rejected_by_name() -> None:
     graph = make_scene().graph
     with pytest.raises(ValueError, match=r"\(E, 2\)"):
         pose_graph_optimize(replace(graph, edges=graph.edges[:, :1]))

@@ -69,11 +69,11 @@ def watched(
         yield view, cleared, by.observe(view, estimate(view, pose_now, agrees))
 
 
-def test_what_moves_is_found_when_two_looks_differ_and_then_left_out() -> None:
+def test_a_moving_object_is_detected_and_masked_out() -> None:
     by = watcher()
     for view, cleared, said in watched(by, [frame(index) for index in range(3 * EVERY)]):
         left_out = view.mask & ~cleared.mask
-        assert not (left_out & ~is_thing(view)).float().mean() > 0.02  # some of the scene is close beside it
+        assert not (left_out & ~is_thing(view)).float().mean() > 0.02  # some of the scene is next to it
         if view.index == EVERY:
             assert said.note == f"{int(said.note.split()[0])} keypoints move by themselves and are left out"
             assert 40 <= int(said.note.split()[0]) <= 75
@@ -84,7 +84,7 @@ def test_what_moves_is_found_when_two_looks_differ_and_then_left_out() -> None:
         assert not said.rejection
 
 
-def test_a_thing_that_stands_still_is_scene() -> None:
+def test_a_static_object_belongs_to_the_scene() -> None:
     by = watcher()
     for view, cleared, said in watched(by, [frame(index, speed=0.0) for index in range(3 * EVERY)]):
         assert said == Movement()
@@ -92,7 +92,7 @@ def test_a_thing_that_stands_still_is_scene() -> None:
 
 
 @pytest.mark.parametrize("depth", [0.6, 1.0, 20.0])
-def test_near_and_far_is_not_moving(depth: float) -> None:
+def test_depth_differences_are_no_motion(depth: float) -> None:
     """Whatever its depth, a point of the scene lies where a point of the scene can be."""
     other = Scene.of(60, seed=2, depth=depth, width=0.4 * depth)
     by = watcher()
@@ -112,7 +112,7 @@ def test_the_least_error_decides() -> None:
         assert bool(said.note) is found
 
 
-def test_fewer_than_the_least_number_of_matches_are_chance() -> None:
+def test_too_few_matches_are_no_object() -> None:
     few = Scene.of(19, seed=1, depth=2.0, width=0.8)
     for least, found in ((20, False), (15, True)):
         by = watcher(min_matches=least)
@@ -120,7 +120,7 @@ def test_fewer_than_the_least_number_of_matches_are_chance() -> None:
         assert bool(said.note) is found
 
 
-def test_strays_that_go_each_their_way_are_no_group() -> None:
+def test_outliers_without_common_motion_are_no_object() -> None:
     """Keypoints that jump about are wrong matches; of what misses the scene, half must move as one."""
     by = watcher()
     for index in range(2 * EVERY):
@@ -134,7 +134,7 @@ def test_strays_that_go_each_their_way_are_no_group() -> None:
         assert not by.observe(view, estimate(view, camera_at(index), torch.arange(50))).note
 
 
-def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
+def test_an_object_is_tracked_while_the_camera_is_lost() -> None:
     by = watcher()
     *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
     for index in range(2 * EVERY, 6 * EVERY):
@@ -144,7 +144,7 @@ def test_it_is_followed_where_nobody_knows_where_the_camera_is() -> None:
         assert (left_out & ~is_thing(view)).sum() < 0.2 * view.mask.sum()
 
 
-def test_it_is_given_up_when_it_was_not_seen_to_move_for_long() -> None:
+def test_an_object_is_dropped_when_it_has_not_moved_for_long() -> None:
     for limit, kept in ((2, False), (100, True)):
         by = watcher(max_unseen_frames=limit)
         *_, _ = watched(by, [frame(index) for index in range(EVERY + 1)])
@@ -153,14 +153,14 @@ def test_it_is_given_up_when_it_was_not_seen_to_move_for_long() -> None:
         assert bool((~cleared.mask & frame(index).mask).any()) is kept
 
 
-def test_it_is_given_up_when_it_has_gone() -> None:
+def test_an_object_is_dropped_when_it_disappears() -> None:
     by = watcher()
     *_, _ = watched(by, [frame(index) for index in range(2 * EVERY)])
     alone = SCENE.view(2 * EVERY, camera_at(2 * EVERY))
     assert torch.equal(by.mask_out(alone).mask, alone.mask)
 
 
-def test_what_has_more_of_the_image_than_the_map_is_not_left_out_but_doubted() -> None:
+def test_an_object_larger_than_the_map_makes_the_pose_uncertain() -> None:
     """The map followed the thing: the rest moves against it, in most of the image."""
     by = watcher()
     for index in range(EVERY + 1):
@@ -174,7 +174,7 @@ def test_what_has_more_of_the_image_than_the_map_is_not_left_out_but_doubted() -
     assert torch.equal(by.mask_out(view).mask, view.mask)
 
 
-def test_a_map_that_goes_over_to_what_was_known_to_move_is_doubted() -> None:
+def test_a_map_that_attaches_to_a_moving_object_is_uncertain() -> None:
     by = watcher()
     *_, _ = watched(by, [frame(index) for index in range(2 * EVERY + 1)])
     doubts = []
@@ -187,7 +187,7 @@ def test_a_map_that_goes_over_to_what_was_known_to_move_is_doubted() -> None:
     assert any(doubts)
 
 
-def test_where_most_of_the_image_moves_the_pose_is_doubted() -> None:
+def test_where_most_of_the_image_moves_the_pose_is_uncertain() -> None:
     by = watcher()
     *_, (view, _, said) = watched(by, [frame(index) for index in range(EVERY + 1)])
     assert not said.rejection
@@ -196,7 +196,7 @@ def test_where_most_of_the_image_moves_the_pose_is_doubted() -> None:
     assert not watcher(max_area_ratio=100.0).observe(view, estimate(view, camera_at(0), cell)).rejection
 
 
-def test_poses_of_two_worlds_are_not_compared() -> None:
+def test_poses_of_two_submaps_are_not_compared() -> None:
     by = watcher()
     for index in range(2 * EVERY):
         view = frame(index)

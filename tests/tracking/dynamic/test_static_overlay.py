@@ -55,7 +55,7 @@ def observed(by: StaticOverlayDetector, T_cw: Tensor, *, logo: bool = True, **op
     return [by.observe(view, T, 4.0) for view, T in zip(shown, T_cw, strict=True)]
 
 
-def test_a_logo_is_known_when_it_stayed_twice() -> None:
+def test_a_logo_is_detected_after_two_observations() -> None:
     by = overlay_detector()
     known = observed(by, turning(3))
     assert known[:2] == [0, 0]
@@ -68,7 +68,7 @@ def test_a_logo_is_known_when_it_stayed_twice() -> None:
     assert torch.equal(cleared.mask[:-LOGO] & scene, scene)
 
 
-def test_before_that_nothing_is_left_out() -> None:
+def test_before_detection_nothing_is_masked() -> None:
     by = overlay_detector()
     observed(by, turning(2))
     view = with_logo(SCENE.view(9, sideways(1)[0]))
@@ -79,7 +79,7 @@ def test_before_that_nothing_is_left_out() -> None:
     assert more.mask_out(view) is view
 
 
-def test_cells_around_a_keypoint_that_stays_are_covered_too() -> None:
+def test_cells_around_a_static_keypoint_are_masked() -> None:
     by = overlay_detector()
     observed(by, turning(3))
     corner = torch.tensor([[270.0, 190.0]]).double()  # cell 67 (268 to 272), 47 (188 to 192)
@@ -93,7 +93,7 @@ def test_cells_around_a_keypoint_that_stays_are_covered_too() -> None:
     assert by.covers(corner).all()
 
 
-def test_the_edge_of_the_image_is_covered_as_its_middle_is() -> None:
+def test_the_image_border_is_masked_like_its_center() -> None:
     corners = torch.tensor([[0.0, 0.0], [319.4, 0.0], [0.0, 239.4], [319.4, 239.4]] * 2).double()
     by = overlay_detector()
     by.add(corners)
@@ -104,32 +104,32 @@ def test_the_edge_of_the_image_is_covered_as_its_middle_is() -> None:
     assert not by.covers(inside + 9 * (torch.tensor([159.5, 119.5]) - inside).sign()).any()
 
 
-def test_a_scene_alone_makes_nothing_known() -> None:
+def test_a_scene_without_overlay_masks_nothing() -> None:
     by = overlay_detector()
     assert observed(by, turning(5), logo=False) == [0] * 5
     assert not by.covers(SCENE.view(0, pose()).keypoints).any()
 
 
-def test_a_camera_that_stands_proves_nothing() -> None:
+def test_a_static_camera_gives_no_evidence() -> None:
     by = overlay_detector()
     assert observed(by, turning(6, 0.0)) == [0] * 6
     assert observed(overlay_detector(), sideways(4, 0.4)) == [0] * 4  # what is far stays
 
 
-def test_small_steps_add_up_to_one_that_tells() -> None:
+def test_small_motions_accumulate_to_evidence() -> None:
     by = overlay_detector()
     known = observed(by, turning(31, STEP / 10))
     assert sum(known) > LOGO
     assert known[1:3] == [0] * 2
 
 
-def test_few_that_stay_are_chance() -> None:
+def test_few_static_keypoints_are_ignored() -> None:
     assert observed(overlay_detector(), turning(3), keypoints=8)[2] > 0
     by = overlay_detector()
     assert observed(by, turning(6), keypoints=7) == [0] * 6
 
 
-def test_chance_takes_back_what_is_not_known_yet() -> None:
+def test_weak_evidence_decays() -> None:
     """It stays once and is gone. Five frames later it is back, five later it stayed once more, then twice."""
     by = overlay_detector()
     T_cw = turning(14, step=0.04)
@@ -141,7 +141,7 @@ def test_chance_takes_back_what_is_not_known_yet() -> None:
     assert results[13] > LOGO
 
 
-def test_where_nothing_stayed_it_pauses() -> None:
+def test_detection_pauses_where_nothing_is_static() -> None:
     by = overlay_detector()
     T_cw = turning(8, step=0.04)
     looked = []
@@ -152,7 +152,7 @@ def test_where_nothing_stayed_it_pauses() -> None:
     assert looked == [True, True, False, False, False, False, True, False]
 
 
-def test_a_logo_may_wander_a_little() -> None:
+def test_a_logo_may_move_slightly() -> None:
     for shift, found in ((1.4, True), (1.6, False)):
         by = overlay_detector()
         T_cw = turning(3)
@@ -163,7 +163,7 @@ def test_a_logo_may_wander_a_little() -> None:
         assert (results[2] > 0) is found
 
 
-def test_another_session_or_world_is_not_compared() -> None:
+def test_frames_of_other_sessions_or_submaps_are_not_compared() -> None:
     by = overlay_detector()
     T_cw = turning(4)
     for index, T in enumerate(T_cw):
@@ -177,13 +177,13 @@ def test_another_session_or_world_is_not_compared() -> None:
 
 def test_most_of_the_image_must_have_moved() -> None:
     """By more than four pixels: a turn by a little less than a fiftieth, or more."""
-    for pixels, told in ((2.5, False), (4.4, True)):
+    for pixels, detected in ((2.5, False), (4.4, True)):
         by = overlay_detector()
         known = observed(by, torch.stack([pose(0, 0, 0, 0, pixels / 200.0 * index) for index in range(3)]))
-        assert (known[2] > 0) is told
+        assert (known[2] > 0) is detected
 
 
-def test_evidence_from_elsewhere_counts_as_much() -> None:
+def test_external_evidence_counts_equally() -> None:
     pixels = 40.0 + 10 * torch.arange(8, dtype=torch.float64)[:, None].expand(8, 2)
     for times, enough, known in ((1, 8, False), (2, 8, True), (2, 7, False)):
         by = overlay_detector()

@@ -48,14 +48,14 @@ def content_of(folder: Path) -> Files:
 @cache
 def images() -> dict[str, Files]:
     """An image of every kind that is read."""
-    colour = np.stack([picture(index) for index in range(3)], axis=-1)
+    color = np.stack([picture(index) for index in range(3)], axis=-1)
     found = {
         suffix: encoded(picture(1), f".{suffix}") for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm")
     }
     found |= {
-        "ppm": encoded(colour, ".ppm"),
-        "color.png": encoded(colour),
-        "color.jpg": encoded(colour, ".jpg"),
+        "ppm": encoded(color, ".ppm"),
+        "color.png": encoded(color),
+        "color.jpg": encoded(color, ".jpg"),
     }
     found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
     return {kind: {f"a.{kind}": content} for kind, content in found.items()}
