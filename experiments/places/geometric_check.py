@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from experiments.benchmarks.problems import match_pixels
 from experiments.places.images import lookalike_truth
-from torchslam.features import match
 from torchslam.geometry import Camera, estimate_relative_pose
 from torchslam.types import Features
 
@@ -26,12 +26,11 @@ def inliers_of_pairs(features: Features) -> Tensor:
     camera = Camera("pinhole", params, SIZE)
     for later, earlier in asked.nonzero().tolist():
         first, second = features[later : later + 1], features[earlier : earlier + 1]
-        matches = match(first, second)
-        rows = matches.mask[0]
-        if int(rows.sum()) < MIN_MATCHES:
+        pixels_1, pixels_2 = match_pixels(first, second)
+        if len(pixels_1) < MIN_MATCHES:
             continue
-        pixels_1 = first.keypoints[:, matches.indices_1[0, rows]].double()
-        pixels_2 = second.keypoints[:, matches.indices_2[0, rows]].double()
-        pose = estimate_relative_pose(pixels_1, pixels_2, camera, camera, THRESHOLD, max_samples=MAX_SAMPLES)
+        pose = estimate_relative_pose(
+            pixels_1[None], pixels_2[None], camera, camera, THRESHOLD, max_samples=MAX_SAMPLES
+        )
         inliers[later, earlier] = int(pose.inliers.sum())
     return inliers

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from experiments.common import table, write_between
+from experiments.common import table, timed, write_between
 from experiments.places import alternatives
 from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
 from torchslam.loop_closing import KeyframeDatabase
-from torchslam.loop_closing.global_descriptor import rendered_words
+from torchslam.loop_closing.keyframe_database import rendered_words
 from torchslam.types import Features
 
 HEADER = ["", "lookalike: AP, recall at precision 1, recall@1"]
@@ -133,20 +132,14 @@ def costs(features: Features) -> str:
         noise = (1 << torch.randint(0, 8, shape, generator=generator)).to(torch.uint8)
         noise = noise * (torch.rand(shape, generator=generator) < 0.3)
         descriptors, mask = features.descriptors[image] ^ noise, features.mask[image]
-        adding.append(_milliseconds(lambda k=key, d=descriptors, m=mask: memory.add(k, d, m)))  # type: ignore[misc]
+        adding.append(timed(lambda k=key, d=descriptors, m=mask: memory.add(k, d, m))[1])  # type: ignore[misc]
         if len(memory) in SIZES:
             asked = [features[image : image + 1] for image in range(1, 10 * QUERIES, 10)]
-            asking = [_milliseconds(lambda q=q: memory.query(q.descriptors[0], q.mask[0])) for q in asked]  # type: ignore[misc]
+            asking = [timed(lambda q=q: memory.query(q.descriptors[0], q.mask[0]))[1] for q in asked]  # type: ignore[misc]
             megabytes = sum(x.element_size() * x.nelement() for x in (memory._codes, memory._used)) / 1e6
             cells = (sorted(adding)[len(adding) // 2], min(asking), sorted(asking)[QUERIES // 2])
             rows.append([str(len(memory)), *(f"{cell:.1f}" for cell in cells), f"{megabytes:.0f}"])
     return table(["keyframes", "add (ms)", "query, quickest (ms)", "query, median (ms)", "memory (MB)"], rows)
-
-
-def _milliseconds(call: Callable[[], object]) -> float:
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
 
 
 def checks(features: Features, scores: Tensor) -> str:

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-import torchslam.loop_closing.global_descriptor
+import torchslam.loop_closing.keyframe_database
 from torchslam.data import open_sequence
 from torchslam.features import ORB, pack_bits
 from torchslam.features.matching.hamming import sign_products, spread_bits
@@ -25,7 +25,7 @@ ROUNDS = 8
 def main() -> None:
     torch.set_num_threads(1)
     words = k_majority(sample(rendered_descriptors(), DESCRIPTORS), NUM_WORDS, ROUNDS)
-    path = Path(torchslam.loop_closing.global_descriptor.__file__).parent / "words.safetensors"
+    path = Path(torchslam.loop_closing.keyframe_database.__file__).parent / "words.safetensors"
     save_file({"words": words}, path)
     print(f"{len(words)} words in {path}")
 

@@ -4,8 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.features.pyramid import plan_pyramid
-from torchslam.features.selection import (
+from torchslam.features.corners import (
     _falling,
     best_of_cells,
     plan_grid,
@@ -13,6 +12,7 @@ from torchslam.features.selection import (
     ranks_within,
     select_evenly,
 )
+from torchslam.features.pyramid import plan_pyramid
 
 CPU = torch.device("cpu")
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchslam.data import open_sequence
 from torchslam.features import ORB, hamming, pack_bits, unpack_bits
 from torchslam.loop_closing import KeyframeDatabase
-from torchslam.loop_closing.global_descriptor import binary, likeness, rendered_words, words_and_codes
+from torchslam.loop_closing.keyframe_database import binary, likeness, rendered_words, words_and_codes
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:

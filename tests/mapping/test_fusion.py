@@ -13,7 +13,7 @@ from torchslam.config import Config, load_config
 from torchslam.geometry import se3_inverse, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import NO_POINT, Map
-from torchslam.mapping.fusion import fuse, match_in_keyframes, merge_points
+from torchslam.mapping.new_points import fuse, match_in_keyframes, merge_points
 
 SCENE = Scene.of(200)
 ROWS = rows_of(SCENE)
@@ -29,7 +29,7 @@ def free(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
     everywhere = slam_map.points["times_observed"] == slam_map.num_keyframes
     at = torch.nonzero((table[keyframe] >= 0) & everywhere[table[keyframe].clamp(min=0)])[:count, 0]
     points = table[keyframe, at].clone()
-    slam_map.forget(torch.full_like(at, keyframe), at)
+    slam_map.remove_observations(torch.full_like(at, keyframe), at)
     return points, at
 
 
@@ -39,8 +39,8 @@ def double(slam_map: Map, keyframe: int, count: int) -> tuple[Tensor, Tensor]:
     doubles = slam_map.add_points(
         slam_map.positions_w[points], slam_map.points["descriptors"][points], keyframe
     )
-    slam_map.observe(keyframe, at, doubles)
-    slam_map.refresh(torch.arange(slam_map.num_keyframes))
+    slam_map.add_observations(keyframe, at, doubles)
+    slam_map.update_appearance(torch.arange(slam_map.num_keyframes))
     return points, doubles
 
 
@@ -60,7 +60,7 @@ def test_several_keyframes_at_once_equal_one_after_the_other() -> None:
         points, _ = free(here.map, 3, 6)
         double(here.map, 2, 6)
         free(here.map, 1, 9)
-    points = together.map.points_seen_by(torch.arange(4))
+    points = together.map.observed_points(torch.arange(4))
     found = match_in_keyframes(together.map, torch.tensor([3, 1, 2]), points, CAMERA, Config())
     one_by_one = [
         match_in_keyframes(apart.map, torch.tensor([k]), points, CAMERA, Config()) for k in (3, 1, 2)
@@ -73,7 +73,7 @@ def test_several_keyframes_at_once_equal_one_after_the_other() -> None:
 
 def test_an_observed_point_is_not_searched() -> None:
     here = submap()
-    seen = here.map.points_seen_by(torch.tensor([1]))
+    seen = here.map.observed_points(torch.tensor([1]))
     before = here.map.keyframes["point_ids"].clone()
     assert len(match_in_keyframes(here.map, torch.tensor([1]), seen, CAMERA, Config())[0]) == 0
     assert torch.equal(here.map.keyframes["point_ids"], before)
@@ -158,7 +158,7 @@ def observed(*times: int) -> Map:
     slam_map.add_points(scene.points_w, scene.descriptors, 0)
     for point, count in enumerate(times):
         for keyframe in range(count):
-            slam_map.observe(keyframe, torch.tensor([point]), torch.tensor([point]))
+            slam_map.add_observations(keyframe, torch.tensor([point]), torch.tensor([point]))
     return slam_map
 
 

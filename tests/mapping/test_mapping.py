@@ -14,15 +14,15 @@ from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import KeypointNoise, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
-from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all, adjust_local
 from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
-from torchslam.mapping.new_points import has_consistent_scale
+from torchslam.mapping.new_points import fuse, has_consistent_scale
 from torchslam.system.front_end import Simulated
 from torchslam.system.slam import SLAM
-from torchslam.tracking.correspondences import match_points, match_projected_points, project_points
+from torchslam.tracking.data_association import match_points
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, Rejection, TwoViewMap
@@ -178,9 +178,9 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
     doubles = slam.map.add_points(
         slam.map.positions_w[originals], slam.map.points["descriptors"][originals], keyframe
     )
-    slam.map.observe(keyframe, seen, doubles)
-    slam.map.refresh(torch.tensor([keyframe]))
-    fuse(slam.map, keyframe, slam.map.covisible(keyframe, 5, min_shared=5), slam.camera, CONFIG)
+    slam.map.add_observations(keyframe, seen, doubles)
+    slam.map.update_appearance(torch.tensor([keyframe]))
+    fuse(slam.map, keyframe, slam.map.covisible_keyframes(keyframe, 5, min_shared=5), slam.camera, CONFIG)
     assert torch.equal(slam.map.follow_merges(doubles), slam.map.follow_merges(originals))
 
 
@@ -293,6 +293,6 @@ def test_a_mapper_starts_with_two_covisible_keyframes() -> None:
     slam = SLAM(WALK.camera, CONFIG)
     slam_map = Map()
     first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
-    seen = [slam_map.points_seen_by(torch.tensor([k])) for k in (first, second)]
+    seen = [slam_map.observed_points(torch.tensor([k])) for k in (first, second)]
     assert torch.equal(*seen)
     assert len(seen[0]) == len(start.points_w)

@@ -16,8 +16,8 @@ from torchslam.system import state_machine as following
 from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import TentativeMapping
 from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking import pose_confirmation as probation
-from torchslam.tracking.dynamic.independent_motion import NOTHING
+from torchslam.tracking import pose_validation
+from torchslam.tracking.non_static import NOTHING
 from torchslam.types import Reason, Rejection
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -197,7 +197,7 @@ def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
 
 def test_the_number_of_tentative_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
-    monkeypatch.setattr(probation, "MAX_PENDING_FRAMES", 5)
+    monkeypatch.setattr(pose_validation, "MAX_PENDING_FRAMES", 5)
     walk = Leaving(arc(60)[:40], 34)
     slam = doubting(monkeypatch, range(22, 60))
     states = shown(slam, walk)

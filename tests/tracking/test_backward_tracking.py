@@ -15,8 +15,8 @@ from torchslam.config import Config, PoseValidationConfig
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, UnposedFrames, track_back
-from torchslam.tracking.pose_confirmation import PendingFrame
-from torchslam.tracking.provisional_map import ProvisionalMap
+from torchslam.tracking.initialization import ProvisionalMap
+from torchslam.tracking.pose_validation import PendingFrame
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 

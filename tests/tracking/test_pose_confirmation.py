@@ -9,7 +9,7 @@ from tests.map.simulated import estimate_at
 from tests.scene import Scene, pose
 from torchslam.config import Config, load_config
 from torchslam.map.atlas import TrackingState
-from torchslam.tracking.pose_confirmation import PoseConfirmation
+from torchslam.tracking.pose_validation import PoseConfirmation
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 
 SCENE = Scene.of(10)
@@ -121,7 +121,7 @@ def test_mapped_frames_need_as_many_certain_frames_as_were_uncertain() -> None:
 
 
 def test_the_number_of_pending_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchslam.tracking.pose_confirmation.MAX_PENDING_FRAMES", 3)
+    monkeypatch.setattr("torchslam.tracking.pose_validation.MAX_PENDING_FRAMES", 3)
     confirmation = PoseConfirmation(Config())
     for index in range(3):
         assert not confirmation.is_full

@@ -11,8 +11,13 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
-from torchslam.tracking.initialization import Initializer
-from torchslam.tracking.provisional_map import CHECK_INTERVAL, MIN_SUPPORT_RATIO, ProvisionalMap, support
+from torchslam.tracking.initialization import (
+    CHECK_INTERVAL,
+    MIN_SUPPORT_RATIO,
+    Initializer,
+    ProvisionalMap,
+    support,
+)
 from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)

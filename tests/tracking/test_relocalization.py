@@ -8,11 +8,8 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.map.atlas import Submap
-from torchslam.tracking.correspondences import (
-    match_keyframe,
-    match_points,
-    max_distance,
-)
+from torchslam.tracking.data_association import match_keyframe, match_points
+from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.tracking.tracker import Tracker
 

@@ -13,8 +13,7 @@ from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, side
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.map.atlas import Submap
-from torchslam.tracking.correspondences import Projected, project_points
-from torchslam.tracking.match_selection import (
+from torchslam.tracking.data_association import (
     GRID,
     MATURE_OBSERVATIONS,
     MAX_CELL_WEIGHT,
@@ -26,6 +25,7 @@ from torchslam.tracking.match_selection import (
     select_mature,
     subsample_per_cell,
 )
+from torchslam.tracking.localizer import Projected, project_points
 from torchslam.tracking.tracker import EMA_RATE, Tracker, well_observed
 from torchslam.types import FrameFeatures, PoseEstimate
 

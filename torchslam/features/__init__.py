@@ -9,9 +9,8 @@ from torch import nn
 from torchslam.errors import ConfigError
 from torchslam.features.learned import ALIKED, XFeat
 from torchslam.features.matching.brute_force import match, match_pairs
-from torchslam.features.matching.by_projection import match_by_projection
+from torchslam.features.matching.by_projection import expand_runs, match_by_projection
 from torchslam.features.matching.hamming import hamming, pack_bits, unpack_bits
-from torchslam.features.matching.radius_search import expand_runs
 from torchslam.features.orb import ORB, OpenCVORB
 from torchslam.features.simulated import SimulatedFeatures
 

@@ -1,20 +1,26 @@
-"""FAST corners, Harris responses, and sub-pixel positions of corners.
+"""FAST corners, Harris responses, sub-pixel positions, and the selection of corners.
 
-Images are flattened and worked on in chunks: few calls, and intermediate results stay in the cache. On the CPU the
-chunks are NumPy's: for bytes, a call of NumPy takes half the time of one of torch, and gives the same.
+Selection spreads the corners evenly over the image, at a budget per pyramid level. Images are flattened and worked on
+in chunks: few calls, and intermediate results stay in the cache. On the CPU the chunks are NumPy's: for bytes, a call
+of NumPy takes half the time of one of torch, and gives the same.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from torchslam.features.pyramid import PackedPyramid
 from torchslam.utils.indexing import true_indices
 
 CHUNK_PIXELS = 260_000
@@ -276,3 +282,164 @@ def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
     axis = torch.arange(side, device=responses.device, dtype=responses.dtype) - side // 2
     grid = torch.stack([axis.expand(side, side), axis[:, None].expand(side, side)], dim=-1).view(-1, 2)
     return weights @ grid
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells over every level of a pyramid, less a border where no keypoint may lie.
+
+    table:   (rows * stride,) int32, the cell of each atlas pixel, -1 on the border and between levels
+    floor:   (rows * stride,) uint8, the FAST score that a corner must exceed there; 255 where none may lie
+    rows:    of the pyramid, runs (first, last + 1) of those in which there are cells
+    levels:  (cells,) int64, the level of each cell
+    budgets: (levels,) int64, how many keypoints each level may give
+    """
+
+    table: Tensor
+    floor: Tensor
+    rows: tuple[tuple[int, int], ...]
+    levels: Tensor
+    budgets: Tensor
+
+
+@lru_cache(maxsize=8)
+def plan_grid(
+    pyramid: PackedPyramid,
+    num_keypoints: int,
+    per_cell: int,
+    border: int,
+    threshold: int,
+    device: torch.device,
+) -> Grid:
+    """Budgets per level and square cells whose part of the budget is about `per_cell` keypoints.
+
+    threshold: the FAST score that a corner must exceed.
+    """
+    table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32)
+    budgets = _level_budgets(num_keypoints, pyramid, border)
+    levels: list[int] = []
+    for level, ((h, w), (top, left)) in enumerate(zip(pyramid.sizes, pyramid.corners, strict=True)):
+        inner_h, inner_w = h - 2 * border, w - 2 * border
+        if budgets[level] == 0:
+            continue
+        cell = math.sqrt(inner_h * inner_w * per_cell / budgets[level])
+        down, across = max(1, round(inner_h / cell)), max(1, round(inner_w / cell))
+        row = torch.arange(inner_h) * down // inner_h
+        column = torch.arange(inner_w) * across // inner_w
+        cells = row[:, None] * across + column + len(levels)
+        table[top + border : top + h - border, left + border : left + w - border] = cells.to(torch.int32)
+        levels += [level] * (down * across)
+    as_tensor = torch.tensor
+    return Grid(
+        table.flatten().to(device),
+        torch.where(table.flatten() >= 0, threshold, 255).to(device=device, dtype=torch.uint8),
+        _runs((table >= 0).any(1)),
+        as_tensor(levels, dtype=torch.int64, device=device),
+        as_tensor(budgets, dtype=torch.int64, device=device),
+    )
+
+
+def _runs(flags: Tensor) -> tuple[tuple[int, int], ...]:
+    """(start, stop) of all runs of true ones in flags (n,)."""
+    edges = F.pad(flags.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    return tuple(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _level_budgets(num_keypoints: int, pyramid: PackedPyramid, border: int) -> list[int]:
+    """Keypoints per level in proportion to its width; levels with no room inside the border get none."""
+    shares = [
+        1 / x if min(size) > 2 * border else 0.0
+        for (x, _), size in zip(pyramid.scales, pyramid.sizes, strict=True)
+    ]
+    total = sum(shares)
+    if total == 0:
+        return [0] * len(shares)
+    edges = [round(num_keypoints * sum(shares[:k]) / total) for k in range(len(shares) + 1)]
+    return [after - before for before, after in pairwise(edges)]
+
+
+def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
+    """Place of each row among the rows of its group, from 0, in the order in which they come: (N,) int64 -> (N,)."""
+    order = torch.argsort(groups, stable=True)
+    sizes = torch.bincount(groups, minlength=num_groups)
+    starts = sizes.cumsum(0) - sizes
+    ranks = torch.empty_like(order)
+    inside = starts.index_select(0, groups.index_select(0, order))
+    ranks[order] = torch.arange(order.shape[0], device=order.device) - inside
+    return ranks
+
+
+def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
+    """Test whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
+    best = scores.new_zeros(num_cells).scatter_reduce(0, cells, scores, "amax")
+    return scores == best.index_select(0, cells)
+
+
+def prefilter_candidates(
+    scores: Tensor, offered: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
+) -> Tensor:
+    """Corners that `select_evenly` may choose besides the best of the cells: far fewer than all, without a sort.
+
+    scores: (N,) uint8, whole parts of the scores to be; offered: (N,) bool, what is to be spread; others as there.
+    A level takes its budget and at most all that is left of others': who has as many stronger ones cannot be chosen.
+    Returns (N,) bool.
+    """
+    num_levels = grid.budgets.shape[0]
+    group = images * num_levels + grid.levels.index_select(0, cells)
+    values = group * 256 + scores
+    weights = offered.to(torch.float32)
+    histogram = torch.bincount(values, weights, minlength=num_images * num_levels * 256).view(
+        -1, num_levels, 256
+    )
+    from_top = histogram.flip(-1).cumsum(-1).flip(-1)  # how many have this score or a higher one
+    left = (count - torch.minimum(from_top[:, :, 0], grid.budgets).sum(1, keepdim=True)).clamp_min(0)
+    stronger = F.pad(from_top[:, :, 1:], (0, 1))
+    return (stronger < (grid.budgets + left)[:, :, None]).view(-1).index_select(0, values)
+
+
+def select_evenly(
+    scores: Tensor, strong: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
+) -> tuple[Tensor, Tensor]:
+    """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
+
+    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen besides the best of its cell;
+    cells: (N,) cell within its image; images: (N,) its image. Every level first takes its budget; what levels leave
+    unused goes to the best remaining corners of any level.
+    Returns the chosen rows (K,) and the place (K,) of each in its image's list, 0 ... count - 1, by falling score.
+    """
+    num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
+    rows = _falling(scores)  # every rank below follows this order
+    cells, images, strong = (values.index_select(0, rows) for values in (cells, images, strong))
+    extra = ~_is_first(images * num_cells + cells, num_images * num_cells)
+
+    kept = (strong | ~extra).nonzero().squeeze(1)
+    rows, extra, images, cells = (values.index_select(0, kept) for values in (rows, extra, images, cells))
+    levels = grid.levels.index_select(0, cells)
+    # A level counts its cells' best first, then the others; so does an image with what the levels' budgets hold.
+    within_level = _ranks_in_turn(images * num_levels + levels, extra, num_images * num_levels)
+    beyond = within_level >= grid.budgets.index_select(0, levels)
+    chosen = (_ranks_in_turn(images, beyond, num_images) < count).nonzero().squeeze(1)
+    return rows.index_select(0, chosen), ranks_within(images.index_select(0, chosen), num_images)
+
+
+def _falling(scores: Tensor) -> Tensor:
+    """Rows of scores (N,) from the highest down, equal ones in the order in which they come."""
+    if scores.dtype != torch.float32:
+        return torch.argsort(scores, descending=True, stable=True)
+    # The bits of floats are in the order of whole numbers, which are sorted several times as fast.
+    bits = (scores + 0.0).view(torch.int32)  # -0 as 0
+    return torch.argsort(~torch.where(bits < 0, bits ^ 0x7FFFFFFF, bits), stable=True)
+
+
+def _is_first(groups: Tensor, num_groups: int) -> Tensor:
+    """Test whether a row is the first of its group: (N,) int64 -> (N,) bool."""
+    rows = torch.arange(groups.shape[0], device=groups.device)
+    first = rows.new_full((num_groups,), groups.shape[0]).scatter_reduce(0, groups, rows, "amin")
+    return rows == first.index_select(0, groups)
+
+
+def _ranks_in_turn(groups: Tensor, second: Tensor, num_groups: int) -> Tensor:
+    """Place of each row within its group if all rows that are not `second` come first."""
+    ranks = ranks_within(groups * 2 + second, num_groups * 2)
+    firsts = torch.bincount(groups[~second], minlength=num_groups)
+    return ranks + firsts.index_select(0, groups) * second

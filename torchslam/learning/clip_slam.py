@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
 from torchslam.config import Config
@@ -67,19 +68,19 @@ class ClipPoses:
     """The poses of a clip of T frames, or of B clips.
 
     Attributes:
-        T_cw: (T, 4, 4) or (B, T, 4, 4) world to camera, float64, the identity where there is no pose. The world is the
-            camera of the clip's first keyframe, its unit of length the median depth of the first map.
-        posed: (T,) or (B, T) bool; only the frames of the main submap where a clip has several.
-        success: () or (B,) bool: a map was initialized, enough frames are posed, and the solve converged, without which
-            the gradient would be wrong.
+        T_cw: World to camera, float64, the identity where there is no pose. The world is the camera of the clip's
+            first keyframe, its unit of length the median depth of the first map.
+        posed: Frames with a pose; only those of the main submap where a clip has several.
+        success: Whether a map was initialized, enough frames are posed, and the solve converged, without which the
+            gradient would be wrong.
         reasons: One per clip: why it failed, or empty.
         graphs: One per clip, with differentiable pixels and weights; None where no map was initialized.
         solutions: One per clip: minimum of the graph, with points and covariances; None where no map was initialized.
     """
 
-    T_cw: Tensor
-    posed: Tensor
-    success: Tensor
+    T_cw: Float[Tensor, "*batch T 4 4"]
+    posed: Bool[Tensor, "*batch T"]
+    success: Bool[Tensor, "*batch"]
     reasons: tuple[str, ...]
     graphs: tuple[RunGraph | None, ...]
     solutions: tuple[GraphSolution | None, ...]
@@ -91,37 +92,44 @@ class ClipPoses:
 
 
 class ClipLoss(NamedTuple):
-    """The differentiable loss () over the clips, and the fraction of clips that failed."""
+    """The differentiable loss over the clips, and the fraction of clips that failed."""
 
-    loss: Tensor
+    loss: Float[Tensor, ""]
     failure_rate: float
 
 
 def clip_loss(
     poses: ClipPoses,
-    T_cw_groundtruth: Tensor,
+    T_cw_groundtruth: Float[Tensor, "*batch T 4 4"],
     error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
     on_failure: OnFailure = "raise",
 ) -> ClipLoss:
     """Average an error against the true poses over the clips.
 
     Args:
-        poses: Of T frames, or of B clips.
-        T_cw_groundtruth: (T, 4, 4) or (B, T, 4, 4).
+        poses: Of a clip, or of B clips.
+        T_cw_groundtruth: Their true poses.
         error: Maps poses, true poses and mask, shaped like those of `poses`, to () or (B,).
         on_failure: See `clip_mean`.
+
+    Raises:
+        ClipError: As `clip_mean`.
     """
     return clip_mean(poses, error(poses.T_cw, T_cw_groundtruth, poses.posed), on_failure)
 
 
-def clip_mean(poses: ClipPoses, errors: Tensor, on_failure: OnFailure = "raise") -> ClipLoss:
+def clip_mean(poses: ClipPoses, errors: Float[Tensor, "*batch"], on_failure: OnFailure = "raise") -> ClipLoss:
     """Average errors over the clips; a failed clip never counts as error zero, since a front end could learn to fail.
 
     Args:
-        poses: Of T frames, or of B clips.
-        errors: () or (B,).
-        on_failure: "raise" raises ClipError with the reasons. "skip" omits failed clips, and raises ClipError if none
-            is left. A number is the cost of each failed clip, without gradient.
+        poses: Of a clip, or of B clips.
+        errors: One per clip.
+        on_failure: "raise" raises an error if a clip failed. "skip" omits failed clips. A number is the cost of each
+            failed clip, without gradient.
+
+    Raises:
+        ClipError: Clips failed, with the reasons; with "skip": all failed.
+        ValueError: `on_failure` is something else.
     """
     if isinstance(on_failure, str) and on_failure not in ("raise", "skip"):
         raise ValueError(f"on_failure must be 'raise', 'skip' or a number, not {on_failure!r}")
@@ -135,7 +143,9 @@ def clip_mean(poses: ClipPoses, errors: Tensor, on_failure: OnFailure = "raise")
 
 
 class ClipSLAM(nn.Module):
-    """Poses of clips, differentiable with respect to images, camera and the parameters of the front end:
+    """Poses of clips, differentiable with respect to images, camera and the parameters of the front end.
+
+    Train a front end:
 
         clip_slam = ClipSLAM(XFeat("xfeat.safetensors"))
         optimizer = torch.optim.Adam(clip_slam.parameters(), 1e-4)
@@ -153,10 +163,10 @@ class ClipSLAM(nn.Module):
         poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, features)
 
     Args:
-        extractor: Module from images (B, 1, H, W) to Features with differentiable keypoints, such as
+        extractor: Module from images (T, 1, H, W) to Features with differentiable keypoints, such as
             ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; in `train` mode their
             normalization statistics would follow the clip.
-        keypoint_weight: Module or function from Features to weights (B, N) >= 0 that multiply the information of each
+        keypoint_weight: Module or function from Features to weights (T, N) >= 0 that multiply the information of each
             keypoint (for example its score); 1 if None.
         config: Of the system; its features section is not read.
     """
@@ -167,12 +177,15 @@ class ClipSLAM(nn.Module):
         keypoint_weight: Callable[[Features], Tensor] | None = None,
         config: Config | None = None,
     ) -> None:
+        """Create a module with the parameters of the front end."""
         super().__init__()
         self.extractor = extractor
         self.keypoint_weight = keypoint_weight
         self.config = config or Config()
 
-    def forward(self, images: Tensor, camera: Camera, graph: ClipGraph | None = None) -> ClipPoses:
+    def forward(
+        self, images: Float[Tensor, "*batch T 1 H W"], camera: Camera, graph: ClipGraph | None = None
+    ) -> ClipPoses:
         """Estimate the poses of a clip, or of each of several clips.
 
         The front end runs on the device of the images, the rest on that of the camera. World frame and unit are
@@ -180,7 +193,7 @@ class ClipSLAM(nn.Module):
         no posed frame and a gradient of zero; see `success` and `reasons`.
 
         Args:
-            images: (T, 1, H, W) or (B, T, 1, H, W), floats in [0, 1].
+            images: Gray, in [0, 1]: of one clip, or of B clips.
             camera: Of all clips, or with params (B, K) one for each.
             graph: Of these images, by `build_graph`; built anew if None.
 
@@ -192,15 +205,22 @@ class ClipSLAM(nn.Module):
         graph = self.build_graph(images, camera, features) if graph is None else graph
         return self.pose(graph, features, camera)
 
-    def extract(self, images: Tensor) -> Features | list[Features]:
-        """Extract the features of a clip (T, 1, H, W), or of each of several (B, T, 1, H, W)."""
+    def extract(self, images: Float[Tensor, "*batch T 1 H W"]) -> Features | list[Features]:
+        """Extract the features of a clip, or of each of B clips.
+
+        Raises:
+            ValueError: Images of another shape.
+        """
         if images.ndim not in (4, 5):
             raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
         return [self.extractor(clip) for clip in images] if images.ndim == 5 else self.extractor(images)
 
     @torch.no_grad()
     def build_graph(
-        self, images: Tensor, camera: Camera, features: Features | Sequence[Features] | None = None
+        self,
+        images: Float[Tensor, "*batch T 1 H W"],
+        camera: Camera,
+        features: Features | Sequence[Features] | None = None,
     ) -> ClipGraph:
         """Run the system on a clip or on several, without gradient: matches, keyframes, correspondences.
 
@@ -291,8 +311,10 @@ def _cameras(camera: Camera, clips: int) -> tuple[Camera, ...]:
     return tuple(camera[row] for row in range(clips))
 
 
-def _as_seen(run: RunGraph, features: Features, keypoint_weights: Tensor, camera: Camera) -> RunGraph:
-    """The graph of a clip with the current pixels of its features, weighted by keypoint_weights (T, N)."""
+def _as_seen(
+    run: RunGraph, features: Features, keypoint_weights: Shaped[Tensor, "T N"], camera: Camera
+) -> RunGraph:
+    """The graph of a clip with the current pixels of its features, weighted by keypoint_weights."""
     run = _still_seen(run, features.mask)
     rows = (run.frame_ids[run.frame_index], run.keypoint_index)
     weights = run.weights
@@ -306,10 +328,10 @@ def _posed(
     graph: RunGraph | None,
     solution: GraphSolution | None,
     features: Features,
-    keypoint_weights: Tensor,
+    keypoint_weights: Shaped[Tensor, "T N"],
     camera: Camera,
-) -> tuple[Tensor, Tensor]:
-    """The poses (T, 4, 4) of a clip, and which frames have one (T,)."""
+) -> tuple[Float[Tensor, "T 4 4"], Bool[Tensor, " T"]]:
+    """The poses of a clip, and which frames have one."""
     # Zero times everything that poses depend on, so that the gradient exists without any pose.
     nothing = features.keypoints.sum() + keypoint_weights.sum() + camera.params.sum()
     nothing = 0 * (nothing if features.information is None else nothing + features.information.sum())
@@ -322,8 +344,8 @@ def _posed(
     return T_cw, posed.index_copy(0, graph.frame_ids, solution.success)
 
 
-def _still_seen(graph: RunGraph, mask: Tensor) -> RunGraph:
-    """The graph without the observations of keypoints that mask (T, N) excludes."""
+def _still_seen(graph: RunGraph, mask: Bool[Tensor, "T N"]) -> RunGraph:
+    """The graph without the observations of keypoints that the mask excludes."""
     kept = mask[graph.frame_ids[graph.frame_index], graph.keypoint_index]
     columns = ("frame_index", "point_index", "pixels", "weights", "keypoint_index")
     return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})

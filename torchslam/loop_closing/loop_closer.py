@@ -18,8 +18,8 @@ from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecor
 from torchslam.loop_closing.relative_sim3 import neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
-from torchslam.mapping.fusion import match_in_keyframes, merge_points
 from torchslam.mapping.local_bundle import adjust_all
+from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures

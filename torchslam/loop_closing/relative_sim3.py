@@ -22,7 +22,8 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
 from torchslam.optim import refine_pose
-from torchslam.tracking.correspondences import match_projected_points, match_views, project_points
+from torchslam.tracking.data_association import match_views
+from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity

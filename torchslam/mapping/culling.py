@@ -49,7 +49,7 @@ def cull_candidates(submap: Submap) -> Tensor:
     """Return keyframes (k,) covisible with those inserted since the last culling, the newest first."""
     slam_map = submap.map
     candidates = slam_map.covisibility_union(
-        slam_map.ids(*range(submap.num_cull_checked, slam_map.num_keyframes)), NUM_COVISIBLE
+        slam_map.index_tensor(*range(submap.num_cull_checked, slam_map.num_keyframes)), NUM_COVISIBLE
     )
     may_go = (candidates > 0) & (candidates < slam_map.num_keyframes - NUM_NEWEST_KEPT)
     return candidates[may_go & (candidates != submap.tracking.reference)].flip(0)
@@ -67,8 +67,8 @@ def redundant_keyframes(submap: Submap, candidates: Tensor, settings: KeyframesC
 
 def is_covered(slam_map: Map, keyframe: int, removed: Tensor) -> bool:
     """Whether enough remaining keyframes observe the points of a keyframe at a similar or finer scale."""
-    seen = slam_map.observations(slam_map.ids(keyframe))
-    observers, scales = slam_map.scales_of(seen.point_index)
+    seen = slam_map.observations(slam_map.index_tensor(keyframe))
+    observers, scales = slam_map.observers_and_scales(seen.point_index)
     counts = (
         (observers >= 0)
         & (observers != keyframe)
@@ -80,10 +80,10 @@ def is_covered(slam_map: Map, keyframe: int, removed: Tensor) -> bool:
 
 def has_keyframe_nearby(slam_map: Map, keyframe: int, removed: Tensor, settings: KeyframesConfig) -> bool:
     """Whether a remaining keyframe is so close that a frame at this pose would not become a keyframe."""
-    covisible = slam_map.covisible(keyframe, NUM_COVISIBLE)
+    covisible = slam_map.covisible_keyframes(keyframe, NUM_COVISIBLE)
     covisible = covisible[~removed[covisible]]
     T_cw = slam_map.T_cw[keyframe]
-    seen = slam_map.points_seen_by(slam_map.ids(keyframe))
+    seen = slam_map.observed_points(slam_map.index_tensor(keyframe))
     depth = transform(T_cw, slam_map.positions_w[seen])[:, 2].median()
     translation, rotation = pose_distance(T_cw, slam_map.T_cw[covisible], depth)
     return bool(((translation <= settings.max_translation) & (rotation <= settings.max_rotation_deg)).any())
@@ -98,4 +98,4 @@ def remove_masked_observations(submap: Submap, is_masked: Callable[[Tensor], Ten
     """
     slam_map = submap.map
     seen = slam_map.observations(torch.sort(submap.tracking.local_keyframes).values)
-    slam_map.drop(seen, is_masked(seen.pixels))
+    slam_map.remove_masked_observations(seen, is_masked(seen.pixels))

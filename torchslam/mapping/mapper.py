@@ -16,9 +16,8 @@ from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap, compact
 from torchslam.map.map import Map
 from torchslam.mapping.culling import cull_keyframes
-from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
-from torchslam.mapping.new_points import triangulate_against
+from torchslam.mapping.new_points import fuse, triangulate_against
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
@@ -65,9 +64,9 @@ class Mapper:
         second = slam_map.add_keyframe(start.view, T_cw)
         descriptors = start.view.descriptors[start.keypoints_2]
         ids = slam_map.add_points(points_w, descriptors, second, covariances_w, from_initialization=True)
-        slam_map.observe(first, start.keypoints_1, ids)
-        slam_map.observe(second, start.keypoints_2, ids)
-        slam_map.refresh(slam_map.ids(first, second))
+        slam_map.add_observations(first, start.keypoints_1, ids)
+        slam_map.add_observations(second, start.keypoints_2, ids)
+        slam_map.update_appearance(slam_map.index_tensor(first, second))
         return first, second
 
     def insert(
@@ -89,18 +88,18 @@ class Mapper:
             keyframe = slam_map.add_keyframe(
                 view.weighed(estimate.keypoints, estimate.weights), estimate.T_cw
             )
-            slam_map.observe(keyframe, estimate.keypoints, estimate.point_ids)
+            slam_map.add_observations(keyframe, estimate.keypoints, estimate.point_ids)
             if settings.cull:
                 self.cull_recent_points(slam_map, keyframe)
-            neighbors = slam_map.covisible(keyframe, 2 * settings.num_partners)
+            neighbors = slam_map.covisible_keyframes(keyframe, 2 * settings.num_partners)
             last = range(keyframe - 1, max(keyframe - 1 - settings.num_partners, -1), -1)
-            partners = neighbors if settings.triangulation_partners == "covisible" else slam_map.ids(*last)
+            partners = neighbors if settings.triangulation_partners == "covisible" else slam_map.index_tensor(*last)
             partners = partners[: settings.num_partners]
             normalize = self.undistortion.normalize
             triangulate_against(
                 slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
             )
-            slam_map.refresh(slam_map.ids(keyframe))
+            slam_map.update_appearance(slam_map.index_tensor(keyframe))
             if settings.fuse:
                 fuse(slam_map, keyframe, neighbors, self.camera, self.config)
         if self.config.bundle_adjustment.local:
@@ -142,7 +141,7 @@ class Mapper:
         is_unconfirmed = (
             (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
         )
-        slam_map.invalidate(recent[is_rarely_found | is_unconfirmed])
+        slam_map.remove_points(recent[is_rarely_found | is_unconfirmed])
 
 
 def initial_scale(start: TwoViewMap, kind: str) -> float:

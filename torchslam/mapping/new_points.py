@@ -1,4 +1,8 @@
-"""New map points: match a keyframe along epipolar lines with covisible keyframes, triangulate and check."""
+"""New map points and their fusion with known ones.
+
+A keyframe is matched along epipolar lines with covisible keyframes; matches are triangulated and checked. Fusion
+associates map points with covisible keyframes and merges duplicates.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
+from torchslam.features import match_by_projection
 from torchslam.geometry import (
     Camera,
     passes_gate,
@@ -21,6 +26,7 @@ from torchslam.geometry import (
 )
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
+from torchslam.tracking.data_association import predict_observations
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchPrior
@@ -53,7 +59,7 @@ def triangulate_against(
         return
     here, there = (
         FreeKeypoints.of(slam_map, rows, normalize or camera.normalize)
-        for rows in (slam_map.ids(keyframe), neighbors)
+        for rows in (slam_map.index_tensor(keyframe), neighbors)
     )
     found = _match(slam_map, keyframe, neighbors, here, there, camera, config, matcher)
     _triangulate(slam_map, keyframe, neighbors, here, there, found, camera, config)
@@ -144,14 +150,14 @@ def _observe(
     slam_map: Map, keyframes: int | Tensor, rows: Tensor, ids: Tensor, weights: Tensor | None
 ) -> None:
     """Add observations of points (n,) by keypoints (n,) of keyframes, one or (n,), with optional weights (n,)."""
-    slam_map.observe(keyframes, rows, ids)
+    slam_map.add_observations(keyframes, rows, ids)
     if weights is not None:
-        slam_map.weigh(keyframes, rows, weights)
+        slam_map.scale_information(keyframes, rows, weights)
 
 
 def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
     """Return the features of a keyframe, masked to keypoints that observe no point."""
-    view = slam_map.view(keyframe)
+    view = slam_map.frame_features(keyframe)
     return replace(view, mask=view.mask & (slam_map.keyframes["point_ids"][keyframe] == NO_POINT))
 
 
@@ -207,3 +213,80 @@ def has_consistent_scale(
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
     expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(*scale_range)
     return (scale_2 < factor * expected) & (scale_2 * factor > expected)
+
+
+RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
+
+
+def fuse(slam_map: Map, keyframe: int, neighbors: Tensor, camera: Camera, config: Config) -> None:
+    """Match the points of a keyframe in its covisible keyframes and theirs in it, and merge duplicates."""
+    here = slam_map.index_tensor(keyframe)
+    own = slam_map.observed_points(here)
+    merge_points(slam_map, *match_in_keyframes(slam_map, neighbors, own, camera, config))
+    merge_points(
+        slam_map, *match_in_keyframes(slam_map, here, slam_map.observed_points(neighbors), camera, config)
+    )
+
+
+def match_in_keyframes(
+    slam_map: Map, keyframes: Tensor, point_ids: Tensor, camera: Camera, config: Config
+) -> tuple[Tensor, Tensor]:
+    """Match points (n,) by projection into keyframes (k,) that do not observe them yet.
+
+    Matches with free keypoints become observations. Returns the other matches as pairs (m,), (m,) of duplicate points:
+    the matched point and the one that the keypoint already observes.
+    """
+    if len(keyframes) == 0 or len(point_ids) == 0:
+        return point_ids[:0], point_ids[:0]
+    table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
+    features = slam_map.features(keyframes)
+    T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
+    pixels, scales, visible = predict_observations(slam_map, point_ids, T_cw, camera, angle, sizes)
+    visible &= ~slam_map.observation_mask(keyframes, point_ids)
+    somewhere = torch.nonzero(visible.any(0))[:, 0]
+    point_ids = point_ids[somewhere]
+    pixels, scales, visible = (x.index_select(1, somewhere) for x in (pixels, scales, visible))
+    matches = match_by_projection(
+        points["descriptors"][point_ids].expand(len(keyframes), -1, -1),
+        pixels,
+        RADIUS_PX * scales,
+        features,
+        mask=visible,
+        scales=scales,
+        max_distance=max_distance(features.descriptors, config.matching),
+        ratio=None,
+    )
+    which, row = torch.nonzero(matches.mask, as_tuple=True)
+    ids, keyframe, keypoint = point_ids[row], keyframes[which], matches.indices_2[which, row]
+    errors = slam_map.keypoint_noise(keyframe, keypoint).squared(
+        pixels[which, row] - table["keypoints"][keyframe, keypoint]
+    )
+    agrees = passes_gate(errors, config.measurement.max_chi_square)
+    ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
+    taken = table["point_ids"][keyframe, keypoint]
+    is_free = taken < 0
+    slam_map.add_observations(keyframe[is_free], keypoint[is_free], ids[is_free])
+    return ids[~is_free], taken[~is_free]
+
+
+def merge_points(slam_map: Map, found: Tensor, there: Tensor) -> None:
+    """Merge pairs of points (m,), (m,); of each group of duplicates the point with most observations stays."""
+    pairs = torch.stack([found, there], dim=1)
+    counts = slam_map.points["times_observed"][pairs]
+    observed = dict(zip(pairs.flatten().tolist(), counts.flatten().tolist(), strict=True))
+    replacement: dict[int, int] = {}
+
+    def follow_merges(point: int) -> int:
+        while point in replacement:
+            point = replacement[point]
+        return point
+
+    often = zip(found.tolist(), there.tolist(), strict=True)  # a pair may be found in several keyframes
+    for pair in dict.fromkeys(often):
+        one, other = (follow_merges(point) for point in pair)
+        if one != other:
+            old, kept = (one, other) if observed[one] <= observed[other] else (other, one)
+            replacement[old] = kept
+    if replacement:
+        last = [follow_merges(point) for point in replacement.values()]
+        slam_map.merge_points(found.new_tensor(list(replacement)), found.new_tensor(last))

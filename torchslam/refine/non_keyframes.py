@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import Config
@@ -13,7 +14,7 @@ from torchslam.geometry import Camera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
-from torchslam.tracking.correspondences import match_keyframe
+from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import validate_pose
 from torchslam.tracking.relocalization import single_frame_state
 from torchslam.tracking.tracker import Tracker
@@ -26,14 +27,23 @@ class FramePoser:
     """Poses the views of a sequence in a map whose keyframes are some of them."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
+        """Create a tracker.
+
+        Args:
+            camera: Of all views.
+            config: For the size of the images.
+        """
         self.tracker = Tracker(camera, config)
         self.config = config
 
     @torch.no_grad()
-    def pose(self, submap: Submap, views: list[FrameFeatures], given_cw: Tensor) -> list[StepResult]:
-        """Add all views to the posed frames of the submap, in order; return a result for each.
+    def pose(
+        self, submap: Submap, views: list[FrameFeatures], given_cw: Float[Tensor, "F 4 4"]
+    ) -> list[StepResult]:
+        """Add all views to the posed frames of the submap, in order.
 
-        given_cw: (N, 4, 4) the given poses, which become the online poses of the results
+        Returns:
+            One result per view, with its given pose as online pose.
         """
         row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
         self.tracker.reset_to_keyframe(submap, 0)
@@ -102,7 +112,7 @@ class FramePoser:
 
 
 def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
-    """The pose estimate of a keyframe with its own observations."""
+    """Return the pose estimate of a keyframe with its own observations."""
     table = slam_map.keyframes["point_ids"][keyframe]
     keypoints = torch.nonzero(table >= 0)[:, 0]
     seen, T_cw = table[keypoints], slam_map.T_cw[keyframe]
@@ -111,9 +121,11 @@ def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
 
 
 def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
-    """The graph of the keyframes of a map, without other frames."""
+    """Build the observation graph of the keyframes of a map, without other frames."""
     posed_frames = PosedFrames()
     for keyframe in range(slam_map.num_keyframes):
         T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
-        posed_frames.add(slam_map.frame_features(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe)
+        posed_frames.add(
+            slam_map.frame_features(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe
+        )
     return posed_frames.graph(slam_map, camera)

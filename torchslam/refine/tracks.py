@@ -9,13 +9,14 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log, triangulate_many
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.map.map import Map
-from torchslam.tracking.correspondences import match_views
+from torchslam.tracking.data_association import match_views
 from torchslam.types import FrameFeatures
 
 # A view becomes a keyframe if its matches with the last one moved by this fraction of the image width, or if fewer than
@@ -32,16 +33,21 @@ _PAIRS_AT_ONCE, _MAX_SAMPLES = 16, 500
 
 @dataclass(frozen=True)
 class Pair:
-    """Two overlapping keyframes: rows of their views, and matching keypoints (m,), (m,).
+    """Two overlapping keyframes.
 
-    R_21: (3, 3) relative rotation by the matches; None if it is ambiguous
+    Attributes:
+        first: Row of a view.
+        second: Row of another one.
+        keypoints_1: Keypoints of the first view.
+        keypoints_2: Matching keypoints of the second view.
+        R_21: Relative rotation by the matches; None if it is ambiguous.
     """
 
     first: int
     second: int
-    keypoints_1: Tensor
-    keypoints_2: Tensor
-    R_21: Tensor | None
+    keypoints_1: Int[Tensor, " M"]
+    keypoints_2: Int[Tensor, " M"]
+    R_21: Float[Tensor, "3 3"] | None
 
 
 def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> list[int]:
@@ -59,8 +65,10 @@ def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> 
     return chosen
 
 
-def find_pairs(views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config) -> list[Pair]:
-    """Match keyframes with given poses T_cw (K, 4, 4) and verify the pairs by their epipolar geometry."""
+def find_pairs(
+    views: list[FrameFeatures], T_cw: Float[Tensor, "K 4 4"], camera: Camera, config: Config
+) -> list[Pair]:
+    """Match keyframes with given poses and verify the pairs by their epipolar geometry."""
     found = [
         (one, other, *match_views(views[one], views[other], config.matching))
         for one, other in candidates(views, T_cw)
@@ -72,8 +80,8 @@ def find_pairs(views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config:
     return pairs
 
 
-def candidates(views: list[FrameFeatures], T_cw: Tensor) -> list[tuple[int, int]]:
-    """Pairs (lower row first, ascending) close in time, or similar and with similar given viewing directions."""
+def candidates(views: list[FrameFeatures], T_cw: Float[Tensor, "K 4 4"]) -> list[tuple[int, int]]:
+    """Return pairs (lower row first, ascending) close in time, or similar and with similar viewing directions."""
     places = KeyframeDatabase()
     for row, view in enumerate(views):
         places.add(row, view.descriptors, view.mask)
@@ -135,21 +143,25 @@ _TRACKS_AT_ONCE = 4096  # tracks
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations (O,) of points, ordered by track, then keyframe; a keyframe observes a track at most once.
+    """Observations of points, ordered by track, then keyframe; a keyframe observes a track at most once.
 
-    track: (O,) from 0 without gaps; keyframe, keypoint: (O,)
+    Attributes:
+        track: Number of the track of each observation, from 0 without gaps.
+        keyframe: Row of the keyframe.
+        keypoint: Row among its keypoints.
     """
 
-    track: Tensor
-    keyframe: Tensor
-    keypoint: Tensor
+    track: Int[Tensor, " O"]
+    keyframe: Int[Tensor, " O"]
+    keypoint: Int[Tensor, " O"]
 
     @property
     def count(self) -> int:
+        """The number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
-    def select(self, keep: Tensor) -> Tracks:
-        """The rows of a mask (O,), without tracks that have fewer than two of them."""
+    def select(self, keep: Bool[Tensor, " O"]) -> Tracks:
+        """Select the observations of a mask, without tracks that have fewer than two of them."""
         track, keyframe, keypoint = self.track[keep], self.keyframe[keep], self.keypoint[keep]
         _, which, counts = torch.unique(track, return_inverse=True, return_counts=True)
         is_track = counts[which] >= 2
@@ -158,9 +170,12 @@ class Tracks:
 
 
 def join_matches(pairs: list[Pair], keyframes: int, keypoints: int) -> Tracks:
-    """The connected components of all matches, without observations by two keypoints of one keyframe.
+    """Join matches to tracks, their connected components, without observations by two keypoints of one keyframe.
 
-    keypoints: capacity of a keyframe
+    Args:
+        pairs: Of keyframes, with matches.
+        keyframes: Number of keyframes.
+        keypoints: Number of keypoints of a keyframe.
     """
     one = torch.cat([pair.first * keypoints + pair.keypoints_1 for pair in pairs])
     other = torch.cat([pair.second * keypoints + pair.keypoints_2 for pair in pairs])
@@ -173,8 +188,8 @@ def join_matches(pairs: list[Pair], keyframes: int, keypoints: int) -> Tracks:
     return Tracks(track, keyframe, nodes % keypoints).select(counts[which] == 1)
 
 
-def _lowest_connected(one: Tensor, other: Tensor, count: int) -> Tensor:
-    """(count,) the lowest node of the connected component of each node, for edges (E,), (E,)."""
+def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: int) -> Int[Tensor, " R"]:
+    """The lowest node of the connected component of each of `count` nodes with the given edges."""
     label = torch.arange(count, device=one.device)
     while True:
         lower = torch.minimum(label[one], label[other])
@@ -186,11 +201,23 @@ def _lowest_connected(one: Tensor, other: Tensor, count: int) -> Tensor:
 
 
 def triangulate_tracks(
-    tracks: Tracks, pixels: Tensor, T_cw: Tensor, camera: Camera, min_parallax_deg: float
-) -> tuple[Tensor, Tensor]:
-    """Triangulate points (T, 3); (T,) whether they are in front of their keyframes with enough parallax.
+    tracks: Tracks,
+    pixels: Float[Tensor, "O 2"],
+    T_cw: Float[Tensor, "K 4 4"],
+    camera: Camera,
+    min_parallax_deg: float,
+) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
+    """Triangulate the points of tracks.
 
-    pixels: (O, 2); T_cw: (K, 4, 4)
+    Args:
+        tracks: N of them.
+        pixels: Of the observations.
+        T_cw: Poses of the keyframes.
+        camera: Of all keyframes.
+        min_parallax_deg: Least angle between two rays.
+
+    Returns:
+        The points, and whether they are in front of their keyframes with enough parallax.
     """
     length = torch.bincount(tracks.track)
     start = length.cumsum(0) - length
@@ -211,8 +238,13 @@ def triangulate_tracks(
     return torch.cat(points), torch.cat(good)
 
 
-def make_map(views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, points_w: Tensor) -> Map:
-    """Create a map of keyframes at T_cw (K, 4, 4) with the points (T, 3) of the tracks."""
+def make_map(
+    views: list[FrameFeatures],
+    T_cw: Float[Tensor, "K 4 4"],
+    tracks: Tracks,
+    points_w: Float[Tensor, "N 3"],
+) -> Map:
+    """Create a map of keyframes with the points of their tracks."""
     made = Map()
     for view, T in zip(views, T_cw, strict=True):
         made.add_keyframe(view, T)

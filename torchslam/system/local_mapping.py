@@ -10,7 +10,7 @@ from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import keyframe_reason
 from torchslam.system.session import SystemContext
 from torchslam.tracking.backward_tracking import UnposedFrames, track_back
-from torchslam.tracking.pose_confirmation import PendingFrame
+from torchslam.tracking.pose_validation import PendingFrame
 from torchslam.types import FrameFeatures, PoseEstimate
 
 

@@ -267,7 +267,7 @@ def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> 
         return why_no_map(results, skipped)
     if any(submap.posed_frames.count(slam.session.number) for submap in slam.session.atlas):
         return ""
-    return f"none of {len(results)} frames was recognised in the map"
+    return f"none of {len(results)} frames was recognized in the map"
 
 
 def why_no_map(results: list[StepResult], skipped: list[str]) -> str:

@@ -17,8 +17,8 @@ from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.mapping.mapper import Mapper
-from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
-from torchslam.tracking.pose_confirmation import PoseConfirmation
+from torchslam.tracking.non_static import NonStaticFilter
+from torchslam.tracking.pose_validation import PoseConfirmation
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import Matcher, State
 from torchslam.utils.timing import Stopwatch

@@ -30,10 +30,10 @@ from torchslam.system.front_end import FrontEnd, check_order, check_size, image_
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
-from torchslam.tracking.dynamic.non_static_filter import NonStaticFilter
+from torchslam.tracking.non_static import NonStaticFilter
+from torchslam.tracking.initialization import ProvisionalMap
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.tracking.pose_confirmation import PoseConfirmation
-from torchslam.tracking.provisional_map import ProvisionalMap
+from torchslam.tracking.pose_validation import PoseConfirmation
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch

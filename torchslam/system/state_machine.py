@@ -15,10 +15,9 @@ from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, TentativeMapping
 from torchslam.system.session import SystemContext
-from torchslam.tracking.dynamic.independent_motion import NOTHING
-from torchslam.tracking.initialization import Initializer
+from torchslam.tracking.non_static import NOTHING
+from torchslam.tracking.initialization import Initializer, ProvisionalMap
 from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
-from torchslam.tracking.provisional_map import ProvisionalMap
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 

@@ -8,8 +8,12 @@ from typing import Protocol
 
 from torchslam.config import Config
 from torchslam.map.atlas import Submap
-from torchslam.tracking.pose_confirmation import PendingFrame, PoseConfirmation
-from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
+from torchslam.tracking.pose_validation import (
+    PendingFrame,
+    PoseConfirmation,
+    check_map_agreement,
+    check_pose_quality,
+)
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate
 

@@ -21,12 +21,14 @@ from torchslam.geometry import (
 )
 from torchslam.map.map import Map
 from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
-from torchslam.tracking.correspondences import Projected, match_projected_points, project_points
-from torchslam.tracking.match_selection import (
+from torchslam.tracking.data_association import (
     MATURE_OBSERVATIONS,
+    Projected,
     coverage_ratio,
     explained_ratio,
     grid_weights,
+    match_projected_points,
+    project_points,
     select_mature,
     subsample_per_cell,
 )

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.tracking.correspondences import match_keyframe
+from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import validate_pose
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate

@@ -16,8 +16,8 @@ from torchslam.geometry import (
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.tracking.correspondences import match_points, match_projected_points
-from torchslam.tracking.localizer import Localizer
+from torchslam.tracking.data_association import match_points
+from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 

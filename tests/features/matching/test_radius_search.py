@@ -12,7 +12,7 @@ from tests.accelerator import simulated_accelerator
 from tests.conftest import HAS_SIMULATED_ACCELERATOR
 from tests.features.matching.random_features import features
 from torchslam.features import expand_runs
-from torchslam.features.matching.radius_search import nearest_of_pairs, pairs_within_radius
+from torchslam.features.matching.by_projection import nearest_of_pairs, pairs_within_radius
 
 
 @given(

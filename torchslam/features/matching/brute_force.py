@@ -17,10 +17,12 @@ from torchslam.features.matching.hamming import (
     nearest_by_cosine,
     nearest_by_hamming,
 )
-from torchslam.features.matching.radius_search import SAME_SCALE
 from torchslam.geometry.precision import full_precision
 from torchslam.types import Features, Matches
 from torchslam.utils.indexing import true_indices
+
+SAME_SCALE = 0.05
+"""Relative difference up to which two scales belong to one pyramid level."""
 
 
 @full_precision

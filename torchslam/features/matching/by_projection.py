@@ -1,13 +1,20 @@
-"""Matching guided by predicted pixels: ORB-SLAM's search by projection."""
+"""Matching guided by predicted pixels: ORB-SLAM's search by projection.
+
+A radius search finds the keypoints within a radius of predicted pixels, and the nearest of them by Hamming distance.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.features.matching.brute_force import (
+    SAME_SCALE,
     best_of_pairs,
     check_descriptors,
     no_matches,
@@ -18,9 +25,246 @@ from torchslam.features.matching.brute_force import (
     where_rows,
 )
 from torchslam.features.matching.hamming import hamming_between
-from torchslam.features.matching.radius_search import nearest_of_pairs, pairs_within_radius
 from torchslam.geometry.precision import full_precision
 from torchslam.types import Features, Matches
+
+Array = NDArray[Any]
+
+_BAND_HEIGHT = 32.0  # pixels, of the bands of keypoints that the torch backend searches
+# Pixels from one band to the next, and from one image to the next, where keypoints stand in one row. Far more than
+# images have; a wider window takes in keypoints outside of its radius, which are then left out.
+_BAND_OFFSET, _IMAGE_OFFSET = 2.0**20, 2.0**36
+_CELL_WIDTH, _CELL_HEIGHT = (
+    8.0,
+    32.0,
+)  # pixels, in the NumPy backend: a window is some runs of cells, one per row
+_MAX_COLUMNS, _MAX_ROWS = 256, 64  # of cells: those of larger images are larger
+
+
+def pairs_within_radius(
+    pixels: Tensor, radius: Tensor, mask: Tensor, keypoints: Tensor, keypoint_mask: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Find all pairs of a predicted pixel and a keypoint within its radius.
+
+    Args:
+        pixels: (B, M, 2) finite predicted pixels, at least one.
+        radius: (B, M) pixels.
+        mask: (B, M) predictions in use.
+        keypoints: (B, N, 2) pixels.
+        keypoint_mask: (B, N) keypoints in use.
+
+    Returns:
+        Flat rows b * M + i, ascending, and flat columns b * N + j; the columns of a row are in no particular order.
+    """
+    if keypoints.is_cpu:
+        inputs = pixels.double(), radius.double(), mask, keypoints.double(), keypoint_mask
+        found = _pairs_within_radius_numpy(*(tensor.detach().numpy() for tensor in inputs))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    # Keypoints are sorted by band, then by x: what a window takes of a band is one run in that order.
+    x, y = keypoints.double().unbind(-1)
+    at_x, at_y = pixels.double().unbind(-1)
+    low, high = torch.floor((at_y - radius) / _BAND_HEIGHT), torch.floor((at_y + radius) / _BAND_HEIGHT)
+    spans = int((high - low).amax()) + 1
+    bands = low[..., None] + torch.arange(spans, device=low.device)
+    places, starts = torch.floor(y / _BAND_HEIGHT) * _BAND_OFFSET + x, bands * _BAND_OFFSET
+    if len(mask) > 1:
+        image = torch.arange(len(mask), device=mask.device)[:, None] * _IMAGE_OFFSET
+        places, starts = places + image, starts + image[..., None]
+    keys, order = places.masked_fill(~keypoint_mask, torch.inf).flatten().sort(stable=True)
+    left = torch.searchsorted(keys, starts + (at_x - radius)[..., None])
+    right = torch.searchsorted(keys, starts + (at_x + radius)[..., None], right=True)
+    right = torch.where((bands <= high[..., None]) & mask[..., None], right, left)
+    run, place = expand_runs(left.flatten(), right.flatten())
+    row, column = torch.div(run, spans, rounding_mode="floor"), order.index_select(0, place)
+    columns, rows = keypoints.flatten(0, 1).unbind(1), pixels.flatten(0, 1).unbind(1)
+    off_x, off_y = (columns[k].index_select(0, column) - rows[k].index_select(0, row) for k in (0, 1))
+    squared = off_x.square_().add_(off_y.square_())
+    near = torch.nonzero(squared <= radius.flatten().square().index_select(0, row))[:, 0]
+    return row.index_select(0, near), column.index_select(0, near)
+
+
+def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """Expand the runs starts[k], ..., ends[k] - 1 into one list.
+
+    Args:
+        starts: (n,) int64 first numbers.
+        ends: (n,) int64 numbers after the last ones.
+
+    Returns:
+        The run (m,) of each number, ascending, and the numbers (m,).
+    """
+    if starts.is_cpu:
+        found = _expand_runs_numpy(starts.numpy(), ends.numpy())
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    counts = ends - starts
+    run = torch.repeat_interleave(counts)
+    shift = starts - (counts.cumsum(0) - counts)
+    return run, torch.arange(run.shape[0], device=run.device) + shift.index_select(0, run)
+
+
+def nearest_of_pairs(
+    row: Tensor,
+    column: Tensor,
+    distance: Tensor,
+    rows: int,
+    scales: Tensor,
+    ratio: float | None,
+    limit: int | float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose one column for each row among candidate pairs, each column at most once.
+
+    Of equal distances the lower column wins; of rows that share a column the nearest, then the lowest.
+
+    Args:
+        row: (P,) rows of the pairs, ascending.
+        column: (P,) columns of the pairs.
+        distance: (P,) int64 distances.
+        rows: number of rows.
+        scales: (N,) of the columns.
+        ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
+        limit: largest distance, finite.
+
+    Returns:
+        Rows (m,), ascending, their columns (m,) and their distances (m,).
+    """
+    if row.is_cpu:
+        pairs = row.numpy(), column.numpy(), distance.numpy()
+        found = _nearest_of_pairs_numpy(*pairs, scales.detach().numpy(), ratio, limit)
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2]).float()
+    columns = len(scales)
+    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    keys = distance * columns + column
+    unset = (int(limit) + 1) * columns
+    best = row.new_full((rows,), unset).scatter_reduce_(0, row, keys, "amin")
+    nearest, chosen = torch.div(best, columns, rounding_mode="floor"), best % columns
+    accepted = nearest <= limit
+    if ratio is not None:
+        of_nearest = scales.index_select(0, chosen).index_select(0, row)
+        rival = (scales.index_select(0, column) / of_nearest - 1).abs_() < SAME_SCALE
+        rival &= keys != best.index_select(0, row)
+        others = torch.where(rival, distance.float(), torch.inf)
+        second = others.new_full((rows,), torch.inf).scatter_reduce_(0, row, others, "amin")
+        accepted &= nearest < ratio * second
+    first = torch.nonzero(accepted)[:, 0]
+    partner = chosen.index_select(0, first)
+    # Likewise of the rows that share a column.
+    keys = nearest.index_select(0, first) * rows + first
+    least = keys.new_full((columns,), unset * rows).scatter_reduce_(0, partner, keys, "amin")
+    kept = torch.nonzero(least.index_select(0, partner) == keys)[:, 0]
+    first = first.index_select(0, kept)
+    return first, partner.index_select(0, kept), nearest.index_select(0, first).float()
+
+
+def _pairs_within_radius_numpy(
+    pixels: Array, radius: Array, mask: Array, keypoints: Array, keypoint_mask: Array
+) -> tuple[Array, Array]:
+    """`pairs_within_radius` on the CPU."""
+    (x, y), (at_x, at_y) = (np.ascontiguousarray(xy.reshape(-1, 2).T) for xy in (keypoints, pixels))
+    reach = radius.reshape(-1)
+    across = _CellAxis.of(x, _CELL_WIDTH, _MAX_COLUMNS)
+    down = _CellAxis.of(y, _CELL_HEIGHT, _MAX_ROWS)
+    columns = across.number
+    order, starts = _sorted_into_cells(x, y, keypoint_mask, across, down)
+
+    left, right = (across.cell_of(side) for side in (at_x - reach, at_x + reach))
+    top, bottom = (down.cell_of(side) for side in (at_y - reach, at_y + reach))
+    first = top * columns + left + _first_cells(mask.shape, down.number * columns)
+    bands = np.where(mask.reshape(-1), bottom - top + 1, 0)
+    window, band = _expand_runs_numpy(np.zeros_like(bands), bands)
+    begin = first.take(window) + band * columns
+    end = begin + (right - left + 1).take(window)
+    run, place = _expand_runs_numpy(starts.take(begin), starts.take(end))
+    row, column = window.take(run), order.take(place)
+
+    squared = x.take(column) - at_x.take(row)
+    squared *= squared
+    off_y = y.take(column) - at_y.take(row)
+    off_y *= off_y
+    squared += off_y
+    near = np.flatnonzero(squared <= np.square(reach).take(row))
+    return row.take(near), column.take(near)
+
+
+def _expand_runs_numpy(starts: Array, ends: Array) -> tuple[Array, Array]:
+    """`expand_runs` on the CPU."""
+    counts = ends - starts
+    run = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+    return run, np.arange(len(run), dtype=np.int64) + (starts - (np.cumsum(counts) - counts)).take(run)
+
+
+class _CellAxis(NamedTuple):
+    """Columns or rows of cells: their size in pixels, and their number; the outer ones hold all that lies beyond."""
+
+    size: float
+    number: int
+
+    @classmethod
+    def of(cls, values: Array, min_size: float, max_number: int) -> _CellAxis:
+        """Cells for coordinates (n,)."""
+        extent = max(float(values.max()), 0.0)
+        size = max(min_size, extent / max_number)
+        return cls(size, min(int(extent / size) + 1, max_number))
+
+    def cell_of(self, values: Array) -> Array:
+        """The column or row of each coordinate."""
+        found: Array = np.clip(np.floor(values * (1 / self.size)), 0, self.number - 1).astype(np.int64)
+        return found
+
+
+def _sorted_into_cells(
+    x: Array, y: Array, mask: Array, across: _CellAxis, down: _CellAxis
+) -> tuple[Array, Array]:
+    """Keypoints (B N,) sorted by image and cell, and the first of each cell: (B rows columns + 1,)."""
+    of_image = across.number * down.number
+    cell = down.cell_of(y) * across.number + across.cell_of(x) + _first_cells(mask.shape, of_image)
+    count = len(mask) * of_image
+    cell[~mask.reshape(-1)] = count  # behind all others
+    starts = np.zeros(count + 1, np.int64)
+    np.cumsum(np.bincount(cell, minlength=count)[:count], out=starts[1:])
+    # Numbers of sixteen bits are sorted digit by digit.
+    return np.argsort(cell.astype(np.uint16) if count < 1 << 16 else cell, kind="stable"), starts
+
+
+def _first_cells(shape: tuple[int, ...], cells: int) -> Array | int:
+    """The first cell of the image of each of (B N,) rows; shape: (B, N)."""
+    batch, rows = shape
+    return 0 if batch == 1 else np.repeat(np.arange(batch, dtype=np.int64) * cells, rows)
+
+
+def _nearest_of_pairs_numpy(
+    row: Array,
+    column: Array,
+    distance: Array,
+    scales: Array,
+    ratio: float | None,
+    limit: int | float,
+) -> tuple[Array, Array, Array]:
+    """`nearest_of_pairs` on the CPU."""
+    if len(row) == 0:
+        return row, column, distance
+    is_first = np.empty(len(row), dtype=bool)
+    is_first[0], is_first[1:] = True, row[1:] != row[:-1]
+    starts = np.flatnonzero(is_first)
+    columns = len(scales)
+    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    keys = distance * columns + column
+    best = np.minimum.reduceat(keys, starts)
+    nearest, chosen = np.divmod(best, columns)
+    accepted = nearest <= limit
+    if ratio is not None:
+        counts = np.diff(starts, append=len(row))
+        rival = np.abs(scales.take(column) / np.repeat(scales.take(chosen), counts) - 1) < SAME_SCALE
+        rival &= keys != np.repeat(best, counts)
+        second = np.minimum.reduceat(np.where(rival, distance, np.inf), starts)
+        accepted &= nearest < ratio * second
+    first, partner, nearest = (values[accepted] for values in (row.take(starts), chosen, nearest))
+    # Likewise of the rows that share a column: the last one that is written stays.
+    order = np.argsort(nearest * (row[-1] + 1) + first)[::-1]
+    winner = np.full(columns, -1)
+    winner[partner[order]] = order
+    kept = winner.take(partner) == np.arange(len(partner))
+    return first[kept], partner[kept], nearest[kept]
+
 
 SCALE_TOLERANCE = 1.5
 """Largest factor between the predicted and the found scale of a keypoint."""

@@ -1,8 +1,13 @@
-"""Detection of independently moving objects, such as a pedestrian, a hand or a car, which are masked out while in view.
+"""Keypoints that do not belong to the static scene: static overlays and independently moving objects.
 
-Two frames some way apart are matched by their descriptors alone. A point of the static scene must appear on the segment
-between its nearest and its farthest possible depth; matches that do not, and that one rigid motion explains, belong to
-a moving object. It is then followed from frame to frame by its descriptors, without a pose.
+A static overlay (a logo, subtitles, dirt on the lens, a part of the car) shows as keypoints that stay at their pixels
+although the camera moved so far that every point of the scene would have moved. Pixels with evidence from two different
+camera motions are masked out from then on.
+
+A moving object (a pedestrian, a hand, a car) shows in two frames some way apart, matched by their descriptors alone: a
+point of the static scene must appear on the segment between its nearest and its farthest possible depth; matches that
+do not, and that one rigid motion explains, belong to a moving object. It is then followed from frame to frame by its
+descriptors, without a pose, and masked out while in view.
 """
 
 from __future__ import annotations
@@ -12,16 +17,159 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchslam.config import IndependentMotionConfig, MatchingConfig
+from torchslam.config import Config, IndependentMotionConfig, MatchingConfig, StaticOverlayConfig
 from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
-from torchslam.tracking.correspondences import match_views
-from torchslam.tracking.dynamic.static_overlay import distances_to_segments
-from torchslam.tracking.match_selection import cell_numbers
+from torchslam.tracking.data_association import cell_numbers, image_cells, match_views
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
 
-_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
+_OVERLAY_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the possible depths of a keypoint
+_OVERLAY_STRIDE = 8  # stride of the keypoints in the first test whether the camera moved far enough
+_OVERLAY_PAUSE = 4  # frames without a comparison after one that found no overlay
+
+
+@dataclass(frozen=True)
+class _OverlayReference:
+    """A posed frame to compare later ones with.
+
+    pixels:   (n, 2) of its keypoints
+    points_c: (d, n, 3) their points at the possible depths
+    """
+
+    view: FrameFeatures
+    T_wc: Tensor
+    pixels: Tensor
+    points_c: Tensor
+
+    @classmethod
+    def of(cls, view: FrameFeatures, T_cw: Tensor, depth: float, camera: Camera) -> _OverlayReference:
+        pixels = view.keypoints[view.mask]
+        rays = camera.unproject(pixels)
+        depths = depth * rays.new_tensor(_OVERLAY_DEPTHS)
+        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None])
+
+
+class StaticOverlayDetector:
+    """Collects evidence of static overlays in a grid of image cells."""
+
+    def __init__(self, camera: Camera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
+        self.camera = camera
+        self.settings = settings
+        self.matching = matching
+        width, height = camera.size
+        shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
+        self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
+        self._last: _OverlayReference | None = None
+        self._pause = 0
+
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
+        """The view without the keypoints of known overlays."""
+        if not bool((self.evidence >= self.settings.min_evidence).any()):
+            return view
+        return replace(view, mask=view.mask & ~self.covers(view.keypoints))
+
+    def covers(self, pixels: Tensor) -> Tensor:
+        """(n,) bool, which pixels (n, 2) belong to a known overlay."""
+        row, column = self._cells(pixels)
+        return self.evidence[row, column] >= self.settings.min_evidence
+
+    def observe(self, view: FrameFeatures, T_cw: Tensor, depth: float) -> int:
+        """Compare a posed frame with an earlier one.
+
+        Args:
+            view: with all its keypoints
+            T_cw: (4, 4)
+            depth: median depth of the scene
+
+        Returns:
+            The number of cells that became known overlays.
+        """
+        last = self._last
+        if last is None or view.session != last.view.session:
+            self._last = _OverlayReference.of(view, T_cw, depth, self.camera)
+            return 0
+        self._pause -= 1
+        if self._pause >= 0 or not self._is_far(self._must_move(last, T_cw, _OVERLAY_STRIDE)):
+            return 0
+        moving = self._must_move(last, T_cw)
+        if not self._is_far(moving):
+            return 0
+        must_move = view.mask.new_zeros(len(last.view.mask))
+        must_move[last.view.mask] = moving
+        self._last = _OverlayReference.of(view, T_cw, depth, self.camera)
+        stayed = self._stayed(last.view, view, must_move)
+        before = int((self.evidence >= self.settings.min_evidence).sum())
+        if len(stayed) < self.settings.min_keypoints:
+            self.evidence[self.evidence < self.settings.min_evidence] = 0
+            self._pause = _OVERLAY_PAUSE
+            return 0
+        self._add(stayed)
+        return int((self.evidence >= self.settings.min_evidence).sum()) - before
+
+    def add(self, pixels: Tensor) -> None:
+        """Add evidence from another source: pixels (m, 2) that stayed in place while the scene moved."""
+        if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
+            self._add(pixels)
+
+    def _must_move(self, last: _OverlayReference, T_cw: Tensor, step: int = 1) -> Tensor:
+        """(n,) whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
+        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
+        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
+
+    def _is_far(self, must_move: Tensor) -> bool:
+        """Whether the camera moved far enough for a comparison: enough of the keypoints (n,) had to move."""
+        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
+
+    def restore(self, evidence: Tensor) -> None:
+        """Continue from the evidence of a checkpoint."""
+        self.evidence.copy_(evidence)
+
+    def forget_last(self) -> None:
+        """Compare the next frame with no earlier one: its pose is in another submap."""
+        self._last = None
+
+    def _stayed(self, earlier: FrameFeatures, view: FrameFeatures, candidates: Tensor) -> Tensor:
+        """(m, 2) pixels in `view` of candidates (N,), keypoints of an earlier view matched at their old pixel."""
+        rows = torch.nonzero(candidates)[:, 0]
+        matches = match_by_projection(
+            earlier.descriptors[rows][None],
+            earlier.keypoints[rows][None],
+            self.settings.radius_px,
+            view.features,
+            scales=earlier.scales[rows][None],
+            max_distance=self.settings.max_distance_ratio * max_distance(view.descriptors, self.matching),
+            ratio=None,
+        )
+        return view.keypoints[matches.indices_2[0][matches.mask[0]]]
+
+    def _add(self, pixels: Tensor) -> None:
+        """Increment the evidence of the cells of pixels (m, 2) and of their neighbors, each cell once."""
+        row, column = self._cells(pixels)
+        hit = torch.zeros_like(self.evidence)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                hit[(row + down).clamp(0, hit.shape[0] - 1), (column + right).clamp(0, hit.shape[1] - 1)] = 1
+        self.evidence += hit
+
+    def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows and columns (n,) of `evidence` for pixels (n, 2)."""
+        rows, columns = self.evidence.shape
+        size = (self.settings.cell_px, self.settings.cell_px)
+        column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
+        return row, column
+
+
+def distances_to_segments(points: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """(...) distances of points (..., 2) from the segments between starts and ends (..., 2)."""
+    along = ends - starts
+    length = (along * along).sum(-1).clamp(min=1e-12)
+    share = (((points - starts) * along).sum(-1) / length).clamp(0, 1)
+    return torch.linalg.vector_norm(points - starts - share[..., None] * along, dim=-1)
+
+
+_MOTION_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
 _NUM_NEIGHBORS = 3  # that vote on whether a keypoint belongs to the object
 _MOVING_PATIENCE = 10  # comparisons in which a keypoint that was seen to move may agree with the map
 _NEARBY_PATIENCE = 3  # the same, for a keypoint that is only near those
@@ -29,7 +177,7 @@ _MAX_DISTANCE_RATIO = 0.06  # of the image's width, from a keypoint of the objec
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Observation:
     """A frame to compare later ones with.
 
     T_cw:     (4, 4); None if it has no pose
@@ -88,7 +236,7 @@ class IndependentMotion:
         self.settings = settings
         self.matching = matching
         self._mover: _Mover | None = None
-        self._last: _Look | None = None  # with the keypoints that belonged then
+        self._last: _Observation | None = None  # with the keypoints that belonged then
         self._frames_since_comparison = 0
         self._frames_since_motion = 0  # against the scene
 
@@ -146,7 +294,7 @@ class IndependentMotion:
         last = self._last
         none = torch.zeros_like(view.mask, dtype=torch.int64)
         guess = none if self._mover is None else _NEARBY_PATIENCE * self._mover.belongs
-        look = _Look(view, T_cw, depth, guess)
+        look = _Observation(view, T_cw, depth, guess)
         self._last, self._frames_since_comparison = look, 0
         if last is None or view.session != last.view.session:
             return NOTHING
@@ -200,7 +348,7 @@ class IndependentMotion:
         """Number of image cells that contain pixels (n, 2)."""
         return len(torch.unique(cell_numbers(pixels, self.camera.size)))
 
-    def _errors(self, last: _Look, look: _Look, first: Tensor, second: Tensor) -> Tensor:
+    def _errors(self, last: _Observation, look: _Observation, first: Tensor, second: Tensor) -> Tensor:
         """(n,) distances of matches from where a point of the scene can be, in units of the keypoints' noise.
 
         Zero if a pose is unknown.
@@ -209,7 +357,7 @@ class IndependentMotion:
         if last.T_cw is None or look.T_cw is None:
             return seen.keypoints.new_zeros(len(first))
         rays = self.camera.unproject(seen.keypoints[first])
-        depths = last.depth * rays.new_tensor(_DEPTHS)
+        depths = last.depth * rays.new_tensor(_MOTION_DEPTHS)
         points_c = rays / rays[:, 2:] * depths[:, None, None]
         pixels, valid = self.camera.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
         distances = distances_to_segments(view.keypoints[second], pixels[:-1], pixels[1:])
@@ -247,3 +395,35 @@ class IndependentMotion:
         is_group = nearest < len(group)
         reach = distances.where(is_group, torch.inf).amin(-1) < _MAX_DISTANCE_RATIO * self.camera.width
         return reach & (2 * is_group.sum(-1) > k)
+
+
+class NonStaticFilter:
+    """Masks out keypoints of static overlays and moving objects, as far as each is enabled."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.config = config
+        self.static_overlay = StaticOverlayDetector(camera, config.static_overlay, config.matching)
+        self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
+
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
+        """The view without the keypoints known not to belong to the scene; call it once per frame, in order."""
+        self._view = view
+        self._without_overlays = self.static_overlay.mask_out(view)
+        return self.independent_motion.mask_out(self._without_overlays)
+
+    def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
+        """Detect keypoints of the newest view that move against the scene, given the view's pose."""
+        if not self.config.independent_motion.enabled:
+            return NOTHING
+        return self.independent_motion.observe(self._without_overlays, estimate)
+
+    def update_overlay(self, T_cw: Tensor, depth: float) -> bool:
+        """Update the overlays with the newest view and its pose (4, 4); return whether there are new ones."""
+        if not self.config.static_overlay.enabled:
+            return False
+        return self.static_overlay.observe(self._view, T_cw, depth) > 0
+
+    def forget_last(self) -> None:
+        """Compare the next frame with no earlier one: its pose is in another submap."""
+        self.static_overlay.forget_last()
+        self.independent_motion.forget_last()

@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import IndependentMotionConfig, MatchingConfig
 from torchslam.geometry import se3_inverse
-from torchslam.tracking.dynamic.independent_motion import IndependentMotion, Movement
+from torchslam.tracking.non_static import IndependentMotion, Movement
 from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(200)
@@ -33,7 +33,7 @@ def thing_at(index: int, speed: float) -> Tensor:
 
 def joined(one: FrameFeatures, other: FrameFeatures) -> FrameFeatures:
     """The keypoints of both."""
-    columns = ("keypoints", "scales", "angles", "descriptors", "mask")
+    columns = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
     return replace(one, **{name: torch.cat([getattr(one, name), getattr(other, name)]) for name in columns})
 
 

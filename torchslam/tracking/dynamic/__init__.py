@@ -1,1 +1,0 @@
-"""Matches that do not belong to the static scene: moving objects and overlays."""
