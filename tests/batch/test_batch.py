@@ -276,4 +276,4 @@ def test_errors_of_the_batch_are_one_line_with_status_2(
 def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'torchslam\[ray\]'"):
-        list(Engine("ray").each(run_row, [{}]))
+        list(Engine("ray").map_unordered(run_row, [{}]))

@@ -22,6 +22,6 @@ def test_same_bytes_with_one_worker_or_two(whole: Path, listed: Path, tmp_path: 
 
 
 def test_a_dying_worker_fails_only_its_row() -> None:
-    found = dict(Engine("ray", workers=1).each(answer, [{"number": number} for number in range(3)]))
+    found = dict(Engine("ray", workers=1).map_unordered(answer, [{"number": number} for number in range(3)]))
     expected = {number: {"twice": 2 * number, "nothing": None} for number in (0, 2)}
     assert found == {**expected, 1: None}

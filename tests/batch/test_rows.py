@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from torchslam.batch import Row, Shard, assign_names, parse_shard, read_list
+from torchslam.batch import Row, Shard, assign_names, read_list
+from torchslam.batch.engines import parse_shard
 from torchslam.batch.rows import COLUMNS, MAX_NAME
 from torchslam.errors import ConfigError, SequenceError
 
@@ -18,8 +19,8 @@ def test_a_text_list_has_one_path_per_line(tmp_path: Path) -> None:
     rows = read_list(tmp_path / "l.txt")
     assert [row.sequence for row in rows] == ["monday/rgb", "tuesday.mp4", "synthetic:room?frames=3"]
     assert [row.name for row in rows] == ["rgb", "tuesday", "synthetic-room-frames=3"]
-    assert rows[0].path("monday/rgb") == str(tmp_path / "monday/rgb")
-    assert rows[2].path(rows[2].sequence) == "synthetic:room?frames=3"
+    assert rows[0].resolve("monday/rgb") == str(tmp_path / "monday/rgb")
+    assert rows[2].resolve(rows[2].sequence) == "synthetic:room?frames=3"
 
 
 def test_a_csv_list_has_a_column_per_option(tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_unnamed_rows_get_unique_names() -> None:
 
 def test_row_options_override_defaults() -> None:
     row = Row("a", "a", overrides=("seed=2",), limit=3)
-    done = row.completed({"limit": 9, "stride": 2, "overrides": ("seed=1",), "camera": None})
+    done = row.with_defaults({"limit": 9, "stride": 2, "overrides": ("seed=1",), "camera": None})
     assert (done.limit, done.stride, done.overrides, done.camera) == (3, 2, ("seed=1", "seed=2"), None)
 
 

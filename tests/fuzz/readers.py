@@ -21,7 +21,7 @@ from tests.fuzz.sample_files import CONFIG, WALK, sample_files
 from tests.walks import T_cw
 from torchslam.batch import Row, Task, read_list
 from torchslam.batch.result_store import RUNS
-from torchslam.batch.results_table import gather, read_times
+from torchslam.batch.results_table import collect_rows, read_times
 from torchslam.batch.task import configuration
 from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
@@ -269,7 +269,7 @@ def _record(root: Path) -> None:
     for path in root.glob("*.json"):
         place.mkdir(parents=True, exist_ok=True)
         path.rename(place / path.name)
-    (row,) = gather([Task(Row("a", "missing"), str(root))], [RECORD_OF], root)
+    (row,) = collect_rows([Task(Row("a", "missing"), str(root))], [RECORD_OF], root)
     assert isinstance(row["status"], str)
     assert json.dumps(row, ensure_ascii=False).encode()
     assert all(

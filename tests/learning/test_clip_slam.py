@@ -187,8 +187,13 @@ def test_a_batch_equals_its_clips() -> None:
     torch.testing.assert_close(two.T_cw, torch.stack([one.T_cw, one.T_cw]), atol=1e-9, rtol=0)
     assert torch.equal(two.posed, torch.stack([one.posed, one.posed]))
     assert len(two.graphs) == len(two.solutions) == 2
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_images_have_the_dimensions_of_clips() -> None:
+    walk = Walk(arc(2, length=1.0))
     with pytest.raises(ValueError, match="images must be"):
-        clip_slam(images[0], walk.camera)
+        ClipSLAM(BentEyes(walk, bend=0.0))(clip_of(walk)[0][0], walk.camera)
 
 
 def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:

@@ -1,4 +1,4 @@
-"""Distribute the rows of a batch: over this process, the workers of Ray Data, or the jobs of an array (`--shard`)."""
+"""Run a batch: distribute its rows over this process, the workers of Ray Data, or the jobs of an array (`--shard`)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,27 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from torchslam.batch.result_store import Columns, store_failure
+from torchslam.batch.results_table import write_table
+from torchslam.batch.task import Task, configuration, run_row
 from torchslam.data.formats.text_file import parse_count
 from torchslam.errors import ConfigError
 
-Columns = dict[str, Any]
 Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
 RETRIES = 2
 """Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
 STORE_BYTES = 100 << 20
 """Size of a local cluster's object store: rows are small, and images do not pass through it."""
+LOST = (
+    f"its process died {RETRIES + 1} times, or could not start: "
+    "not enough memory, or torchslam is not installed where it ran"
+)
 
 
 @dataclass(frozen=True)
@@ -29,9 +36,13 @@ class Engine:
 
     Attributes:
         kind: One of `ENGINES`.
-        workers: Of Ray, see `ray_data`.
-        address: Of Ray, see `ray_data`.
+        workers: With Ray: maximum number at a time; None: the number of processors.
+        address: With Ray: of a cluster (`auto`, `ray://HOST:10001`), whose nodes have this package and the files at the
+            same paths; None: a temporary cluster of this machine.
         gpus: Needed by each worker.
+
+    Raises:
+        ConfigError: Unknown kind, or options of Ray without it.
     """
 
     kind: str = ENGINES[0]
@@ -45,7 +56,7 @@ class Engine:
         if self.kind != "ray" and (self.workers not in (None, 1) or self.address is not None):
             raise ConfigError("--workers and --address need --engine ray")
 
-    def each(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
+    def map_unordered(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
         """Yield the index of each row with its result as they finish; None if the process died or could not start.
 
         Args:
@@ -57,22 +68,16 @@ class Engine:
         """
         rows = list(rows)
         if self.kind == "ray":
-            yield from ray_data(work, rows, self.workers, self.address, self.gpus)
+            yield from _map_with_ray(work, rows, self.workers, self.address, self.gpus)
             return
         for number, row in enumerate(rows):
             yield number, work(json.loads(json.dumps(row)))
 
 
-def ray_data(
+def _map_with_ray(
     work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
 ) -> Iterator[tuple[int, Columns | None]]:
-    """Run `Engine.each` as Ray tasks of one row and one processor each.
-
-    Args:
-        workers: maximum number of workers at a time; None: the number of processors
-        address: address of a cluster (`auto`, `ray://HOST:10001`), whose nodes have this package and the files at the
-            same paths; None: a temporary cluster of this machine
-    """
+    """Run `Engine.map_unordered` as Ray tasks of one row and one processor each."""
     ray, data = _import_ray()
     _start(ray, workers, address)
     try:
@@ -143,7 +148,11 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on."""
+    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on.
+
+    Raises:
+        ConfigError: The index is not in range.
+    """
 
     index: int = 0
     count: int = 1
@@ -159,7 +168,8 @@ class Shard:
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     """Parse `i/n` with i from 0 to n - 1, or `auto`, the index of a Slurm array or a Kubernetes indexed job.
 
-    Raises ConfigError for anything else, and if the environment lacks the index.
+    Raises:
+        ConfigError: Anything else, or the environment lacks the index.
     """
     if text == AUTO:
         return _of_system(environment)
@@ -171,7 +181,7 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard
 
 
 def _of_system(environment: Mapping[str, str]) -> Shard:
-    """The shard of SLURM_ARRAY_TASK_ID in its array, or of JOB_COMPLETION_INDEX in JOB_COMPLETIONS."""
+    """Return the shard of SLURM_ARRAY_TASK_ID in its array, or of JOB_COMPLETION_INDEX in JOB_COMPLETIONS."""
 
     def number(name: str) -> int:
         found = parse_count(environment.get(name, ""))
@@ -192,3 +202,41 @@ def _of_system(environment: Mapping[str, str]) -> Shard:
     raise ConfigError(
         "--shard auto: neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX is set: not a job of an array"
     )
+
+
+def run_batch(
+    tasks: Sequence[Task],
+    engine: Engine | None = None,
+    shard: Shard | None = None,
+    on_progress: Callable[[Columns], None] = lambda columns: None,
+) -> list[Columns]:
+    """Run the unfinished tasks of a shard, and write the table of all tasks.
+
+    Args:
+        tasks: All with the same `output`.
+        engine: Where they run; in this process if None.
+        shard: Which of them run here; all if None.
+        on_progress: Receives the columns of each finished task of the shard.
+
+    Returns:
+        The columns of the shard's tasks in the order of the tasks; `is_new` says whether they were run now.
+
+    Raises:
+        ConfigError: The engine is not available.
+        OSError: The table cannot be written.
+    """
+    engine, shard = engine or Engine(), shard or Shard()
+    mine = tasks[shard.index :: shard.count]
+    found: dict[int, Columns] = {}
+    for number, columns in engine.map_unordered(run_row, [task.as_dict() for task in mine]):
+        found[number] = _lost(mine[number]) if columns is None else columns
+        on_progress(found[number])
+    if tasks:
+        write_table(tasks, Path(tasks[0].output))
+    return [found[number] for number in range(len(mine))]
+
+
+def _lost(task: Task) -> Columns:
+    """Record the error of a row whose process died."""
+    known = {"name": task.row.name, "configuration": configuration(task)}
+    return store_failure(Path(task.output), known, LOST)

@@ -91,7 +91,11 @@ def store_failure(output: Path, known: Columns, message: str, trace: str = "") -
 
 
 def read_stored(output: Path, name: str, configuration: str) -> Columns:
-    """The record of a row's results or of its error, if of this configuration; otherwise the status `open`."""
+    """Return the record of a row's results or of its error, if of this configuration; otherwise the status `open`.
+
+    Raises:
+        ResultsError: A record is not readable.
+    """
     for path in (output / RUNS / name / RECORD, output / ERRORS / f"{name}.json"):
         record = read_record(path)
         if record is not None and record.get("configuration") == configuration:
@@ -100,7 +104,11 @@ def read_stored(output: Path, name: str, configuration: str) -> Columns:
 
 
 def read_record(path: Path) -> Columns | None:
-    """Read the columns of a record; None if there is no file. Raises ResultsError for other content."""
+    """Read the columns of a record; None if there is no file.
+
+    Raises:
+        ResultsError: The file is not a record, or not readable.
+    """
     try:
         record = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
     except (FileNotFoundError, NotADirectoryError):
@@ -154,7 +162,10 @@ def hash_files(paths: list[str]) -> str:
     """Hash names, sizes and modification times of files, of folders with their content, and of patterns.
 
     Missing files count as such. The content is not read: that would take as long as reading all images at each start.
-    Raises SequenceError for too many files, OSError for folders that cannot be listed.
+
+    Raises:
+        SequenceError: There are more than `MAX_FILES` files.
+        OSError: A folder cannot be listed.
     """
     found = hashlib.sha256()
     for path in paths:
@@ -170,7 +181,10 @@ def hash_files(paths: list[str]) -> str:
 def hash_content(path: str) -> str:
     """Hash the content of a file, for example of weights, whose size and time may be the same as the last one's.
 
-    Anything but a file counts as in `hash_files`. Raises OSError for a file that cannot be read.
+    Anything but a file counts as in `hash_files`.
+
+    Raises:
+        OSError: The file cannot be read.
     """
     if not os.path.isfile(path):
         return hash_files([path])

@@ -48,11 +48,15 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
     """Write table and plot of all rows of the list, those of other shards included; return the rows.
 
     Unfinished rows have the status `open`. Each process reads all results again after writing, so the table is complete
-    in the end whichever process writes last. Raises ResultsError, OSError.
+    in the end whichever process writes last.
+
+    Raises:
+        ResultsError: The times of a run are not readable.
+        OSError: A file cannot be written.
     """
     configurations = [_configuration(task) for task in tasks]
     rows: list[Columns] | None = None
-    while (found := gather(tasks, configurations, output)) != rows:
+    while (found := collect_rows(tasks, configurations, output)) != rows:
         rows = found
         _put(output / CSV, _csv(rows, COLUMNS).encode())
         _put(output / TIMES_CSV, _csv(_times(rows, output), TIME_COLUMNS).encode())
@@ -62,7 +66,7 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
     return found
 
 
-def counts(rows: Sequence[Mapping[str, Any]]) -> str:
+def describe_statuses(rows: Sequence[Mapping[str, Any]]) -> str:
     """Describe the number of rows per status."""
     statuses = [row["status"] for row in rows]
     labels = {DONE: "done", NO_MAP: "without a map", ERROR: "with an error", "open": "not yet run"}
@@ -70,11 +74,13 @@ def counts(rows: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(found)
 
 
-def gather(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
+def collect_rows(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
     """Read the rows of the table from the records in the folder of a batch; an invalid record is an error row.
 
     Args:
-        configurations: configuration of each task by `task.configuration`; empty if that failed
+        tasks: All rows of the list.
+        configurations: Configuration of each task by `task.configuration`; empty if that failed.
+        output: Folder of the batch.
     """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):
@@ -109,7 +115,11 @@ def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
 
 
 def read_times(folder: Path) -> Columns:
-    """Read times.json; empty if there is none. Raises ResultsError."""
+    """Read times.json; empty if there is none.
+
+    Raises:
+        ResultsError: It is not readable.
+    """
     path = folder / TIMES
     try:
         times = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
@@ -160,7 +170,7 @@ def _picture(rows: Sequence[Columns]) -> bytes:
         [row["status"] for row in rows],
         shares,
         errors,
-        f"{len(rows)} sequences: {counts(rows)}",
+        f"{len(rows)} sequences: {describe_statuses(rows)}",
     )
     return plots.png(figure)
 

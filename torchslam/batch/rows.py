@@ -54,11 +54,11 @@ class Row:
     mask: str | None = None
     folder: str = ""
 
-    def path(self, name: str) -> str:
+    def resolve(self, name: str) -> str:
         """Resolve a file or folder that the row names."""
         return name if is_synthetic(name) else str(Path(self.folder, name))
 
-    def completed(self, defaults: Mapping[str, Any]) -> Row:
+    def with_defaults(self, defaults: Mapping[str, Any]) -> Row:
         """Fill in defaults for what the row does not set; overrides of the defaults come before its own."""
         own = {key: value for key, value in asdict(self).items() if value not in (None, ())}
         both = (*defaults.get("overrides", ()), *self.overrides)
@@ -72,7 +72,10 @@ def read_list(path: str | Path) -> list[Row]:
     """Read a list: a CSV file with a header of `COLUMNS`, or a text file with a path per line and `#` for comments.
 
     Paths are relative to the folder of the list. A row without a name is named by the last part of its path, with a
-    number if that is taken. Raises SequenceError with file and line.
+    number if that is taken.
+
+    Raises:
+        SequenceError: The list is not valid; the message has file and line.
     """
     path = Path(path)
     table = _cells if path.suffix.lower() == ".csv" else _lines
@@ -90,7 +93,11 @@ def read_list(path: str | Path) -> list[Row]:
 
 
 def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
-    """Give each row a unique name. Raises SequenceError, with `where` in its message, if two have the same one."""
+    """Give each row without a name a unique one.
+
+    Raises:
+        SequenceError: Two rows have the same name; `where` is in the message.
+    """
     rows = list(rows)
     # Folders that differ only in case are the same on some systems.
     given = Counter(row.name.casefold() for row in rows if row.name)

@@ -99,12 +99,20 @@ def run_row(task: Mapping[str, Any]) -> Columns:
 
 
 def settings_of(row: Row) -> Config:
-    """Load the configuration of a row. Raises ConfigError."""
-    return load_config(None if row.config is None else row.path(row.config), row.overrides)
+    """Load the configuration of a row.
+
+    Raises:
+        ConfigError: It is not valid.
+    """
+    return load_config(None if row.config is None else row.resolve(row.config), row.overrides)
 
 
 def configuration(task: Task) -> str:
-    """Hash everything that the results depend on except the input files. Raises ConfigError."""
+    """Hash everything that the results depend on except the input files.
+
+    Raises:
+        ConfigError: The settings of the row are not valid.
+    """
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
     return hash_json(
         {
@@ -121,7 +129,7 @@ def _input(task: Task) -> str:
     """Hash the files that the row reads."""
     row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
-    files = hash_files([row.path(name) for name in names if name])
+    files = hash_files([row.resolve(name) for name in names if name])
     weights = [settings.features.weights, settings.matching.weights]
     return hash_json({"files": files, "weights": [hash_content(name) for name in weights if name]})
 
@@ -129,15 +137,18 @@ def _input(task: Task) -> str:
 def open_row(row: Row) -> Sequence:
     """Open the sequence of a row with its camera and ground truth.
 
-    Raises SequenceError, CalibrationError or TrajectoryError.
+    Raises:
+        SequenceError: The sequence cannot be opened, or is a live source.
+        CalibrationError: The camera is not valid.
+        TrajectoryError: The ground truth is not valid.
     """
-    if is_live(row.sequence) and not Path(row.path(row.sequence)).exists():
+    if is_live(row.sequence) and not Path(row.resolve(row.sequence)).exists():
         raise SequenceError(f"{row.sequence}: a live source has no end and is not repeatable")
     camera = row.camera
-    if camera is not None and Path(row.path(camera)).is_file():
-        camera = row.path(camera)
+    if camera is not None and Path(row.resolve(camera)).is_file():
+        camera = row.resolve(camera)
     sequence = open_sequence(
-        row.path(row.sequence),
+        row.resolve(row.sequence),
         camera,
         fps=row.fps,
         limit=row.limit,
@@ -145,10 +156,10 @@ def open_row(row: Row) -> Sequence:
         start=row.start or 0,
         stop=row.stop,
         resize_to=row.resize,
-        mask=None if row.mask is None else row.path(row.mask),
+        mask=None if row.mask is None else row.resolve(row.mask),
     )
     if row.groundtruth is not None:
-        sequence = WithGroundTruth(sequence, read_trajectory(row.path(row.groundtruth)))
+        sequence = WithGroundTruth(sequence, read_trajectory(row.resolve(row.groundtruth)))
     return sequence
 
 
@@ -168,7 +179,7 @@ def _run(task: Task, folder: Path) -> Columns:
     metrics = compute_metrics(finished, sequence, camera)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
-    metrics |= {"source": full_name(row.path(row.sequence)), "source_fps": row.fps}
+    metrics |= {"source": full_name(row.resolve(row.sequence)), "source_fps": row.fps}
     write_run(_without_times(finished), sequence, metrics, folder, plots=task.plots, viewer=task.plots)
     return {
         "sequence": row.sequence,

@@ -32,8 +32,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from torchslam.batch import DONE, ENGINES, ERROR, Columns, Engine, Task, parse_shard, read_list, run_batch
-from torchslam.batch.results_table import CSV, counts
+from torchslam.batch import DONE, ERROR, Columns, Engine, Task, read_list, run_batch
+from torchslam.batch.engines import ENGINES, parse_shard
+from torchslam.batch.results_table import CSV, describe_statuses
 from torchslam.cli import arguments
 from torchslam.cli.progress import SIGNALS, STATUS
 
@@ -80,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    rows = [row.completed(_defaults(options)) for row in read_list(options.list)]
+    rows = [row.with_defaults(_defaults(options)) for row in read_list(options.list)]
     arguments.config(options)  # report an invalid configuration once
     output, device = str(options.output.absolute()), options.device
     tasks = [Task(row, output, str(device), options.overwrite, not options.no_plots) for row in rows]
@@ -90,7 +91,7 @@ def execute(options: argparse.Namespace) -> int:
         progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
         found = run_batch(tasks, engine, shard, progress.report)
     new = sum(columns["is_new"] for columns in found)
-    print(f"{len(found)} sequences: {counts(found)}; {len(found) - new} of them already existed")
+    print(f"{len(found)} sequences: {describe_statuses(found)}; {len(found) - new} of them already existed")
     print(f"table: {options.output / CSV}")
     return ERRORS if any(columns["status"] == ERROR for columns in found) else 0
 

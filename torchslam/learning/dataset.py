@@ -9,6 +9,7 @@ from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -33,18 +34,18 @@ class Clip:
     """T frames of a sequence, or B clips of T frames.
 
     Attributes:
-        images: (T, 1, H, W) or (B, T, 1, H, W) float32 in [0, 1].
-        T_cw: (T, 4, 4) or (B, T, 4, 4) float64 true poses, world to camera, meters; the identity where unknown.
-        known: (T,) or (B, T) bool, where there is a true pose.
-        camera: With params (K,) or (B, K).
-        number: () or (B,) int64 index in the data set.
+        images: Gray, in [0, 1].
+        T_cw: True poses, world to camera, meters, float64; the identity where unknown.
+        known: Whether there is a true pose.
+        camera: With params (P,) or (B, P).
+        number: Index in the data set.
     """
 
-    images: Tensor
-    T_cw: Tensor
-    known: Tensor
+    images: Float[Tensor, "*batch T 1 H W"]
+    T_cw: Float[Tensor, "*batch T 4 4"]
+    known: Bool[Tensor, "*batch T"]
     camera: Camera
-    number: Tensor
+    number: Int[Tensor, "*batch"]
 
     @classmethod
     def of(
@@ -58,7 +59,16 @@ class Clip:
     ) -> Clip:
         """Read the frames `start`, `start + stride`, ... of a sequence.
 
-        Raises SequenceError if the sequence is too short or, if `supervised`, lacks the true pose of one of them.
+        Args:
+            sequence: With a camera.
+            start: First frame.
+            frames: T.
+            stride: Frames from one to the next.
+            number: Index in the data set.
+            supervised: Whether every frame must have a true pose.
+
+        Raises:
+            SequenceError: The sequence is too short or, if `supervised`, lacks the true pose of one of the frames.
         """
         indices = range(start, start + frames * stride, stride)
         if indices[-1] >= len(sequence):
@@ -87,8 +97,10 @@ class Clip:
 def collate(clips: Several[Clip]) -> Clip:
     """Stack clips of one each into one of B clips, with a camera for each; for `DataLoader(collate_fn=collate)`.
 
-    Pinhole cameras get distortion coefficients of zero where others are distorted. Raises ValueError for different
-    sizes or numbers of frames, and for fisheye cameras mixed with others.
+    Pinhole cameras get distortion coefficients of zero where others are distorted.
+
+    Raises:
+        ValueError: Different sizes or numbers of frames, or fisheye cameras mixed with others.
     """
     sizes = {tuple(clip.images.shape) for clip in clips}
     if len(sizes) > 1 or len({clip.camera.size for clip in clips}) > 1:
@@ -105,7 +117,11 @@ def collate(clips: Several[Clip]) -> Clip:
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """Stack B cameras of one size into one with params (B, K); pinholes are padded where others are distorted."""
+    """Stack B cameras of one size into one with params (B, P); pinholes are padded where others are distorted.
+
+    Raises:
+        ValueError: Different sizes, or models that cannot be mixed.
+    """
     models = {camera.model for camera in cameras}
     if models == {"pinhole", "radial_tangential"}:
         width = max(camera.params.shape[-1] for camera in cameras)
@@ -117,7 +133,7 @@ def stack_cameras(cameras: Several[Camera]) -> Camera:
 
 
 def frames_in(seconds: float, sequence: Sequence) -> int:
-    """The number of frames in a time, at least one."""
+    """Return the number of frames in a time, at least one."""
     return max(1, round(seconds * sequence.frame_rate))
 
 
@@ -129,8 +145,12 @@ class Clips(Dataset[Clip]):
 
     A clip starts at a random frame. Its stride is the least of 1, 2, 4, ... for which matches between the first and
     the last frame have a median parallax of `min_parallax`. Starts without such a stride, or with fewer than
-    `MIN_MATCHES` matches, are skipped. The same arguments give the same clips. `chosen` has (sequence, start, stride)
-    of each clip.
+    `MIN_MATCHES` matches, are skipped. The same arguments give the same clips.
+
+    Attributes:
+        sequences: The sequences.
+        frames: Number of frames of a clip.
+        chosen: (sequence, start, stride) of each clip.
 
     Args:
         sequences: Sequences with cameras.
@@ -156,6 +176,7 @@ class Clips(Dataset[Clip]):
         supervised: bool = True,
         seed: int = 0,
     ) -> None:
+        """Select the clips."""
         self.sequences, self.frames = list(sequences), frames
         self.chosen: list[tuple[int, int, int]] = []
         generator = torch.Generator().manual_seed(seed)
@@ -174,7 +195,11 @@ class Clips(Dataset[Clip]):
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Clip:
-        """Read a clip. Raises FrameError if an image cannot be read."""
+        """Read a clip.
+
+        Raises:
+            FrameError: An image cannot be read.
+        """
         sequence, start, stride = self.chosen[number]
         return Clip.of(self.sequences[sequence], start, self.frames, stride, number)
 
@@ -191,11 +216,15 @@ class Batches(Sampler[list[int]]):
         first: Number of the first batch.
         rank: Of this process.
         ranks: Number of processes.
+
+    Raises:
+        ValueError: No clips, or batches without clips.
     """
 
     def __init__(
         self, length: int, batch: int, seed: int = 0, first: int = 0, rank: int = 0, ranks: int = 1
     ) -> None:
+        """Keep the arguments."""
         if length < 1 or batch < 1:
             raise ValueError(f"batches need at least one clip: batch size {batch}, {length} clips")
         self.length, self.batch, self.seed, self.first = length, batch, seed, first
@@ -222,6 +251,7 @@ class GraphCache:
     """
 
     def __init__(self, clip_slam: ClipSLAM) -> None:
+        """Copy the front end and the configuration of a module."""
         self._clip_slam = ClipSLAM(copy.deepcopy(clip_slam.extractor), config=clip_slam.config)
         self._graphs: dict[int, ClipGraph] = {}
 
@@ -235,14 +265,16 @@ class GraphCache:
 
 
 @torch.no_grad()
-def parallax(first: Features, second: Features, camera: Camera, R_21: Tensor | None = None) -> float:
+def parallax(
+    first: Features, second: Features, camera: Camera, R_21: Float[Tensor, "3 3"] | None = None
+) -> float:
     """Measure the median angle between the rays of matches after rotation compensation, in radians.
 
     Args:
         first: Features of one image.
         second: Features of another one.
         camera: Of both.
-        R_21: (3, 3) rotation from the first camera to the second; estimated if None.
+        R_21: Rotation from the first camera to the second; estimated if None.
 
     Returns:
         Radians; zero with fewer than `MIN_MATCHES` matches, or if the relative pose cannot be estimated.
@@ -272,7 +304,7 @@ class _Seen:
         self._features: dict[int, Features] = {}
 
     def stride(self, start: int, steps: int, least: float, most: int) -> int:
-        """The least of 1, 2, 4, ... `most` with enough parallax to the frame `steps` strides later; 0 for none."""
+        """The least of 1, 2, 4, ..., `most` with enough parallax to the frame `steps` strides later; 0 for none."""
         stride = 1
         while stride <= most and start + steps * stride < len(self._sequence):
             first, second = start, start + steps * stride
@@ -285,6 +317,7 @@ class _Seen:
         return 0
 
     def lacks_poses(self, start: int, frames: int, stride: int) -> bool:
+        """Test whether a frame of a clip has no true pose."""
         return any(self._sequence.pose(start + row * stride) is None for row in range(frames))
 
     def _of(self, index: int) -> Features:

@@ -12,6 +12,7 @@ import math
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.evaluation import ate, rpe
@@ -44,22 +45,26 @@ __all__ = [
 
 
 @full_precision
-def path_length(T_cw: Tensor) -> Tensor:
-    """Compute the length (...) of the path through poses (..., N, 4, 4), in their unit."""
+def path_length(T_cw: Float[Tensor, "*batch N 4 4"]) -> Float[Tensor, "*batch"]:
+    """Compute the length of the path through poses, in their unit."""
     return se3_inverse(T_cw)[..., :3, 3].diff(dim=-2).norm(dim=-1).sum(-1)
 
 
 @full_precision
-def relative_ate(T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = None) -> Tensor:
+def relative_ate(
+    T_cw: Float[Tensor, "*batch N 4 4"],
+    T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
+    mask: Bool[Tensor, "*batch N"] | None = None,
+) -> Float[Tensor, "*batch"]:
     """Compute the ATE relative to the length of the true path, comparable between clips of any size.
 
     Args:
-        T_cw: (..., N, 4, 4).
-        T_cw_groundtruth: (..., N, 4, 4); all of it is the path.
-        mask: (..., N) poses that count.
+        T_cw: Estimated poses.
+        T_cw_groundtruth: True poses; all of them make up the path.
+        mask: Poses that count.
 
     Returns:
-        (...), NaN where fewer than three poses count or the true camera does not move.
+        A ratio, NaN where fewer than three poses count or the true camera does not move.
     """
     length = path_length(T_cw_groundtruth)
     share = ate(T_cw, T_cw_groundtruth, mask) / torch.where(length > 0, length, 1.0)
@@ -67,12 +72,14 @@ def relative_ate(T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = N
 
 
 @full_precision
-def pose_errors(T_cw: Tensor, T_cw_groundtruth: Tensor) -> Tensor:
-    """Compute the distance between poses (..., 4, 4) in the same world frame.
+def pose_errors(
+    T_cw: Float[Tensor, "*#batch 4 4"], T_cw_groundtruth: Float[Tensor, "*#batch 4 4"]
+) -> Float[Tensor, "*#batch 2"]:
+    """Compute the distance between poses in the same world frame.
 
     Returns:
-        (..., 2): distance of the camera centers, in the unit of the translations, and angle, radians. The gradient is
-        zero where the error is.
+        Distance of the camera centers, in the unit of the translations, and angle, radians. The gradient is zero where
+        the error is.
     """
     difference = T_cw @ se3_inverse(T_cw_groundtruth)
     vectors = torch.stack((difference[..., :3, 3], so3_log(difference[..., :3, :3])), dim=-2)
@@ -80,11 +87,13 @@ def pose_errors(T_cw: Tensor, T_cw_groundtruth: Tensor) -> Tensor:
 
 
 @full_precision
-def motion_difference(T_21: Tensor, T_21_groundtruth: Tensor) -> Tensor:
-    """Compute the rotation and direction errors of motions (..., 4, 4), independent of the translations' lengths.
+def motion_difference(
+    T_21: Float[Tensor, "*#batch 4 4"], T_21_groundtruth: Float[Tensor, "*#batch 4 4"]
+) -> Float[Tensor, "*#batch 2 3"]:
+    """Compute the rotation and direction errors of motions, independent of the translations' lengths.
 
     Returns:
-        Rotation vectors (..., 2, 3), radians: of the rotation, and of the direction of the translation (zero where a
+        Rotation vectors, radians: of the rotation, and of the direction of the translation (zero where a
         translation is). Their lengths are the usual errors of relative poses.
     """
     t, t_true = (F.normalize(T[..., :3, 3], dim=-1) for T in (T_21, T_21_groundtruth))
@@ -97,22 +106,22 @@ def motion_difference(T_21: Tensor, T_21_groundtruth: Tensor) -> Tensor:
 
 @full_precision
 def pose_nll(
-    T_cw: Tensor, T_cw_groundtruth: Tensor, covariance: Tensor, mask: Tensor | None = None
-) -> Tensor:
+    T_cw: Float[Tensor, "*#batch N 4 4"],
+    T_cw_groundtruth: Float[Tensor, "*#batch N 4 4"],
+    covariance: Float[Tensor, "*#batch N 6 6"],
+    mask: Bool[Tensor, "*#batch N"] | None = None,
+) -> Float[Tensor, "*#batch"]:
     """Compute the mean negative log-likelihood of the true poses, in nats.
 
     An error xi with covariance S costs (xi^T S^-1 xi + log det S + 6 log 2 pi) / 2. Poses whose covariance is not
     positive definite do not count.
 
     Args:
-        T_cw: (..., N, 4, 4).
-        T_cw_groundtruth: (..., N, 4, 4) in the same world and unit.
-        covariance: (..., N, 6, 6) of the left perturbation (translation, rotation) of T_cw: of a solver (detached, so
-            it only weights the errors) or predicted by a network.
-        mask: (..., N) poses that count; others may have any covariance.
-
-    Returns:
-        (...).
+        T_cw: Estimated poses.
+        T_cw_groundtruth: True poses in the same world and unit.
+        covariance: Of the left perturbation (translation, rotation) of T_cw: of a solver (detached, so it only weights
+            the errors) or predicted by a network.
+        mask: Poses that count; others may have any covariance.
     """
     xi = se3_log(T_cw_groundtruth @ se3_inverse(T_cw))
     eye = torch.eye(6, dtype=xi.dtype, device=xi.device)
@@ -130,29 +139,29 @@ def pose_nll(
 
 @full_precision
 def epipolar_loss(
-    T_21: Tensor,
-    pixels_1: Tensor,
-    pixels_2: Tensor,
+    T_21: Float[Tensor, "*#batch 4 4"],
+    pixels_1: Float[Tensor, "*#batch N 2"],
+    pixels_2: Float[Tensor, "*#batch N 2"],
     camera_1: Camera,
     camera_2: Camera,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "*#batch N"] | None = None,
     kernel: Kernel = "cauchy",
     scale: float = 1.0,
-) -> Tensor:
+) -> Float[Tensor, "*#batch"]:
     """Compute the mean robust squared Sampson distance of matches; needs no depth and no ground truth.
 
     Args:
-        T_21: (..., 4, 4), with a translation of any length but zero, which would fit everything.
-        pixels_1: (..., N, 2).
-        pixels_2: (..., N, 2).
+        T_21: With a translation of any length but zero, which would fit everything.
+        pixels_1: Of the first images.
+        pixels_2: Matching pixels of the second images.
         camera_1: Of the first images.
         camera_2: Of the second images.
-        mask: (..., N) matches that count.
+        mask: Matches that count.
         kernel: Robust kernel.
         scale: Of the kernel, pixels.
 
     Returns:
-        (...), px^2.
+        px^2.
     """
     counted = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     counted = counted if mask is None else counted & mask
@@ -166,27 +175,27 @@ def epipolar_loss(
 
 @full_precision
 def reprojection_loss(
-    T_cw: Tensor,
-    pixels: Tensor,
+    T_cw: Float[Tensor, "*#batch V 4 4"],
+    pixels: Float[Tensor, "*#batch N V 2"],
     camera: Camera,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "*#batch N V"] | None = None,
     kernel: Kernel = "cauchy",
     scale: float = 1.0,
-) -> Tensor:
+) -> Float[Tensor, "*#batch"]:
     """Compute the mean robust reprojection error of points triangulated from tracks, differentiably.
 
     A point behind one of its views does not count: make sure that the network cannot gain by moving it there.
 
     Args:
-        T_cw: (..., V, 4, 4) poses of the views: true ones, or estimated ones for self-supervision.
-        pixels: (..., N, V, 2).
+        T_cw: Poses of the views: true ones, or estimated ones for self-supervision.
+        pixels: Of the points in the views.
         camera: Of all views.
-        mask: (..., N, V) which views see a point; a point needs two.
+        mask: Which views see a point; a point needs two.
         kernel: Robust kernel.
         scale: Of the kernel on the root of a point's sum of squares, pixels.
 
     Returns:
-        (...), px^2: mean over points of the robust sum of squares.
+        px^2: mean over points of the robust sum of squares.
     """
     points = triangulate_many(T_cw, pixels, camera, mask)
     seen = points.errors.isfinite()
@@ -195,7 +204,9 @@ def reprojection_loss(
 
 
 @full_precision
-def clip_reprojection(poses: ClipPoses, kernel: Kernel = "cauchy", scale: float = 1.0) -> Tensor:
+def clip_reprojection(
+    poses: ClipPoses, kernel: Kernel = "cauchy", scale: float = 1.0
+) -> Float[Tensor, "*batch"]:
     """Compute the robust reprojection error of clips against their own solution; needs no ground truth.
 
     Observations of frames without a pose and of points that were not optimized do not count. All observations weigh the
@@ -207,7 +218,7 @@ def clip_reprojection(poses: ClipPoses, kernel: Kernel = "cauchy", scale: float 
         scale: Of the kernel, pixels.
 
     Returns:
-        (B,), or () for one clip, px^2: mean over the observations, for `clip_mean`.
+        px^2, one per clip: mean over the observations, for `clip_mean`.
     """
     means = []
     for T_cw, graph, solution in zip(
@@ -223,12 +234,12 @@ def clip_reprojection(poses: ClipPoses, kernel: Kernel = "cauchy", scale: float 
     return torch.stack(means) if poses.T_cw.ndim == 4 else means[0]
 
 
-def _robust(squared: Tensor, kernel: Kernel, scale: float) -> Tensor:
-    """rho of squares (...)."""
+def _robust(squared: Float[Tensor, "*batch"], kernel: Kernel, scale: float) -> Float[Tensor, "*batch"]:
+    """The kernel's rho of squares."""
     return robustify(squared, kernel, squared.new_tensor(scale)).rho
 
 
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
-    """The mean of the rows (..., N) that count; NaN, with a gradient of zero, where there is none."""
+def _mean(values: Float[Tensor, "*batch N"], mask: Bool[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+    """The mean of the rows that count; NaN, with a gradient of zero, where there is none."""
     total = torch.where(mask, values, 0.0).sum(-1)
     return torch.where(mask.any(-1), total / mask.sum(-1).clamp_min(1), torch.nan)

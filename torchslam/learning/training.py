@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
@@ -24,9 +25,8 @@ Log = Callable[[str, float, int], None]
 MAX_NORM = 1.0
 """Of the gradient: one step through a poorly determined pose must not undo a hundred others."""
 
-_SEED_STRIDE = (
-    1_000_003  # a prime: the 32-bit seeds of steps and epochs rarely collide with those of other seeds
-)
+# A prime: the 32-bit seeds of steps and epochs rarely collide with those of other seeds.
+_SEED_STRIDE = 1_000_003
 
 
 class Training:
@@ -68,6 +68,7 @@ class Training:
         schedule: LRScheduler | None = None,
         max_norm: float = MAX_NORM,
     ) -> None:
+        """Start at step 0."""
         self.module, self.optimizer, self.steps, self.log = module, optimizer, steps, log
         self._seed, self._max_norm = seed, max_norm
         self.step = 0
@@ -82,16 +83,21 @@ class Training:
             torch.manual_seed(seed_of(self._seed, self.step * ranks + rank))
             yield self.step
 
-    def descend(self, loss: Tensor) -> None:
-        """Backpropagate a loss () and make one step."""
+    def descend(self, loss: Float[Tensor, ""]) -> None:
+        """Backpropagate a loss and make one step.
+
+        Raises:
+            RuntimeError: As `update`.
+        """
         self.optimizer.zero_grad()
         loss.backward()
         self.update(float(loss.detach()))
 
     def update(self, loss: float) -> None:
-        """Make one step with the current gradients of the parameters.
+        """Make one step with the current gradients of the parameters, for a loss that is only logged.
 
-        Raises RuntimeError, with unchanged parameters, if a gradient is not finite.
+        Raises:
+            RuntimeError: A gradient is not finite; the parameters are unchanged.
         """
         parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         norm = float(clip_grad_norm_(parameters, self._max_norm, error_if_nonfinite=True))
@@ -104,7 +110,11 @@ class Training:
         self.step += 1
 
     def save(self, path: str | Path) -> None:
-        """Write a checkpoint atomically. Raises OSError."""
+        """Write a checkpoint atomically.
+
+        Raises:
+            OSError: It cannot be written.
+        """
         buffer = io.BytesIO()
         torch.save(_plain(self._state()), buffer)
         write_whole(path, buffer.getvalue())
@@ -112,7 +122,8 @@ class Training:
     def resume(self, path: str | Path) -> bool:
         """Continue from a checkpoint; return False, and change nothing, if there is no file.
 
-        Raises ResultsError for a file that is not a checkpoint, or has another number of steps.
+        Raises:
+            ResultsError: The file is not a checkpoint, or of a training of another number of steps.
         """
         if not Path(path).exists():
             return False

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.formats.given_poses import COLMAP, NERFSTUDIO
@@ -33,7 +34,11 @@ CAMERA_KEYS = (
 
 @dataclass(frozen=True)
 class NamedScene(Scene):
-    """A scene with the image names of another program, by frame number."""
+    """A scene with the image names of another program.
+
+    Attributes:
+        names: By frame number.
+    """
 
     names: dict[int, str]
 
@@ -62,8 +67,8 @@ def write_refined(folder: Path, refined: RefinementResult) -> Path:
     return path
 
 
-def refined_poses(refined: RefinementResult) -> tuple[Tensor, Tensor]:
-    """The frames (n,) with a refined pose, ascending, and their T_cw (n, 4, 4)."""
+def refined_poses(refined: RefinementResult) -> tuple[Int[Tensor, " F"], Float[Tensor, "F 4 4"]]:
+    """Return the frames with a refined pose, ascending, and their T_cw."""
     posed_frames, slam_map = refined.run.posed_frames, refined.run.map
     frames = posed_frames.frames["frame_index"].cpu()
     order = torch.argsort(frames)

@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.calibration.intrinsics import FOCAL, directions
 from torchslam.config import Config
 from torchslam.geometry import Camera, KeypointNoise, passes_gate, so3_exp, so3_log, transform
+from torchslam.geometry.robust import robustify
 from torchslam.map.map import Map
-from torchslam.mapping.fusion import fuse
 from torchslam.mapping.local_bundle import adjust_all
-from torchslam.mapping.new_points import triangulate_against
+from torchslam.mapping.new_points import fuse, triangulate_against
 from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.refine.tracks import Pair, Tracks, make_map, triangulate_tracks
 from torchslam.types import FrameFeatures
@@ -29,8 +30,8 @@ ITERATIONS = 20
 TOLERANCE = 1e-4  # relative cost decrease; the adjustment of the map follows
 
 
-def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
-    """Replace the rotations of given poses (K, 4, 4) by averaged relative ones of the matches; camera centers stay."""
+def align_rotations(T_cw: Float[Tensor, "K 4 4"], pairs: list[Pair]) -> Float[Tensor, "K 4 4"]:
+    """Replace the rotations of given poses by averaged relative ones of the matches; camera centers stay."""
     known = [pair for pair in pairs if pair.R_21 is not None]
     if not known:
         return T_cw
@@ -45,11 +46,25 @@ def align_rotations(T_cw: Tensor, pairs: list[Pair]) -> Tensor:
 
 
 def adjust_coarse_to_fine(
-    views: list[FrameFeatures], T_cw: Tensor, tracks: Tracks, camera: Camera, config: Config, free_focal: bool
-) -> tuple[Tensor, Camera, Tracks, Tensor]:
-    """Adjust inaccurate poses; return poses (K, 4, 4), camera, consistent tracks and their points (T, 3).
+    views: list[FrameFeatures],
+    T_cw: Float[Tensor, "K 4 4"],
+    tracks: Tracks,
+    camera: Camera,
+    config: Config,
+    free_focal: bool,
+) -> tuple[Float[Tensor, "K 4 4"], Camera, Tracks, Float[Tensor, "N 3"]]:
+    """Adjust inaccurate poses with the points of the tracks, under kernels of decreasing width.
 
-    free_focal: adjust the focal length too, before a wrong one rejects matches
+    Args:
+        views: Of the keyframes.
+        T_cw: Approximate poses.
+        tracks: Of the keyframes.
+        camera: Of the keyframes.
+        config: For the size of the images.
+        free_focal: Adjust the focal length too, before a wrong one rejects matches.
+
+    Returns:
+        The poses, the camera, the consistent tracks and their points.
     """
     pixels = torch.stack([view.keypoints for view in views])[tracks.keyframe, tracks.keypoint]
     scales, information = (
@@ -93,13 +108,13 @@ def densify(slam_map: Map, camera: Camera, config: Config) -> None:
 
 def build_map(
     views: list[FrameFeatures],
-    T_cw: Tensor,
+    T_cw: Float[Tensor, "K 4 4"],
     tracks: Tracks,
     camera: Camera,
     config: Config,
     free_focal: bool = False,
 ) -> tuple[Map, Camera]:
-    """Build the adjusted map of keyframes with approximate poses T_cw (K, 4, 4); return it with its camera."""
+    """Build the adjusted map of keyframes with approximate poses; return it with its camera."""
     T_cw, camera, inliers, points_w = adjust_coarse_to_fine(views, T_cw, tracks, camera, config, free_focal)
     made = make_map(views, T_cw, inliers, points_w)
     adjust_all(made, camera, config.bundle_adjustment)
@@ -109,13 +124,17 @@ def build_map(
 
 MAX_ROTATION_STEPS = 20
 RELATIVE_STD = math.radians(0.3)  # of a relative rotation of two views
-MAD = (
-    1.4826 / 1.54
-)  # from the median length of a 3-vector to the standard deviation of a component, approximately
+# From the median length of a 3-vector to the standard deviation of a component, approximately.
+MAD = 1.4826 / 1.54
 
 
-def average_rotations(R_cw: Tensor, first: Tensor, second: Tensor, R_21: Tensor) -> Tensor:
-    """Average rotations R_cw (K, 3, 3) with the relative ones R_21 (E, 3, 3) from views first (E,) to second (E,)."""
+def average_rotations(
+    R_cw: Float[Tensor, "K 3 3"],
+    first: Int[Tensor, " M"],
+    second: Int[Tensor, " M"],
+    R_21: Float[Tensor, "M 3 3"],
+) -> Float[Tensor, "K 3 3"]:
+    """Average given rotations with relative ones R_21 from views `first` to views `second`."""
     if len(first) == 0:
         return R_cw
     given, count = R_cw, len(R_cw)
@@ -125,8 +144,8 @@ def average_rotations(R_cw: Tensor, first: Tensor, second: Tensor, R_21: Tensor)
     for _ in range(MAX_ROTATION_STEPS):
         residuals = so3_log(R_21 @ R_cw[first] @ R_cw[second].mT)
         from_given = so3_log(given @ R_cw.mT)
-        weights = _cauchy(residuals, 2 * RELATIVE_STD) / RELATIVE_STD**2
-        own = _cauchy(from_given, 3 * given_std) / given_std**2
+        weights = _cauchy_weights(residuals, 2 * RELATIVE_STD) / RELATIVE_STD**2
+        own = _cauchy_weights(from_given, 3 * given_std) / given_std**2
         # The residual of an edge changes by R_21 w_1 - w_2, that of a given rotation by -w.
         A = R_cw.new_zeros(count, count, 3, 3)
         W = weights[:, None, None]
@@ -146,6 +165,6 @@ def average_rotations(R_cw: Tensor, first: Tensor, second: Tensor, R_21: Tensor)
     return R_cw
 
 
-def _cauchy(residuals: Tensor, scale: float) -> Tensor:
-    """(n,) weights of residuals (n, 3)."""
-    return 1 / (1 + residuals.square().sum(-1) / scale**2)
+def _cauchy_weights(residuals: Float[Tensor, "N 3"], scale: float) -> Float[Tensor, " N"]:
+    """The Cauchy weights of residuals."""
+    return robustify(residuals.square().sum(-1), "cauchy", residuals.new_tensor(scale)).weight

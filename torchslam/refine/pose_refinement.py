@@ -14,6 +14,7 @@ from enum import Enum
 from pathlib import Path
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.calibration.find_camera import contradiction
@@ -41,9 +42,9 @@ class CameraChoice(Enum):
     """How the given camera is treated.
 
     Attributes:
-        IF_CONTRADICTED: replace its focal length if the images contradict it
-        FREE: replace it if the images determine it
-        FIXED: keep it
+        IF_CONTRADICTED: Replace its focal length if the images contradict it.
+        FREE: Replace it if the images determine it.
+        FIXED: Keep it.
     """
 
     IF_CONTRADICTED = "if_contradicted"
@@ -59,14 +60,14 @@ class RefinementResult:
         run: Its submap is in the frame and unit of the given poses, its camera is the refined one, and its online
             poses are the given ones.
         given: The given poses.
-        pose_rows: (F,) row of the given pose of each frame of the sequence, -1 for none.
+        pose_rows: Row of the given pose of each frame of the sequence, -1 for none.
         intrinsics: Estimate of the camera; None if it was fixed or no map was built.
         rounds: Number of cameras with which a map was built.
     """
 
     run: Run
     given: GivenPoses
-    pose_rows: Tensor
+    pose_rows: Int[Tensor, " F"]
     intrinsics: IntrinsicsEstimate | None
     rounds: int
 
@@ -104,6 +105,9 @@ def refine_poses(
         device: Of torch.
         extractor: Front end; the configured one if None.
         on_progress: Receives messages.
+
+    Returns:
+        The run in the frame and unit of the given poses.
 
     Raises:
         TrajectoryError: No pose belongs to an image.
@@ -223,7 +227,7 @@ def _rounds(
 
 
 def largest_connected_part(pairs: list[Pair], count: int) -> list[int]:
-    """The largest connected set of keyframes, ascending; among equal ones the one with the lowest keyframe."""
+    """Return the largest connected set of `count` keyframes, ascending; among equal ones that with the lowest."""
     label = list(range(count))
     for _ in range(count):
         before = list(label)
@@ -262,23 +266,24 @@ def _run(
 MAX_OUTLIER_RATIO = 4.0  # times the median error: given positions further off are ignored
 
 
-def align_to_input(T_cw: Tensor, given_cw: Tensor) -> Tensor:
-    """Similarity S (4, 4) from the world of poses T_cw (N, 4, 4) to that of the given ones (N, 4, 4).
+def align_to_input(T_cw: Float[Tensor, "F 4 4"], given_cw: Float[Tensor, "F 4 4"]) -> Float[Tensor, "4 4"]:
+    """Compute the similarity from the world of the poses to that of the given poses.
 
     Centers and orientations count equally: centers on a line do not determine the rotation about it. Without any extent
     of the centers the scale is one.
     """
     T_wc, given = se3_inverse(T_cw), se3_inverse(given_cw)
-    counts = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)
+    is_inlier = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)
     for _ in range(3):
-        S = _similarity(T_wc[counts], given[counts])
+        S = _similarity(T_wc[is_inlier], given[is_inlier])
         moved = T_wc[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
         off = torch.linalg.vector_norm(moved - given[:, :3, 3], dim=-1)
-        counts = off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
+        is_inlier = off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
     return S
 
 
-def _similarity(T_wc: Tensor, given: Tensor) -> Tensor:
+def _similarity(T_wc: Float[Tensor, "F 4 4"], given: Float[Tensor, "F 4 4"]) -> Float[Tensor, "4 4"]:
+    """The similarity that aligns centers and orientations in the least-squares sense."""
     source, target = T_wc[:, :3, 3], given[:, :3, 3]
     x, y = source - source.mean(0), target - target.mean(0)
     extent = (x.square().sum() * y.square().sum()).sqrt()
