@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchslam.batch import ENGINES, ERROR, Columns, Engine, Row, Task, run_batch
+from torchslam.batch import ERROR, Columns, Engine, Row, Task, run_batch
+from torchslam.batch.engines import ENGINES
 from torchslam.batch.result_store import RUNS, hash_files, hash_json, program_hash, run_or_reuse
 from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
@@ -107,7 +108,7 @@ def run_cases(
     Raises SystemExit if a process died.
     """
     found: dict[int, Columns] = {}
-    for number, columns in Engine(options.engine, options.workers).each(work, cases):
+    for number, columns in Engine(options.engine, options.workers).map_unordered(work, cases):
         if columns is None:
             raise SystemExit(f"{cases[number]}: its process died")
         found[number] = columns
