@@ -18,8 +18,8 @@ RETURNS = 0.5  # pixels: limit of the forward-backward error
 
 
 class Samples(torch.nn.Module):
-    """Images (B, 1, H, W) in [0, 1], in temporal order, to Features: samples that the flow carries from image to image,
-    and new ones for those it lost. The descriptor of a sample is its identifier."""
+    """Images (B, 1, H, W) in [0, 1], in temporal order, to Features: the flow carries samples from image to image, and
+    new samples replace lost ones. The descriptor of a sample is its identifier."""
 
     def __init__(self, num_keypoints: int = 800) -> None:
         super().__init__()
