@@ -111,7 +111,7 @@ def test_localization_elsewhere_finds_no_pose_and_starts_no_map(first: tuple[SLA
     assert {result.state for result in run.results} == {State.LOST}
     assert len(run.submaps) == 1
     assert len(run.trajectory) == 0
-    assert run.failure == "none of 10 frames was recognised in the map"
+    assert run.failure == "none of 10 frames was recognized in the map"
     assert run.graph is not None
 
 

@@ -113,7 +113,7 @@ class Run:
         if self.main is None:
             return []
         numbers = [self.main.number]
-        joined = {frozenset((closure.submap, closure.other)) for closure in self.loop_closures}
+        joined = {frozenset((closure.submap, closure.matched_submap)) for closure in self.loop_closures}
         for number in numbers:
             numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
         return [part for number in numbers if len(part := self._given_in(number))]
@@ -238,7 +238,7 @@ def finish(
         results,
         skipped,
         interrupted,
-        why_no_pose(slam, results, skipped),
+        failure_message(slam, results, skipped),
         tuple(slam.loop_closer.loop_closures),
         slam.session.number,
         slam.session.count,
@@ -261,16 +261,16 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
     return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
 
 
-def why_no_pose(slam: System, results: list[StepResult], skipped: list[str]) -> str:
+def failure_message(slam: System, results: list[StepResult], skipped: list[str]) -> str:
     """Why no frame of the session has a pose, in one sentence; empty where some have."""
     if len(slam.session.atlas) == 0:
-        return why_no_map(results, skipped)
+        return no_map_message(results, skipped)
     if any(submap.posed_frames.count(slam.session.number) for submap in slam.session.atlas):
         return ""
     return f"none of {len(results)} frames was recognized in the map"
 
 
-def why_no_map(results: list[StepResult], skipped: list[str]) -> str:
+def no_map_message(results: list[StepResult], skipped: list[str]) -> str:
     """One sentence for the user: how many frames were tried, what kept them from starting a map, the last attempt."""
     if not results:
         return (
