@@ -1,6 +1,6 @@
-"""How far an estimated trajectory is from the true one: absolute (ATE) and relative (RPE) pose errors.
+"""Absolute (ATE) and relative (RPE) pose errors of an estimated trajectory.
 
-A monocular estimate has no scale of its own, so that it is aligned to the ground truth by a similarity first.
+A monocular estimate has no scale of its own, so it is aligned to the ground truth by a similarity first.
 Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012; Umeyama, 1991.
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.trajectories import interpolate_poses, nearest
@@ -29,18 +30,23 @@ MIN_POSES = 3
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The errors of an estimate. Root mean squares, over the compared poses; metres of the ground truth.
+    """The errors of an estimate: root mean squares over the compared poses, in meters of the ground truth.
 
-    ate_m:         of the positions after alignment by a similarity
-    ate_se3_m:     after alignment by a rigid transform, the scale taken as it is
-    rpe_translation_m, rpe_rotation_deg: of the motion over `rpe_delta` poses, the estimate scaled by `scale`
-    scale:         true metres per unit of the estimate
-    path_length_m: of the true positions at the compared poses
-    posed, compared: poses of the estimate, and those among them with a true pose
-    S_groundtruth_estimate: (4, 4) the similarity [s R, t; 0, 1] that aligns the estimate
-    aligned:       the whole estimate after that similarity
-    matched, groundtruth: the compared poses, aligned, and the true ones at the same times
-    errors_m:      (compared,) distances between these two
+    Attributes:
+        ate_m: absolute trajectory error of the positions after alignment by a similarity.
+        ate_se3_m: of the positions after alignment by a rigid transform, with the scale of the estimate.
+        rpe_translation_m: of the motion over `rpe_delta` poses, the estimate scaled by `scale`.
+        rpe_rotation_deg: of the same motion.
+        rpe_delta: number of poses.
+        scale: true meters per unit of the estimate.
+        path_length_m: length of the path through the true positions of the compared poses.
+        posed: number of poses of the estimate.
+        compared: number of these with a true pose.
+        S_groundtruth_estimate: the similarity that aligns the estimate.
+        aligned: the whole estimate, aligned.
+        matched: the compared poses, aligned.
+        groundtruth: the true poses at the same times.
+        errors_m: distances between the positions of `matched` and `groundtruth`.
     """
 
     ate_m: float
@@ -52,11 +58,11 @@ class Evaluation:
     path_length_m: float
     posed: int
     compared: int
-    S_groundtruth_estimate: Tensor
+    S_groundtruth_estimate: Float[Tensor, "4 4"]
     aligned: Trajectory
     matched: Trajectory
     groundtruth: Trajectory
-    errors_m: Tensor
+    errors_m: Float[Tensor, " N"]
 
     def as_dict(self) -> dict[str, float | int | dict[str, float | int]]:
         """The figures, for metrics.json and tables."""
@@ -84,13 +90,20 @@ def evaluate(
 ) -> Evaluation:
     """Compare an estimate with the ground truth at the times of the estimate.
 
-    association: the true pose between the two nearest in time, or the nearest one as it is. Where the ground truth
-                 has a clock of its own, "nearest" charges the estimate with the motion in between (0.03 mm and
-                 0.008 degrees a frame on TUM fr2_desk with its 300 Hz); at equal times both are the same.
-    tolerance:   seconds to the nearest true pose beyond which an estimated one is left out
-    delta:       poses over which relative motion is compared, fewer where there are fewer
+    Args:
+        estimate: to evaluate.
+        groundtruth: true poses.
+        association: how to get the true pose at a time: from the two nearest ones, or the nearest as it is. Where the
+            ground truth has a clock of its own, "nearest" charges the estimate with the motion in between (0.03 mm
+            and 0.008 degrees a frame on TUM fr2_desk with its 300 Hz); at equal times both are the same.
+        tolerance: maximum time to the nearest true pose, seconds; other estimated poses are left out.
+        delta: number of poses over which relative motion is compared, fewer if there are fewer.
 
-    Raises TrajectoryError where fewer than three poses can be compared.
+    Returns:
+        The errors.
+
+    Raises:
+        TrajectoryError: Fewer than three poses can be compared.
     """
     device = groundtruth.T_wc.device
     times = estimate.timestamps.to(device=device, dtype=torch.float64)
@@ -131,12 +144,14 @@ def evaluate(
 
 
 def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
-    """The ATE of poses that were given in several submaps: RMS over all of them, metres.
+    """ATE of poses that were given in several submaps: RMS over all of them, meters.
 
-    Each part is aligned by a similarity of its own. When these poses were given, nothing was known of how their submaps
-    lie to each other; what was learned later would either better or worsen what was given then. The price: errors
-    between the parts do not show. Options as `evaluate` has them by default. Parts with fewer than three true poses,
-    which fit any path, are left out; raises TrajectoryError where none is left.
+    Each part is aligned by a similarity of its own, because the relative poses of the submaps were not known when the
+    poses were given; so errors between the parts do not show. Options are the defaults of `evaluate`. Parts with fewer
+    than three true poses, which fit any path, are left out.
+
+    Raises:
+        TrajectoryError: No part is left.
     """
     errors = [
         evaluate(part, groundtruth).errors_m for part in parts if _compared(part, groundtruth) >= MIN_POSES
@@ -157,35 +172,56 @@ def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
 
 @full_precision
 def ate(
-    T_cw: Tensor, T_cw_groundtruth: Tensor, mask: Tensor | None = None, with_scale: bool = True
-) -> Tensor:
-    """Absolute trajectory error: the root mean square distance of camera centres after alignment, metres.
+    T_cw: Float[Tensor, "*batch N 4 4"],
+    T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
+    mask: Bool[Tensor, "*batch N"] | None = None,
+    with_scale: bool = True,
+) -> Float[Tensor, "*batch"]:
+    """Absolute trajectory error: the root mean square distance of camera centers after alignment, meters.
 
-    T_cw, T_cw_groundtruth: (..., N, 4, 4), row by row at the same times; mask: (..., N) rows that count
-    Returns (...), differentiable, with a gradient of zero on exact data; NaN, with a gradient of zero, where fewer than
-    `MIN_POSES` rows count. Aligned by a similarity, or by a rigid transform without `with_scale`.
+    Differentiable, with a gradient of zero on exact data.
+
+    Args:
+        T_cw: estimated poses.
+        T_cw_groundtruth: true poses at the same times.
+        mask: rows that count.
+        with_scale: align by a similarity; False: by a rigid transform.
+
+    Returns:
+        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count.
     """
-    centres, truth = _centers(T_cw), _centers(T_cw_groundtruth)
-    s, R, t = umeyama(centres, truth, mask, with_scale)
-    moved = s[..., None, None] * centres @ R.mT + t[..., None, :]
+    centers, truth = _centers(T_cw), _centers(T_cw_groundtruth)
+    s, R, t = umeyama(centers, truth, mask, with_scale)
+    moved = s[..., None, None] * centers @ R.mT + t[..., None, :]
     error = _rms((moved - truth).square().sum(-1), mask)
     return torch.where(_enough(T_cw, mask), error, torch.nan)
 
 
 @full_precision
 def rpe(
-    T_cw: Tensor,
-    T_cw_groundtruth: Tensor,
+    T_cw: Float[Tensor, "*batch N 4 4"],
+    T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     delta: int = 1,
-    mask: Tensor | None = None,
+    mask: Bool[Tensor, "*batch N"] | None = None,
     with_scale: bool = True,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Relative pose error: root mean squares of the error of the motion from each row to the one `delta` later.
 
-    T_cw, T_cw_groundtruth: (..., N, 4, 4), row by row at the same times; mask: (..., N) rows that count
-    Returns translation (...) metres and rotation (...) radians, differentiable. With `with_scale` the estimate takes
-    its scale from the alignment of `ate`. Both are NaN, with a gradient of zero, where no two rows that count are
-    `delta` apart, or fewer than `MIN_POSES` count for that alignment.
+    Differentiable.
+
+    Args:
+        T_cw: estimated poses.
+        T_cw_groundtruth: true poses at the same times.
+        delta: number of rows.
+        mask: rows that count.
+        with_scale: scale the estimate as the alignment of `ate` does.
+
+    Returns:
+        Translation in meters and rotation in radians. Both are NaN, with a gradient of zero, where no two rows that
+        count are `delta` apart, or fewer than `MIN_POSES` count for that alignment.
+
+    Raises:
+        ValueError: `delta` is not between 1 and N - 1.
     """
     if not 1 <= delta < T_cw.shape[-3]:
         raise ValueError(f"delta must be between 1 and {T_cw.shape[-3] - 1}, got {delta}")
@@ -202,8 +238,10 @@ def rpe(
     return torch.where(known, errors[0], torch.nan), torch.where(known, errors[1], torch.nan)
 
 
-def _associate(truth: Trajectory, times: Tensor, association: str, tolerance: float) -> tuple[Tensor, Tensor]:
-    """(N, 4, 4) the true T_wc at each time and (N,) whether there is one."""
+def _associate(
+    truth: Trajectory, times: Float[Tensor, " N"], association: str, tolerance: float
+) -> tuple[Float[Tensor, "N 4 4"], Bool[Tensor, " N"]]:
+    """The true T_wc at each time, and whether there is one."""
     if len(truth) == 0 or len(times) == 0:
         return truth.T_wc.new_zeros(len(times), 4, 4), torch.zeros_like(times, dtype=torch.bool)
     if association == "interpolate":
@@ -213,35 +251,41 @@ def _associate(truth: Trajectory, times: Tensor, association: str, tolerance: fl
 
 
 def _ranges(times: Tensor, truth_times: Tensor) -> str:
-    """From when to when either goes, where both go somewhere: mostly what is wrong."""
+    """The spans of time of both, as the end of a message; empty where one has no poses."""
     if len(times) == 0 or len(truth_times) == 0:
         return ""
     spans = [f"from {float(span[0]):.3f} to {float(span[-1]):.3f} s" for span in (times, truth_times)]
     return f"; the estimate goes {spans[0]}, the ground truth {spans[1]}"
 
 
-def _aligned(T_wc: Tensor, s: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """Camera poses (N, 4, 4) after a similarity of the world."""
+def _aligned(
+    T_wc: Float[Tensor, "N 4 4"], s: Float[Tensor, ""], R: Float[Tensor, "3 3"], t: Float[Tensor, " 3"]
+) -> Float[Tensor, "N 4 4"]:
+    """Camera poses after a similarity of the world."""
     return rigid(R @ T_wc[:, :3, :3], s * T_wc[:, :3, 3] @ R.mT + t)
 
 
-def _enough(T_cw: Tensor, mask: Tensor | None) -> Tensor:
-    """(...) bool, enough rows (..., N) count for an alignment to say something."""
+def _enough(
+    T_cw: Float[Tensor, "*batch N 4 4"], mask: Bool[Tensor, "*batch N"] | None
+) -> Bool[Tensor, "*batch"]:
+    """Test whether enough rows count for an alignment."""
     rows = T_cw.new_ones(T_cw.shape[:-2], dtype=torch.bool) if mask is None else mask
     return rows.sum(-1) >= MIN_POSES
 
 
-def _centers(T_cw: Tensor) -> Tensor:
-    """(..., N, 3) camera centres in the world."""
+def _centers(T_cw: Float[Tensor, "*batch N 4 4"]) -> Float[Tensor, "*batch N 3"]:
+    """Camera centers in the world."""
     return se3_inverse(T_cw)[..., :3, 3]
 
 
-def _motions(T_cw: Tensor, delta: int) -> Tensor:
-    """(..., N - delta, 4, 4) each camera `delta` rows later, in the camera before."""
+def _motions(T_cw: Float[Tensor, "*batch N 4 4"], delta: int) -> Float[Tensor, "*batch N-{delta} 4 4"]:
+    """Each camera `delta` rows later, in the camera before."""
     return T_cw[..., :-delta, :, :] @ se3_inverse(T_cw[..., delta:, :, :])
 
 
-def _rms(squares: Tensor, mask: Tensor | None = None) -> Tensor:
+def _rms(
+    squares: Float[Tensor, "*batch N"], mask: Bool[Tensor, "*batch N"] | None = None
+) -> Float[Tensor, "*batch"]:
     """The root of the mean of the last dimension's squares, with a gradient of zero at zero."""
     weights = torch.ones_like(squares) if mask is None else mask.to(squares.dtype)
     mean = (weights * torch.where(weights > 0, squares, 0.0)).sum(-1) / weights.sum(-1).clamp(min=1.0)

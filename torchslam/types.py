@@ -1,16 +1,14 @@
-"""Values passed between the stages of the pipeline: small frozen dataclasses of tensors.
-
-Letters in shapes: B batch, N keypoints, M matches, L points; H, W image height and width.
-"""
+"""Values passed between the stages of the pipeline: small frozen dataclasses of tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum
-from typing import Any
+from typing import Any, Self
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -21,23 +19,24 @@ from torchslam.geometry.gating import KeypointNoise, packed_information, unpacke
 class Frame:
     """One image of a sequence.
 
-    index:     position in the sequence, from 0
-    timestamp: seconds
-    image:     (1, 1, H, W) float32 in [0, 1], gray
-    name:      of the image in messages (its path, or `video.mp4#17`)
-    T_cw_groundtruth: (4, 4) float64 world to camera, if the sequence has it. Read only by simulated features,
-               by scale from ground truth and by evaluation.
-    mask:      (1, 1, H, W) bool, True where features may be found; None: everywhere
-    features:  a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0
-    backlog:   number of newer frames already queued (live sources only)
+    Attributes:
+        index: position in the sequence, from 0.
+        timestamp: seconds.
+        image: gray, float32 in [0, 1].
+        name: name of the image in messages (its path, or `video.mp4#17`).
+        T_cw_groundtruth: float64 world to camera, if the sequence has it. Read only by simulated features, by scale
+            from ground truth and by evaluation.
+        mask: True where features may be found; None: everywhere.
+        features: a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0.
+        backlog: number of newer frames already queued (live sources only).
     """
 
     index: int
     timestamp: float
-    image: Tensor
+    image: Float[Tensor, "1 1 H W"]
     name: str = ""
-    T_cw_groundtruth: Tensor | None = None
-    mask: Tensor | None = None
+    T_cw_groundtruth: Float[Tensor, "4 4"] | None = None
+    mask: Bool[Tensor, "1 1 H W"] | None = None
     features: Features | None = None
     backlog: int = 0
 
@@ -46,34 +45,36 @@ class Frame:
 class Features:
     """A batch of keypoints with descriptors. Invalid rows (`mask` False) are finite.
 
-    keypoints:   (B, N, 2) pixels (x, y) of the full-resolution image; (0, 0) is the center of the top left pixel
-    scores:      (B, N) response of the detector, higher is better
-    scales:      (B, N) size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0,
-                 unless the image was reduced before)
-    angles:      (B, N) radians, clockwise in the image (from x towards y)
-    descriptors: (B, N, 32) uint8, 256 bits packed least significant first; or (B, N, D) floats of unit length
-    mask:        (B, N) bool, True where the row is a keypoint
-    information: (B, N) inverse variances of the keypoints in each direction, px^-2, or (B, N, 2, 2) inverse
-                 covariances, positive (definite) where `mask`; None: a keypoint is known to its scale
+    Attributes:
+        keypoints: pixels (x, y) of the full-resolution image; (0, 0) is the center of the top left pixel.
+        scores: response of the detector, higher is better.
+        scales: size of a pixel of the keypoint's pyramid level, in full-resolution pixels (1.0 at level 0, unless the
+            image was reduced before).
+        angles: radians, clockwise in the image (from x towards y).
+        descriptors: 256 bits as 32 uint8, packed least significant first; or floats of unit length.
+        mask: True where the row is a keypoint.
+        information: inverse variances of the keypoints in each direction, px^-2, or inverse covariances, positive
+            (definite) where `mask`; None: a keypoint is known to its scale.
     """
 
-    keypoints: Tensor
-    scores: Tensor
-    scales: Tensor
-    angles: Tensor
-    descriptors: Tensor
-    mask: Tensor
-    information: Tensor | None = None
+    keypoints: Float[Tensor, "B N 2"]
+    scores: Float[Tensor, "B N"]
+    scales: Float[Tensor, "B N"]
+    angles: Float[Tensor, "B N"]
+    descriptors: UInt8[Tensor, "B N 32"] | Float[Tensor, "B N D"]
+    mask: Bool[Tensor, "B N"]
+    information: Float[Tensor, "B N"] | Float[Tensor, "B N 2 2"] | None = None
 
     def __getitem__(self, rows: slice) -> Features:
         """A part of the batch, by slice."""
         return self._each(lambda column: column[rows])
 
     def to(self, device: torch.device | str) -> Features:
+        """The same features on a device."""
         return self._each(lambda column: column.to(device))
 
-    def rows(self, rows: Tensor | slice) -> Features:
-        """Some keypoints of each element, by slice or index (n,)."""
+    def rows(self, rows: Int[Tensor, " R"] | slice) -> Features:
+        """Some keypoints of each element, by slice or index."""
         return self._each(lambda column: column[:, rows])
 
     @classmethod
@@ -93,46 +94,51 @@ class Features:
 class Matches:
     """A batch of matches between two sets of features. Invalid rows have index 0 and `mask` False.
 
-    indices_1: (B, M) int64 rows in the first set
-    indices_2: (B, M) int64 rows in the second set
-    distances: (B, M) float32: Hamming distance in bits, or 1 - cosine
-    mask:      (B, M) bool
-    weights:   (B, M) matching weights, if the matcher gives some
+    Attributes:
+        indices_1: rows in the first set.
+        indices_2: rows in the second set.
+        distances: Hamming distance in bits, or 1 - cosine.
+        mask: True where the row is a match.
+        weights: matching weights, if the matcher gives some.
     """
 
-    indices_1: Tensor
-    indices_2: Tensor
-    distances: Tensor
-    mask: Tensor
-    weights: Tensor | None = None
+    indices_1: Int[Tensor, "B M"]
+    indices_2: Int[Tensor, "B M"]
+    distances: Float[Tensor, "B M"]
+    mask: Bool[Tensor, "B M"]
+    weights: Float[Tensor, "B M"] | None = None
 
 
 @dataclass(frozen=True)
 class FrameFeatures:
     """The features of one frame as the geometry uses them, unbatched.
 
-    keypoints:   (N, 2) pixels, in the dtype of the geometry (float64 unless configured)
-    scales:      (N,) pixels: the standard deviation of a keypoint grows with the size of its pyramid level
-    angles:      (N,) radians
-    descriptors: (N, D)
-    mask:        (N,) bool
-    session:     number of the run over the same map, from 0
-    information: (N, I) as in `KeypointNoise`, of the keypoints; (N, 0) if the front end gives none
-    image:       (1, 1, H, W) gray, if the matcher wants it
-    backlog:     as in `Frame`
+    Attributes:
+        index: as in `Frame`.
+        timestamp: as in `Frame`.
+        keypoints: pixels, in the dtype of the geometry (float64 unless configured).
+        scales: pixels: the standard deviation of a keypoint grows with the size of its pyramid level.
+        angles: radians.
+        descriptors: as in `Features`.
+        mask: as in `Features`.
+        T_cw_groundtruth: as in `Frame`.
+        session: number of the run over the same map, from 0.
+        information: as in `KeypointNoise`, of the keypoints; (N, 0) if the front end gives none.
+        image: gray, if the matcher wants it.
+        backlog: as in `Frame`.
     """
 
     index: int
     timestamp: float
-    keypoints: Tensor
-    scales: Tensor
-    angles: Tensor
-    descriptors: Tensor
-    mask: Tensor
-    T_cw_groundtruth: Tensor | None = None
+    keypoints: Float[Tensor, "N 2"]
+    scales: Float[Tensor, " N"]
+    angles: Float[Tensor, " N"]
+    descriptors: Shaped[Tensor, "N D"]
+    mask: Bool[Tensor, " N"]
+    T_cw_groundtruth: Float[Tensor, "4 4"] | None = None
     session: int = 0
-    information: Tensor = field(default_factory=lambda: torch.zeros(0))
-    image: Tensor | None = None
+    information: Float[Tensor, "N I"] = field(default_factory=lambda: torch.zeros(0))
+    image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
 
     def __post_init__(self) -> None:
@@ -159,11 +165,11 @@ class FrameFeatures:
 
     @property
     def noise(self) -> KeypointNoise:
-        """Of the keypoints (N,)."""
+        """Of the keypoints."""
         return KeypointNoise(self.scales, self.information)
 
-    def weighed(self, keypoints: Tensor, weights: Tensor | None) -> FrameFeatures:
-        """The same view, the information of keypoints (n,) multiplied with the weights (n,) of their matches."""
+    def weighed(self, keypoints: Int[Tensor, " M"], weights: Float[Tensor, " M"] | None) -> FrameFeatures:
+        """The same view, the information of keypoints multiplied with the weights of their matches."""
         if weights is None:
             return self
         factors = torch.ones_like(self.scales).index_put((keypoints,), weights)
@@ -189,15 +195,17 @@ class FrameFeatures:
 class MatchPrior:
     """Prior knowledge about the matches of two views. A matcher may ignore it: all matches are tested later.
 
-    radius_px:   (N,) search radii; the first view's keypoints are map points at their predicted pixels in the second
-    ratio:       maximum ratio of the best to the second best distance, with a radius; None: no ratio test
-    T_21:        (4, 4) from the first camera to the second; matches lie within `epipolar_px` of their epipolar lines
-    camera:      of both views, with `T_21`
+    Attributes:
+        radius_px: search radii; the first view's keypoints are map points at their predicted pixels in the second.
+        ratio: maximum ratio of the best to the second best distance, with a radius; None: no ratio test.
+        T_21: from the first camera to the second; matches lie within `epipolar_px` of their epipolar lines.
+        camera: of both views, with `T_21`.
+        epipolar_px: largest distance from the epipolar line, pixels.
     """
 
-    radius_px: Tensor | None = None
+    radius_px: Float[Tensor, " N"] | None = None
     ratio: float | None = None
-    T_21: Tensor | None = None
+    T_21: Float[Tensor, "4 4"] | None = None
     camera: Camera | None = None
     epipolar_px: float = 0.0
 
@@ -213,60 +221,67 @@ for projected map points."""
 
 @dataclass(frozen=True)
 class MatchIndices:
-    """Rows (m,), (m,) of matches, and their weights (m,); None: equal weights."""
+    """Rows of matches in two sets, and their weights; None: equal weights."""
 
-    first: Tensor
-    second: Tensor
-    weights: Tensor | None = None
+    first: Int[Tensor, " M"]
+    second: Int[Tensor, " M"]
+    weights: Float[Tensor, " M"] | None = None
 
 
 @dataclass(frozen=True)
 class TwoViewMap:
     """A map of two views, the result of initialization.
 
-    reference, view: the two views; the camera of the reference is the world frame
-    T_cw:      (4, 4) pose of the second view
-    points_w:  (n, 3); keypoints_1, keypoints_2: (n,) their keypoints in the two views
+    Attributes:
+        reference: the first view, whose camera is the world frame.
+        view: the second view.
+        T_cw: pose of the second view.
+        points_w: points.
+        keypoints_1: their keypoints in the first view.
+        keypoints_2: their keypoints in the second view.
     """
 
     reference: FrameFeatures
     view: FrameFeatures
-    T_cw: Tensor
-    points_w: Tensor
-    keypoints_1: Tensor
-    keypoints_2: Tensor
+    T_cw: Float[Tensor, "4 4"]
+    points_w: Float[Tensor, "M 3"]
+    keypoints_1: Int[Tensor, " M"]
+    keypoints_2: Int[Tensor, " M"]
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
     """Pose of a frame, with the inliers it was estimated from.
 
-    T_cw:        (4, 4)
-    point_ids:   (m,) map points of the inliers; keypoints: (m,) their keypoints
-    matches:     number of matches from which the inliers were chosen
-    covariance:  (6, 6) of the pose's left perturbation (translation, rotation), the points taken as exact
-    weights:     (m,) of the inliers, if the matcher gives some
-    expected:    (n,) points predicted to be visible; None: `point_ids`
-    depth:       median depth of the inliers
-    error:       median squared error of the matches, in units of their variance: 1.39 if noise is all there is
-    coverage_ratio: ratio of image cells with expected points in which these are found
-    explained_ratio: ratio of image cells with keypoints in which some agree with the map
+    Attributes:
+        T_cw: world to camera.
+        point_ids: map points of the inliers.
+        keypoints: their keypoints.
+        matches: number of matches from which the inliers were chosen.
+        covariance: of the pose's left perturbation (translation, rotation), the points taken as exact.
+        depth: median depth of the inliers.
+        error: median squared error of the matches, in units of their variance; 1.39 for noise alone.
+        coverage_ratio: ratio of image cells with expected points in which these are found.
+        explained_ratio: ratio of image cells with keypoints in which some agree with the map.
+        weights: of the inliers, if the matcher gives some.
+        expected: points predicted to be visible; None: `point_ids`.
     """
 
-    T_cw: Tensor
-    point_ids: Tensor
-    keypoints: Tensor
+    T_cw: Float[Tensor, "4 4"]
+    point_ids: Int[Tensor, " M"]
+    keypoints: Int[Tensor, " M"]
     matches: int
-    covariance: Tensor
+    covariance: Float[Tensor, "6 6"]
     depth: float
     error: float = 0.0
     coverage_ratio: float = 1.0
     explained_ratio: float = 1.0
-    weights: Tensor | None = None
-    expected: Tensor | None = None
+    weights: Float[Tensor, " M"] | None = None
+    expected: Int[Tensor, " N"] | None = None
 
     @property
     def inliers(self) -> int:
+        """Number of inliers."""
         return len(self.point_ids)
 
 
@@ -280,19 +295,25 @@ def _fill_information(features: FrameFeatures) -> None:
 class Observations:
     """Observations of points in keyframes: flat index tensors, ordered by keyframe, then keypoint.
 
-    keyframe_index, keypoint_index, point_index: (O,) int64
-    pixels: (O, 2); scales: (O,) pixels; information: (O, I) as in `KeypointNoise`
+    Attributes:
+        keyframe_index: rows of keyframes.
+        keypoint_index: rows of keypoints in these keyframes.
+        point_index: rows of points.
+        pixels: where the keypoints are.
+        scales: pixels, as in `KeypointNoise`.
+        information: as in `KeypointNoise`.
     """
 
-    keyframe_index: Tensor
-    keypoint_index: Tensor
-    point_index: Tensor
-    pixels: Tensor
-    scales: Tensor
-    information: Tensor
+    keyframe_index: Int[Tensor, " O"]
+    keypoint_index: Int[Tensor, " O"]
+    point_index: Int[Tensor, " O"]
+    pixels: Float[Tensor, "O 2"]
+    scales: Float[Tensor, " O"]
+    information: Float[Tensor, "O I"]
 
     @property
     def noise(self) -> KeypointNoise:
+        """Of the observed keypoints."""
         return KeypointNoise(self.scales, self.information)
 
     def __len__(self) -> int:
@@ -303,12 +324,13 @@ class Observations:
 class Trajectory:
     """Camera poses over time, ordered by timestamp.
 
-    timestamps: (N,) float64 seconds
-    T_wc:       (N, 4, 4) camera to world
+    Attributes:
+        timestamps: float64 seconds.
+        T_wc: camera to world.
     """
 
-    timestamps: Tensor
-    T_wc: Tensor
+    timestamps: Float[Tensor, " N"]
+    T_wc: Float[Tensor, "N 4 4"]
 
     @classmethod
     def empty(cls) -> Trajectory:
@@ -319,15 +341,15 @@ class Trajectory:
         return int(self.timestamps.shape[0])
 
     @property
-    def positions_w(self) -> Tensor:
-        """(N, 3) camera centers."""
+    def positions_w(self) -> Float[Tensor, "N 3"]:
+        """Camera centers."""
         return self.T_wc[:, :3, 3]
 
 
 class Reason(StrEnum):
     """Why a frame has no pose, an uncertain one or became a keyframe: the text of `StepResult.reason`.
 
-    Texts with fields in braces belong to a `Rejection`, which has the numbers.
+    Texts with fields in braces belong to an `Explanation`, which has the numbers.
     """
 
     NEW_REFERENCE = "took a reference frame"
@@ -337,6 +359,13 @@ class Reason(StrEnum):
     LOST = "lost"
     LOST_AT_START = "lost right after the start: starting anew"
     STATIC_OVERLAY = "some of the image does not move with the scene and is left out"
+    INDEPENDENT_MOTION = "{count} keypoints move by themselves and are left out"
+    UNCONFIRMED = "to be confirmed by {count} more frames"
+
+    # keyframes
+    MOVED = "moved by {ratio:.2f} of the depth of the scene"
+    TURNED = "turned by {degrees:.1f} degrees"
+    LOW_OVERLAP = "sees {ratio:.0%} of the points of its reference keyframe"
 
     # initialization
     FEW_MATCHES = "too few matches with the reference frame: {count}, {needed} are needed"
@@ -368,19 +397,23 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
-class Rejection:
-    """Why a pose or an initialization is rejected; as text, the reason with its numbers."""
+class Explanation:
+    """A reason with the values of the fields of its text; `str` gives the text."""
 
     reason: Reason
-    values: dict[str, float | str | Rejection] = field(default_factory=dict)
+    values: dict[str, float | str | Explanation] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, reason: Reason, **values: float | str | Rejection) -> Rejection:
+    def of(cls, reason: Reason, **values: float | str | Explanation) -> Self:
         """A reason with the values of the fields of its text."""
         return cls(reason, values)
 
     def __str__(self) -> str:
         return self.reason.value.format(**self.values)
+
+
+class Rejection(Explanation):
+    """Why a pose or an initialization is rejected."""
 
 
 class State(Enum):
@@ -400,23 +433,26 @@ class State(Enum):
 class StepResult:
     """The result of one frame.
 
-    state:       after the frame. Uncertain: there is a pose, which later frames have to confirm
-    T_cw:        (4, 4) pose of the frame, world to camera; None while initializing or lost
-    submap:       number of the submap the pose is in; None without a pose
-    covariance:  (6, 6) of the pose's left perturbation (translation, rotation); None if it was not estimated
-    is_keyframe: whether the frame became a keyframe
-    matches:     map points matched in this frame
-    inliers:     number of these that agree with the pose
-    reason:      why there is no pose or why the frame is a keyframe, as text; empty otherwise
-    stage_ms:    milliseconds per stage
+    Attributes:
+        index: of the frame.
+        timestamp: of the frame, seconds.
+        state: after the frame.
+        T_cw: pose of the frame, world to camera; None while initializing or lost.
+        submap: number of the submap the pose is in; None without a pose.
+        covariance: of the pose's left perturbation (translation, rotation); None if it was not estimated.
+        is_keyframe: True if the frame became a keyframe.
+        matches: number of map points matched in this frame.
+        inliers: number of these that agree with the pose.
+        reason: text: why there is no pose, or why the frame is a keyframe; empty otherwise.
+        stage_ms: milliseconds per stage.
     """
 
     index: int
     timestamp: float
     state: State
-    T_cw: Tensor | None
+    T_cw: Float[Tensor, "4 4"] | None
     submap: int | None = None
-    covariance: Tensor | None = None
+    covariance: Float[Tensor, "6 6"] | None = None
     is_keyframe: bool = False
     matches: int = 0
     inliers: int = 0
