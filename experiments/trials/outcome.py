@@ -188,7 +188,7 @@ def furthest(loop_closures: list[LoopClosureRecord], sequence: Edited) -> tuple[
     """The largest distance (meters) and angle (degrees) between a frame and the place of its loop closure."""
     meters, degrees = [], []
     for closure in loop_closures:
-        here, there = sequence.pose(closure.frame), sequence.pose(closure.place)
+        here, there = sequence.pose(closure.frame), sequence.pose(closure.matched_frame)
         if here is None or there is None:
             continue
         motion = se3_inverse(here) @ there
@@ -233,7 +233,8 @@ def _misled(outcome: Outcome) -> str:
 
 def _loop_closures(outcome: Outcome) -> str:
     listed = [
-        f"{closure.frame}→{closure.place}" + " in another submap" * (closure.submap != closure.other)
+        f"{closure.frame}→{closure.matched_frame}"
+        + " in another submap" * (closure.submap != closure.matched_submap)
         for closure in outcome.loop_closures
     ]
     text = ", ".join(listed[:MAX_LISTED]) + f" and {len(listed) - MAX_LISTED} more" * (

@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 
 from tests.scene import Scene, pose
-from torchslam.loop_closing.loop_closer import STRONG, essential_edges
+from torchslam.loop_closing.loop_closer import MIN_ESSENTIAL_WEIGHT, essential_edges
 from torchslam.map.map import Map
 
 
@@ -37,7 +37,7 @@ def test_a_keyframe_without_shared_points_is_joined_to_the_previous_one() -> Non
 
 
 def test_highly_covisible_keyframes_are_joined_as_well() -> None:
-    assert STRONG == 100
+    assert MIN_ESSENTIAL_WEIGHT == 100
     assert edges((0, 150), (0, 120), (20, 150)) == [[0, 1], [0, 2], [1, 2]]
     assert edges((0, 150), (0, 119), (20, 150)) == [[0, 1], [0, 2]]
     assert edges((0, 150), (0, 120), (20, 150), (30, 150)) == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]

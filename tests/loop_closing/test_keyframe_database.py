@@ -11,7 +11,7 @@ from torch import Tensor
 from torchslam.data import open_sequence
 from torchslam.features import ORB, hamming, pack_bits, unpack_bits
 from torchslam.loop_closing import KeyframeDatabase
-from torchslam.loop_closing.keyframe_database import binary, likeness, rendered_words, words_and_codes
+from torchslam.loop_closing.keyframe_database import binarize, code_similarity, default_vocabulary, quantize
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -48,7 +48,7 @@ def answer_alike(left: KeyframeDatabase, right: KeyframeDatabase) -> bool:
 
 
 def test_the_bundled_visual_words_are_distinct() -> None:
-    words = rendered_words(torch.device("cpu"))
+    words = default_vocabulary(torch.device("cpu"))
     assert words.shape == (1024, 32)
     assert words.dtype == torch.uint8
     assert len(torch.unique(words, dim=0)) > 1000
@@ -57,21 +57,21 @@ def test_the_bundled_visual_words_are_distinct() -> None:
 def test_descriptors_choose_the_nearest_word_and_the_lower_of_equals() -> None:
     words = noise(40, 32)
     words[7] = words[3]
-    used, _ = words_and_codes(torch.stack([words[7], words[30], words[12]]), words)
+    used, _ = quantize(torch.stack([words[7], words[30], words[12]]), words)
     assert used.tolist() == [3, 12, 30]
     descriptors = noise(200, 32, seed=1)
-    used, _ = words_and_codes(descriptors, words)
+    used, _ = quantize(descriptors, words)
     assert used.tolist() == sorted(set(hamming(descriptors, words).argmin(1).tolist()))
 
 
 def test_codes_are_the_majority_bits_of_a_word() -> None:
     words = noise(2, 32)
     three = torch.stack([blurred(words[1], 0.2, seed) for seed in range(3)])
-    used, codes = words_and_codes(three, words)
+    used, codes = quantize(three, words)
     majority = pack_bits(unpack_bits(three).sum(0) >= 2)
     assert used.tolist() == [1]
-    assert torch.equal(words_and_codes(majority[None], words)[1], codes)
-    assert not torch.equal(words_and_codes(three[:1], words)[1], codes)
+    assert torch.equal(quantize(majority[None], words)[1], codes)
+    assert not torch.equal(quantize(three[:1], words)[1], codes)
 
 
 @pytest.mark.parametrize("distance", [0, 1, 9, 19, 20, 64])
@@ -80,19 +80,20 @@ def test_similarity_falls_with_distance_and_ends_at_zero(distance: int) -> None:
     bits = sum(1 << (3 * bit % 64) for bit in range(distance))  # 3 and 64 have no divisor in common
     other = code ^ torch.tensor([bits - (1 << 64) if bits >= 1 << 63 else bits])
     expected = math.exp(-((distance / 9) ** 2)) if distance <= 19 else 0.0
-    assert float(likeness(code, other)) == pytest.approx(expected, rel=1e-6)
+    assert float(code_similarity(code, other)) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_binarized_floats_keep_their_angles(generator: torch.Generator) -> None:
     floats = torch.nn.functional.normalize(torch.randn(30, 64, generator=generator), dim=1)
-    bits = binary(floats)
+    bits = binarize(floats)
     angles = torch.acos((floats @ floats.T).clamp(-1, 1))
     error = hamming(bits, bits) / 256 - angles / math.pi
     assert bits.shape == (30, 32)
     assert float(error.abs().max()) < 0.15
-    assert torch.equal(binary(bits), bits)
+    assert torch.equal(binarize(bits), bits)
     with pytest.raises(ValueError, match="256 bits"):
-        binary(noise(3, 16))
+        binarize(noise(3, 16))
 
 
 # --- scores --------------------------------------------------------------------------------------------------
@@ -193,7 +194,7 @@ def test_float_descriptors_fix_their_words_once(generator: torch.Generator) -> N
     assert database.query(floats[0], mask)[1].tolist() == [0.0]
     for key in range(1, 6):
         database.add(key, floats[key], mask)
-    assert torch.equal(database._words, binary(floats[1]))
+    assert torch.equal(database._words, binarize(floats[1]))
     close = torch.nn.functional.normalize(
         floats + 0.02 * torch.randn(6, 100, 64, generator=generator), dim=-1
     )

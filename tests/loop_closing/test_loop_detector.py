@@ -19,10 +19,10 @@ from torchslam.loop_closing.loop_detector import (
     LoopClosureRecord,
     LoopDetector,
     are_consistent,
-    covisible_twice,
-    may_have_drifted,
+    is_plausible_drift,
+    two_hop_covisible,
 )
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, rescaling
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, scaling_sim3
 from torchslam.map.atlas import Atlas, Submap
 
 SCENE = Scene.of(300)
@@ -51,10 +51,12 @@ def test_another_submap_of_the_same_place_is_detected(S_21: Tensor) -> None:
     one, other = two_submaps(S_21)
     found = loop_detector(one, other).detect(other, 3)
     assert found is not None
-    assert (found.submap, found.keyframe, found.other) == (other, 3, one)
+    assert (found.submap, found.keyframe, found.matched_submap) == (other, 3, one)
     assert not found.is_loop
     torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
-    assert found.closure == LoopClosureRecord(frame=103, place=found.place, submap=1, other=0)
+    assert found.closure == LoopClosureRecord(
+        frame=103, matched_frame=found.matched_keyframe, submap=1, matched_submap=0
+    )
 
 
 def test_a_drifted_loop_is_detected() -> None:
@@ -62,10 +64,10 @@ def test_a_drifted_loop_is_detected() -> None:
     found = loop_detector(submap).detect(submap, END)
     assert found is not None
     assert found.is_loop
-    assert found.place in (0, 1, 2)
+    assert found.matched_keyframe in (0, 1, 2)
     # what the end sees is smaller by all the steps of the way
     scale = float(found.relation.S_21[:3, :3].det()) ** (1 / 3)
-    assert scale == pytest.approx(1.01 ** (END - found.place), rel=0.02)
+    assert scale == pytest.approx(1.01 ** (END - found.matched_keyframe), rel=0.02)
 
 
 def test_a_place_that_was_never_left_is_no_loop() -> None:
@@ -100,7 +102,7 @@ def test_neighboring_keyframes_must_verify_a_loop(S_21: Tensor) -> None:
 
 def test_covisibility_reaches_two_steps() -> None:
     slam_map = ring_submap().map
-    near = covisible_twice(slam_map, 10)
+    near = two_hop_covisible(slam_map, 10)
     shared = slam_map.count_observed(slam_map.observed_points(torch.tensor([10])))
     assert set(torch.nonzero(shared)[:, 0].tolist()) <= set(near.tolist())
     furthest = int(torch.nonzero(shared)[-1])
@@ -119,20 +121,24 @@ def way() -> Submap:
 
 
 def drifts(
-    S_21: Tensor, submap: Submap | None = None, keyframe: int = 10, place: int = 0, **settings: float
+    S_21: Tensor,
+    submap: Submap | None = None,
+    keyframe: int = 10,
+    matched_keyframe: int = 0,
+    **settings: float,
 ) -> bool:
     relation = RelativeSim3(S_21, 0, 0, 0)
-    return may_have_drifted(
-        submap or way(), keyframe, place, relation, replace(LoopClosingConfig(), **settings)
+    return is_plausible_drift(
+        submap or way(), keyframe, matched_keyframe, relation, replace(LoopClosingConfig(), **settings)
     )
 
 
 def test_the_allowed_position_drift_grows_with_path_length() -> None:
     assert drifts(pose(0, 1.99))
     assert not drifts(pose(0, 2.01))
-    assert drifts(pose(0, 0, 0.99), place=5)
-    assert not drifts(pose(0, 0, 1.01), place=5)
-    assert drifts(pose(0, 0, 0.99), keyframe=0, place=5)
+    assert drifts(pose(0, 0, 0.99), matched_keyframe=5)
+    assert not drifts(pose(0, 0, 1.01), matched_keyframe=5)
+    assert drifts(pose(0, 0, 0.99), keyframe=0, matched_keyframe=5)
     assert drifts(pose(0, 3.99), max_drift=0.4)
 
 
@@ -161,7 +167,7 @@ def test_rotation_drift_is_bounded() -> None:
 @pytest.mark.parametrize(("scale", "may"), [(4.99, True), (5.01, False), (1 / 4.99, True), (1 / 5.01, False)])
 def test_scale_drift_is_bounded(scale: float, may: bool) -> None:
     here = camera_center(way().map.T_cw[10])
-    grown = rescaling(torch.tensor(scale).double())
+    grown = scaling_sim3(torch.tensor(scale).double())
     grown = pose(*here.tolist()) @ grown @ pose(*(-here).tolist())
     assert drifts(grown) is may
     turned = pose(0, 0, 0, 0, 0, math.radians(15.0))  # the scale is no rotation, nor the other way round
@@ -190,7 +196,7 @@ def test_candidates_with_nearly_equal_similarities_agree() -> None:
     for near, far in (
         (pose(0, 0.38), pose(0, 0.5)),  # a tenth of the depth, which is four
         (pose(0, 0, 0, 4.9 * degree), pose(0, 0, 0, 5.1 * degree)),
-        (rescaling(torch.tensor(1.19).double()), rescaling(torch.tensor(1.21).double())),
+        (scaling_sim3(torch.tensor(1.19).double()), scaling_sim3(torch.tensor(1.21).double())),
     ):
         assert answers(about(near), pose())
         assert answers(pose(), about(near))

@@ -18,9 +18,9 @@ from torchslam.loop_closing.relative_sim3 import (
     inlier_matches,
     match_by_sim3_pose,
     neighborhood,
-    rescaling,
-    seen_from,
-    verify,
+    scaling_sim3,
+    transfer_pose,
+    verify_relative_sim3,
 )
 from torchslam.map.map import Map
 
@@ -48,10 +48,10 @@ def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:
     torch.testing.assert_close(relation.S_21, S_21, atol=1e-6, rtol=0)
     seen = set(map_1.observed_points(torch.tensor([2])).tolist())
     there = set(map_2.observed_points(torch.arange(4)).tolist())
-    assert relation.forward == relation.pairs == len(seen & there)  # rows are the same in both
+    assert relation.inliers_1 == relation.shared_points == len(seen & there)  # rows are the same in both
     back = set(map_2.observed_points(torch.tensor([1])).tolist())
     here = set(map_1.observed_points(torch.arange(4)).tolist())
-    assert relation.backward == len(back & here)
+    assert relation.inliers_2 == len(back & here)
 
 
 def test_the_reverse_similarity_is_the_inverse(S_21: Tensor) -> None:
@@ -67,7 +67,7 @@ def test_noise_changes_the_similarity_little(S_21: Tensor) -> None:
     points = SCENE.points_w[:50]
     off = transform(relation.S_21, points) - transform(S_21, points)
     assert float(off.norm(dim=-1).median()) < 0.03 * 4.0 * 1.6
-    assert relation.forward > 100
+    assert relation.inliers_1 > 100
 
 
 @pytest.mark.parametrize(("known", "samples"), [(12, 1), (24, 69), (60, 1147), (120, 3000)])
@@ -126,7 +126,7 @@ def test_enough_points_of_the_other_map_must_be_seen(S_21: Tensor) -> None:
         thinned(map_2, in_both(map_1, map_2)[:count])
         relation = related(map_1, map_2)
         assert (relation is not None) is found
-        assert relation is None or relation.forward == 40
+        assert relation is None or relation.inliers_1 == 40
         map_1, map_2 = maps(S_21)
         thinned(map_2, in_both(map_1, map_2)[:count])
         assert related(map_1, map_2, f"loop_closing.min_matches={count}") is not None
@@ -138,7 +138,7 @@ def test_enough_of_them_must_be_known_to_the_own_map(S_21: Tensor) -> None:
         thinned(map_1, in_both(map_1, map_2)[:count])
         relation = related(map_1, map_2)
         assert (relation is not None) is found
-        assert relation is None or (relation.pairs, relation.backward) == (20, 20)
+        assert relation is None or (relation.shared_points, relation.inliers_2) == (20, 20)
 
 
 def test_the_reverse_direction_needs_half_as_many_matches(S_21: Tensor) -> None:
@@ -165,17 +165,17 @@ def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor)
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
     right = RelativeSim3(S_21, 0, 0, 0)
-    assert verify(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
     for wrong in (
         pose(0.5) @ S_21,
         pose(0, 0, 0, 0, 0.1) @ S_21,
-        rescaling(torch.tensor(1.3).double()) @ S_21,
+        scaling_sim3(torch.tensor(1.3).double()) @ S_21,
     ):
-        assert not verify(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
+        assert not verify_relative_sim3(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:20])
-    assert verify(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
     thinned(map_2, in_both(map_1, map_2)[:19])
-    assert not verify(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert not verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(4.85, True), (4.95, False)])
@@ -209,8 +209,8 @@ def test_a_neighborhood_is_a_keyframe_and_its_most_covisible_ones() -> None:
 
 
 def test_a_camera_pose_is_expressed_in_the_other_map(S_21: Tensor) -> None:
-    torch.testing.assert_close(seen_from(moved(ONE[1], S_21), S_21), ONE[1])
-    torch.testing.assert_close(seen_from(ONE[1], sim3_inverse(S_21)), moved(ONE[1], S_21))
+    torch.testing.assert_close(transfer_pose(moved(ONE[1], S_21), S_21), ONE[1])
+    torch.testing.assert_close(transfer_pose(ONE[1], sim3_inverse(S_21)), moved(ONE[1], S_21))
     points = SCENE.points_w[:5]
-    twice = transform(rescaling(torch.tensor(2.0).double()), points)
+    twice = transform(scaling_sim3(torch.tensor(2.0).double()), points)
     torch.testing.assert_close(twice, 2 * points)

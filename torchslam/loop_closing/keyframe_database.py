@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from torchslam.features.matching.hamming import pack_bits, sign_products, spread
 
 BITS = 256  # of a descriptor
 CODE_BITS = 64  # of a code: one machine word
-_CODE_NOISE = 9.0  # bits: the likeness of codes falls by exp(-(distance / _CODE_NOISE)^2)
+_CODE_NOISE = 9.0  # bits: the similarity of codes falls by exp(-(distance / _CODE_NOISE)^2)
 _CODE_LIMIT = 19  # bits: codes further apart mean different things
 # by experiments/places/train.py, from rendered images
 _WORDS_FILE = Path(__file__).parent / "words.safetensors"
@@ -27,16 +28,18 @@ _SEED = 0  # of the choice of bits and of the projections of floats; part of wha
 
 
 @lru_cache(maxsize=4)
-def rendered_words(device: torch.device) -> Tensor:
-    """(1024, 32) uint8: centers of ORB descriptors of rendered images."""
+def default_vocabulary(device: torch.device) -> UInt8[Tensor, "1024 32"]:
+    """The vocabulary of the package: centers of ORB descriptors of rendered images."""
     return load_file(_WORDS_FILE)["words"].to(device)
 
 
-def binary(descriptors: Tensor) -> Tensor:
-    """Descriptors as 256 packed bits: (N, 32) uint8 as they are, (N, D) floats by the signs of random projections.
+def binarize(descriptors: UInt8[Tensor, "N 32"] | Float[Tensor, "N D"]) -> UInt8[Tensor, "N 32"]:
+    """Convert descriptors to 256 packed bits: bits stay, floats become the signs of random projections.
 
-    The Hamming distance of such bits grows with the angle between the floats (Charikar, 2002). Returns (N, 32) uint8.
-    Raises ValueError for bits of another number.
+    The Hamming distance of such bits grows with the angle between the floats (Charikar, 2002).
+
+    Raises:
+        ValueError: The descriptors are bits of another number.
     """
     if descriptors.dtype == torch.uint8:
         if descriptors.shape[-1] != BITS // 8:
@@ -46,10 +49,12 @@ def binary(descriptors: Tensor) -> Tensor:
     return pack_bits(values @ _projections(values.shape[-1], values.device) > 0)
 
 
-def words_and_codes(descriptors: Tensor, words: Tensor) -> tuple[Tensor, Tensor]:
-    """The words that descriptors (N, 32) uint8 use out of words (W, 32) uint8, ascending, and the code of each.
+def quantize(
+    descriptors: UInt8[Tensor, "N 32"], words: UInt8[Tensor, "W 32"]
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
+    """Quantize descriptors: the words that they use, ascending, and the code of each word.
 
-    Of equally near words the lower one wins, of equally many bits 0 and 1 the 0. Returns (n,) int64 and (n,) int64.
+    Of equally near words the lower one wins, of equally many bits 0 and 1 the 0.
     """
     if len(descriptors) == 0:
         nothing = torch.zeros(0, dtype=torch.int64, device=descriptors.device)
@@ -62,8 +67,8 @@ def words_and_codes(descriptors: Tensor, words: Tensor) -> tuple[Tensor, Tensor]
     return used, pack_bits(votes[used] > 0).view(torch.int64)[:, 0]
 
 
-def _nearest(descriptors: Tensor, words: Tensor) -> Tensor:
-    """(N,) the nearest word by Hamming distance, the lower one of equals on every device."""
+def _nearest(descriptors: UInt8[Tensor, "N 32"], words: UInt8[Tensor, "W 32"]) -> Int[Tensor, " N"]:
+    """The nearest word by Hamming distance, the lower one of equals on every device."""
     keys = sign_products(descriptors, words, 1).to(torch.int32)
     # One maximum finds product and word: a quarter of the time of argmax.
     keys = keys * len(words) + torch.arange(len(words) - 1, -1, -1, device=words.device, dtype=torch.int32)
@@ -71,35 +76,37 @@ def _nearest(descriptors: Tensor, words: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _code_bits(device: torch.device) -> Tensor:
-    """(64,) which bits of a descriptor make its code."""
+def _code_bits(device: torch.device) -> Int[Tensor, "64"]:
+    """The bits of a descriptor that make its code."""
     generator = torch.Generator().manual_seed(_SEED)
     return torch.randperm(BITS, generator=generator)[:CODE_BITS].to(device)
 
 
 @lru_cache(maxsize=4)
-def _projections(size: int, device: torch.device) -> Tensor:
-    """(size, 256) random directions."""
+def _projections(size: int, device: torch.device) -> Float[Tensor, "{size} 256"]:
+    """Random directions."""
     generator = torch.Generator().manual_seed(_SEED)
     return torch.randn(size, BITS, generator=generator).to(device)
 
 
-def likeness(codes_1: Tensor, codes_2: Tensor) -> Tensor:
-    """How much alike codes of the same word are: (...) int64 twice, broadcast -> (...) float32 in [0, 1]."""
+def code_similarity(
+    codes_1: Int[Tensor, "*#batch"], codes_2: Int[Tensor, "*#batch"]
+) -> Float[Tensor, "*#batch"]:
+    """Similarity of codes of the same word, 0 to 1."""
     distance = _count_bits(codes_1 ^ codes_2)
     return _kernel(codes_1.device).index_select(0, distance.view(-1)).view(distance.shape)
 
 
 @lru_cache(maxsize=4)
-def _kernel(device: torch.device) -> Tensor:
-    """(65,) float32: likeness by Hamming distance."""
+def _kernel(device: torch.device) -> Float[Tensor, "65"]:
+    """Similarity by Hamming distance."""
     distance = torch.arange(CODE_BITS + 1, dtype=torch.float64)
     values = torch.exp(-((distance / _CODE_NOISE) ** 2)) * (distance <= _CODE_LIMIT)
     return values.float().to(device)
 
 
-def _count_bits(words: Tensor) -> Tensor:
-    """How many bits of each word are set: (...) int64 -> (...) int64 (Warren: Hacker's Delight, 2002). Overwrites."""
+def _count_bits(words: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
+    """Number of set bits of each word (Warren: Hacker's Delight, 2002). Overwrites the words."""
     part = (words >> 1).bitwise_and_(0x5555555555555555)
     words -= part
     torch.bitwise_right_shift(words, 2, out=part)
@@ -109,7 +116,7 @@ def _count_bits(words: Tensor) -> Tensor:
     return words.bitwise_right_shift_(56)  # at most 64, so the sign bit stays clear
 
 
-STRONGEST = 400  # descriptors used per image: nearly as good as all of them, at less than half the cost
+MAX_DESCRIPTORS = 400  # per image, the strongest: nearly as good as all of them, at less than half the cost
 NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
@@ -120,14 +127,14 @@ _MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a flo
 class KeyframeDatabase:
     """Inverted index of keyframes, by key, that ranks them by similarity to an image.
 
-    Descriptors are ordered by decreasing strength, as the extractors return them: bits (N, 32) or unit floats (N, D),
-    of one kind for all images.
+    Descriptors are ordered by decreasing strength, as the extractors return them, and of one kind for all images.
 
-    words: (W, 32) uint8, the vocabulary. By default bits use that of the package, which was trained on rendered images,
-           and floats the descriptors of the first keyframe that has at least 64.
+    Args:
+        words: the vocabulary. By default bits use that of the package, which was trained on rendered images, and
+            floats the descriptors of the first keyframe that has at least 64.
     """
 
-    def __init__(self, words: Tensor | None = None) -> None:
+    def __init__(self, words: UInt8[Tensor, "W 32"] | None = None) -> None:
         self._words = words
         self._keys = torch.zeros(0, dtype=torch.int64)  # (slots,) NO_KEY where the slot is free
         self._codes = torch.zeros(0, 0, dtype=torch.int64)  # (W, slots), of each word in each keyframe
@@ -139,36 +146,40 @@ class KeyframeDatabase:
         return len(self._slots)
 
     def __contains__(self, key: int) -> bool:
+        """Whether there is a keyframe of this key."""
         return key in self._slots
 
     @property
-    def keys(self) -> Tensor:
-        """(n,) int64 keys of all keyframes, ascending."""
+    def keys(self) -> Int[Tensor, " K"]:
+        """Keys of all keyframes, ascending."""
         return torch.sort(self._keys[self._keys != NO_KEY]).values
 
-    # --- changing --------------------------------------------------------------------------------------------
+    def add(self, key: int, descriptors: Shaped[Tensor, "N D"], mask: Bool[Tensor, " N"]) -> None:
+        """Add a keyframe by its descriptors, bits or unit floats, where the mask is True.
 
-    def add(self, key: int, descriptors: Tensor, mask: Tensor) -> None:
-        """Add a keyframe with descriptors (N, 32) uint8 or (N, D) floats, those of the mask (N,).
-
-        Raises ValueError for a negative key or one that is already there.
+        Raises:
+            ValueError: The key is negative or already there.
         """
         if key < 0 or key in self._slots:
             raise ValueError(f"a key must be new and at least 0, not {key}")
         floats, descriptors = descriptors.is_floating_point(), _strongest(descriptors, mask)
         slot = self._free_slot(descriptors.device)
         if self._words is None and (not floats or len(descriptors) >= _MIN_FLOAT_WORDS):
-            self._words = descriptors if floats else rendered_words(descriptors.device)
+            self._words = descriptors if floats else default_vocabulary(descriptors.device)
         if self._words is not None and len(self._codes) == 0:
-            self._take_words(self._words.to(descriptors.device))
+            self._set_words(self._words.to(descriptors.device))
         if self._words is not None:
-            used, codes = words_and_codes(descriptors, self._words)
+            used, codes = quantize(descriptors, self._words)
             self._used[used, slot], self._codes[used, slot] = 1.0, codes
         self._keys[slot] = key
         self._slots[key] = slot
 
-    def remove(self, keys: Tensor | Iterable[int]) -> None:
-        """Remove keyframes (n,). Raises KeyError, before anything changes, if a key is missing."""
+    def remove(self, keys: Int[Tensor, " K"] | Iterable[int]) -> None:
+        """Remove keyframes.
+
+        Raises:
+            KeyError: A key is missing; nothing was removed.
+        """
         keys = _as_list(keys)
         slots = [self._slots[key] for key in keys]
         self._keys[slots] = NO_KEY
@@ -176,32 +187,39 @@ class KeyframeDatabase:
         for key in keys:
             self._slots.pop(key, None)
 
-    # --- asking ----------------------------------------------------------------------------------------------
+    def query(
+        self, descriptors: Shaped[Tensor, "N D"], mask: Bool[Tensor, " N"]
+    ) -> tuple[Int[Tensor, " K"], Float[Tensor, " K"]]:
+        """Rank all keyframes by similarity to an image with these descriptors, where the mask is True.
 
-    def query(self, descriptors: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Rank all keyframes by similarity to an image with descriptors (N, 32) or (N, D), those of the mask (N,).
-
-        Returns keys (n,) int64 and scores (n,) float32 in [0, 1], the best first, of equals the lower key first.
+        Returns:
+            Keys and scores in [0, 1], the best first, of equals the lower key first.
         """
         if not self._slots or self._words is None:
             return self.keys, torch.zeros(len(self), device=self._keys.device)
-        return self._ranked(*words_and_codes(_strongest(descriptors, mask), self._words))
+        return self._ranked(*quantize(_strongest(descriptors, mask), self._words))
 
-    def query_by_key(self, key: int) -> tuple[Tensor, Tensor]:
-        """Rank all keyframes by similarity to one of them, as `query`. Raises KeyError if the key is missing."""
+    def query_by_key(self, key: int) -> tuple[Int[Tensor, " K"], Float[Tensor, " K"]]:
+        """Rank all keyframes by similarity to one of them, as `query`.
+
+        Raises:
+            KeyError: The key is missing.
+        """
         slot = self._slots[key]
         used = torch.nonzero(self._used[:, slot])[:, 0]
         return self._ranked(used, self._codes[used, slot])
 
-    def _ranked(self, used: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and scores by similarity to an image that uses words (n,) with codes (n,), in order."""
+    def _ranked(
+        self, used: Int[Tensor, " R"], codes: Int[Tensor, " R"]
+    ) -> tuple[Int[Tensor, " K"], Float[Tensor, " K"]]:
+        """Keys and scores by similarity to an image that uses these words with these codes, in order."""
         size = len(self._keys)
         # A word that no keyframe has yet is taken to be as rare as one that a single one has.
         rarity = torch.log((len(self) + 1) / self._used.sum(1).clamp(min=1.0)).square()
         shared = self._used.new_zeros(size)
         for rows in torch.arange(len(used), device=used.device).split(max(1, _CHUNK // size)):
             word = used[rows]
-            alike = likeness(self._codes.index_select(0, word), codes[rows, None])
+            alike = code_similarity(self._codes.index_select(0, word), codes[rows, None])
             shared += rarity[word] @ alike.mul_(self._used.index_select(0, word))
         own = rarity[used].sum()
         scores = shared / (own * (rarity @ self._used)).sqrt().clamp(min=1e-12)
@@ -210,10 +228,8 @@ class KeyframeDatabase:
         ranked = torch.sort(scores[slots].clamp(max=1.0), descending=True, stable=True)
         return self._keys[slots][ranked.indices], ranked.values
 
-    # --- storage ---------------------------------------------------------------------------------------------
-
-    def _take_words(self, words: Tensor) -> None:
-        """Describe the keyframes from now on by these words (W, 32); those there are, empty ones, have none."""
+    def _set_words(self, words: UInt8[Tensor, "W 32"]) -> None:
+        """Set the vocabulary; the keyframes so far, which are empty, use no words."""
         self._words = words
         self._codes = torch.zeros(len(words), len(self._keys), dtype=torch.int64, device=words.device)
         self._used = torch.zeros(len(words), len(self._keys), device=words.device)
@@ -232,17 +248,19 @@ class KeyframeDatabase:
         self._used = _widened(self._used, capacity, 0, device)
 
 
-def _strongest(descriptors: Tensor, mask: Tensor) -> Tensor:
-    """(<= STRONGEST, 32) uint8: the first descriptors of the mask, as bits."""
-    return binary(descriptors[torch.nonzero(mask)[:STRONGEST, 0]])
+def _strongest(descriptors: Shaped[Tensor, "N D"], mask: Bool[Tensor, " N"]) -> UInt8[Tensor, "R 32"]:
+    """The first MAX_DESCRIPTORS descriptors of the mask, as bits."""
+    return binarize(descriptors[torch.nonzero(mask)[:MAX_DESCRIPTORS, 0]])
 
 
-def _widened(columns: Tensor, capacity: int, fill: int, device: torch.device) -> Tensor:
-    """The tensor (..., n) with `capacity` columns, the new ones filled."""
+def _widened(
+    columns: Shaped[Tensor, "*batch K"], capacity: int, fill: int, device: torch.device
+) -> Shaped[Tensor, "*batch {capacity}"]:
+    """The tensor with `capacity` columns, the new ones filled."""
     new = torch.full((*columns.shape[:-1], capacity), fill, dtype=columns.dtype, device=device)
     new[..., : columns.shape[-1]] = columns
     return new
 
 
-def _as_list(keys: Tensor | Iterable[int]) -> list[int]:
+def _as_list(keys: Int[Tensor, " K"] | Iterable[int]) -> list[int]:
     return [int(key) for key in (keys.tolist() if isinstance(keys, Tensor) else keys)]

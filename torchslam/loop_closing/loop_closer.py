@@ -9,6 +9,7 @@ Tardos, "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, sectio
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
@@ -24,14 +25,19 @@ from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures
 
-STRONG = 100  # shared points from which two keyframes have an edge beside the spanning tree
+MIN_ESSENTIAL_WEIGHT = 100  # shared points of two keyframes with an edge in addition to the spanning tree
 _MAX_STRONG_EDGES = 20  # of a keyframe
 _ITERATIONS = 20
-_VISIT_KEYFRAMES = 20  # on either side of the loop: what is searched for the other side's points
+_VISIT_KEYFRAMES = 20  # on either side of the loop, in which the other side's points are searched for
 
 
 class LoopCloser:
-    """Detects and closes loops over all submaps of an atlas."""
+    """Detects and closes loops over all submaps of an atlas.
+
+    Attributes:
+        loop_closures: records of all loop closures and merges so far.
+        loop_precheck: key of the last keyframe of `precheck`, and whether a loop was detected.
+    """
 
     def __init__(self, camera: Camera, config: Config, atlas: Atlas) -> None:
         self.camera = camera
@@ -39,8 +45,8 @@ class LoopCloser:
         self.atlas = atlas
         self.keyframe_database = KeyframeDatabase()
         self.loop_detector = LoopDetector(camera, config, atlas, self.keyframe_database)
-        self.loop_closures: list[LoopClosureRecord] = []  # what was recognised so far, for the record
-        self.loop_precheck: tuple[int, bool] | None = None  # a keyframe, by key, and what `precheck` saw
+        self.loop_closures: list[LoopClosureRecord] = []
+        self.loop_precheck: tuple[int, bool] | None = None
         for submap in atlas:
             for keyframe in range(submap.map.num_keyframes):
                 self.add(submap.map, keyframe)
@@ -54,8 +60,8 @@ class LoopCloser:
         view = slam_map.frame_features(keyframe)
         self.keyframe_database.add(slam_map.key(keyframe), view.descriptors, view.mask)
 
-    def remove(self, keys: Tensor) -> None:
-        """Remove keyframes by their keys (n,)."""
+    def remove(self, keys: Int[Tensor, " K"]) -> None:
+        """Remove keyframes by their keys from the keyframe database."""
         self.keyframe_database.remove(keys)
 
     def query(self, view: FrameFeatures) -> list[Candidate]:
@@ -93,7 +99,7 @@ class LoopCloser:
             close_loop(found, self.camera, self.config)
             return found.submap, found.keyframe
         submap, keyframe = merge_maps(found, self.camera, self.config)
-        self.atlas.remove(found.submap if submap is found.other else found.other)
+        self.atlas.remove(found.submap if submap is found.matched_submap else found.matched_submap)
         return submap, keyframe
 
 
@@ -101,18 +107,19 @@ def close_loop(found: LoopCandidate, camera: Camera, config: Config) -> None:
     """Correct the drift of a submap by a pose graph, then fuse landmarks; the first keyframe stays."""
     submap = found.submap
     submap.apply_sim3_correction(essential_graph_solution(found))
-    fuse_and_adjust(submap, found.keyframe, found.place, camera, config)
+    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe, camera, config)
 
 
-def essential_graph_solution(found: LoopCandidate) -> Tensor:
-    """Optimize the pose graph of the essential graph and the loop edge; return Sim(3) (K, 4, 4), world to keyframe."""
+def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
+    """Optimize the pose graph of the essential graph and the loop edge; return Sim(3), world to keyframe."""
     T_cw = found.submap.map.T_cw
     edges = essential_edges(found.submap.map)
-    closing = edges.new_tensor([[found.place, found.keyframe]])
+    closing = edges.new_tensor([[found.matched_keyframe, found.keyframe]])
     measured = T_cw[edges[:, 1]] @ se3_inverse(T_cw[edges[:, 0]])
-    # S_21 maps the frame of the keyframe to that of the place.
-    S_kp = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ se3_inverse(T_cw[found.place])
-    graph = PoseGraph(T_cw, torch.cat([edges, closing]), torch.cat([measured, S_kp[None]]), fixed=(0,))
+    # S_21 maps the frame of the keyframe to that of the matched one.
+    T_wm = se3_inverse(T_cw[found.matched_keyframe])
+    S_km = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ T_wm
+    graph = PoseGraph(T_cw, torch.cat([edges, closing]), torch.cat([measured, S_km[None]]), fixed=(0,))
     return pose_graph_optimize(graph, backward="detached", iterations=_ITERATIONS).S_cw
 
 
@@ -121,27 +128,29 @@ def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Su
 
     The tracking state stays that of the keyframe's submap.
     """
-    submap, other, relation = found.submap, found.other, found.relation
+    submap, other, relation = found.submap, found.matched_submap, found.relation
     if other.number < submap.number:
         offset = other.map.num_keyframes
         other.merge(submap, relation.S_21)
-        fuse_and_adjust(other, found.keyframe + offset, found.place, camera, config)
+        fuse_and_adjust(other, found.keyframe + offset, found.matched_keyframe, camera, config)
         return other, found.keyframe + offset
     offset = submap.map.num_keyframes
     tracking = submap.tracking
     submap.merge(other, sim3_inverse(relation.S_21))
     submap.tracking = tracking
-    fuse_and_adjust(submap, found.keyframe, found.place + offset, camera, config)
+    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe + offset, camera, config)
     return submap, found.keyframe
 
 
-def fuse_and_adjust(submap: Submap, keyframe: int, place: int, camera: Camera, config: Config) -> None:
-    """Fuse landmarks between the neighborhoods of a keyframe and of a place, and adjust the whole map, twice.
+def fuse_and_adjust(
+    submap: Submap, keyframe: int, matched_keyframe: int, camera: Camera, config: Config
+) -> None:
+    """Fuse landmarks between the neighborhoods of two keyframes, and adjust the whole map, twice.
 
     Before the first adjustment some points are too far from their keypoints to be matched.
     """
     here = neighborhood(submap.map, keyframe, _VISIT_KEYFRAMES)
-    there = neighborhood(submap.map, place, _VISIT_KEYFRAMES)
+    there = neighborhood(submap.map, matched_keyframe, _VISIT_KEYFRAMES)
     fuse_landmarks(submap.map, here, there, camera, config)
     if config.loop_closing.global_bundle_adjustment and config.bundle_adjustment.local:
         adjust_all(submap.map, camera, config.bundle_adjustment)
@@ -162,8 +171,8 @@ def fuse_with_earlier_visits(submap: Submap, keyframe: int, camera: Camera, conf
         tracking.last_inlier_points = submap.map.follow_merges(tracking.last_inlier_points)
 
 
-def earlier_visit_keyframes(slam_map: Map, keyframe: int) -> Tensor:
-    """Return covisible keyframes (<= 20,) of earlier visits: before the last gap in covisibility over time."""
+def earlier_visit_keyframes(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
+    """Return at most 20 covisible keyframes of earlier visits: before the last gap in covisibility over time."""
     order = torch.argsort(slam_map.keys)
     rank = torch.argsort(order)
     shares = slam_map.count_observed(slam_map.observed_points(slam_map.index_tensor(keyframe)))[order] > 0
@@ -173,16 +182,18 @@ def earlier_visit_keyframes(slam_map: Map, keyframe: int) -> Tensor:
     return near[rank[near] < began][:_VISIT_KEYFRAMES]
 
 
-def fuse_landmarks(slam_map: Map, here: Tensor, there: Tensor, camera: Camera, config: Config) -> None:
-    """Match the points of keyframes (k,) and others (l,) in each other, and merge duplicates."""
+def fuse_landmarks(
+    slam_map: Map, here: Int[Tensor, " K"], there: Int[Tensor, " L"], camera: Camera, config: Config
+) -> None:
+    """Match the points of two sets of keyframes in each other, and merge duplicates."""
     for keyframes, others in ((here, there), (there, here)):
         points = slam_map.observed_points(others)
         merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
     slam_map.update_appearance(torch.unique(torch.cat([here, there])))
 
 
-def essential_edges(slam_map: Map) -> Tensor:
-    """Return the essential graph: edges (E, 2) int64 of a spanning tree and of strongly covisible keyframes.
+def essential_edges(slam_map: Map) -> Int[Tensor, "E 2"]:
+    """Return the essential graph: edges of a spanning tree and of strongly covisible keyframes.
 
     The parent in the tree is the most covisible earlier keyframe, or else the row before.
     """
@@ -191,6 +202,6 @@ def essential_edges(slam_map: Map) -> Tensor:
         near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes, min_shared=1)
         earlier = near[near < keyframe]
         edges.add((int(earlier[0]) if len(earlier) else keyframe - 1, keyframe))
-        strong = slam_map.covisible_keyframes(keyframe, _MAX_STRONG_EDGES, min_shared=STRONG)
+        strong = slam_map.covisible_keyframes(keyframe, _MAX_STRONG_EDGES, min_shared=MIN_ESSENTIAL_WEIGHT)
         edges.update((other, keyframe) for other in strong.tolist() if other < keyframe)
     return torch.tensor(sorted(edges), dtype=torch.int64, device=slam_map.T_cw.device).reshape(-1, 2)

@@ -6,13 +6,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from torchslam.config import Config, LoopClosingConfig
 from torchslam.geometry import Camera, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, estimate_relative_sim3, neighborhood, verify
+from torchslam.loop_closing.relative_sim3 import (
+    RelativeSim3,
+    estimate_relative_sim3,
+    neighborhood,
+    verify_relative_sim3,
+)
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 
@@ -23,40 +29,50 @@ _SAME_SCALE, _SAME_DEG, _SAME_SHARE = 1.2, 5.0, 0.1  # largest difference of two
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """A verified match of a keyframe with another keyframe, its place.
+    """A verified match of a keyframe with another keyframe of the same place.
 
-    submap, keyframe: the new keyframe
-    other, place:     the recognized keyframe, in the same submap or another
-    relation:         Sim(3) from the submap, at the keyframe, to the other submap
+    Attributes:
+        submap: of the new keyframe.
+        keyframe: row of the new keyframe.
+        matched_submap: of the recognized keyframe; the same or another.
+        matched_keyframe: row of the recognized keyframe.
+        relation: Sim(3) from the submap, at the keyframe, to the matched submap.
     """
 
     submap: Submap
     keyframe: int
-    other: Submap
-    place: int
+    matched_submap: Submap
+    matched_keyframe: int
     relation: RelativeSim3
 
     @property
     def is_loop(self) -> bool:
         """Whether both are in the same submap."""
-        return self.submap is self.other
+        return self.submap is self.matched_submap
 
     @property
     def closure(self) -> LoopClosureRecord:
         """The record of this candidate, independent of later changes of the map."""
         frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
-        place = int(self.other.map.keyframes["frame_index"][self.place])
-        return LoopClosureRecord(frame, place, self.submap.number, self.other.number)
+        matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
+        return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
 
 
 @dataclass(frozen=True)
 class LoopClosureRecord:
-    """Record of a loop closure or map merge: frame indices of the two keyframes and numbers of their submaps."""
+    """Record of a loop closure or map merge.
+
+    Attributes:
+        frame: index of the frame of the new keyframe.
+        matched_frame: index of the frame of the recognized keyframe.
+        submap: number of the submap of the new keyframe.
+        matched_submap: number of the submap of the recognized keyframe.
+    """
 
     frame: int
-    place: int
+    matched_frame: int
     submap: int
-    other: int
+    matched_submap: int
 
 
 class LoopDetector:
@@ -71,68 +87,73 @@ class LoopDetector:
         self.keyframe_database = keyframe_database
 
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
-        """The place that a keyframe shows, if it is certain; None where it is new, or where two places might be it."""
+        """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
         found = [
-            LoopCandidate(submap, keyframe, other, place, relation)
-            for other, place in self._candidates(submap, keyframe)
-            if (relation := self._relation(submap, keyframe, other, place)) is not None
+            LoopCandidate(submap, keyframe, other, matched_keyframe, relation)
+            for other, matched_keyframe in self._candidates(submap, keyframe)
+            if (relation := self._relation(submap, keyframe, other, matched_keyframe)) is not None
         ]
         if not found or any(not are_consistent(found[0], other) for other in found[1:]):
             return None
         return found[0]
 
     def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
-        """Keyframes that look like this one but share nothing with it, the likeliest first, one of each place."""
+        """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""
         slam_map = submap.map
-        known = covisible_twice(slam_map, keyframe)
+        known = two_hop_covisible(slam_map, keyframe)
         keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
         taken: list[tuple[Submap, Tensor]] = [(submap, known)]
         for key in keys[: 4 * self.config.loop_closing.max_candidates].tolist():
             found = self.atlas.find(key)
             if found is None or len(taken) > self.config.loop_closing.max_candidates:
                 continue
-            other, place = found
-            if any(other is one and bool((near == place).any()) for one, near in taken):
+            other, matched_keyframe = found
+            if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
                 continue
-            taken.append((other, neighborhood(other.map, place)))
-            yield other, place
+            taken.append((other, neighborhood(other.map, matched_keyframe)))
+            yield other, matched_keyframe
 
-    def _relation(self, submap: Submap, keyframe: int, other: Submap, place: int) -> RelativeSim3 | None:
-        """How a keyframe lies to a place, if keyframes beside it confirm that and a drift may be the reason."""
-        relation = estimate_relative_sim3(submap.map, keyframe, other.map, place, self.camera, self.config)
+    def _relation(
+        self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
+    ) -> RelativeSim3 | None:
+        """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
+        relation = estimate_relative_sim3(
+            submap.map, keyframe, other.map, matched_keyframe, self.camera, self.config
+        )
         if relation is None:
             return None
-        if submap is other and not may_have_drifted(
-            submap, keyframe, place, relation, self.config.loop_closing
+        if submap is other and not is_plausible_drift(
+            submap, keyframe, matched_keyframe, relation, self.config.loop_closing
         ):
             return None
-        near = neighborhood(other.map, place)
+        near = neighborhood(other.map, matched_keyframe)
         covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
         sure = sum(
-            verify(relation, submap.map, one, other.map, near, self.camera, self.config)
+            verify_relative_sim3(relation, submap.map, one, other.map, near, self.camera, self.config)
             for one in covisible.tolist()
         )
         return relation if sure >= self.config.loop_closing.min_confirming_keyframes else None
 
 
-def covisible_twice(slam_map: Map, keyframe: int) -> Tensor:
-    """(k,) a keyframe, those that share points with it, and those that share many with the first of these."""
+def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
+    """Return a keyframe, those that share points with it, and those that share many with the first of these."""
     near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes, min_shared=1)
     further = slam_map.covisibility_union(near[:_AROUND], _AROUND)
     return torch.unique(torch.cat([near.new_tensor([keyframe]), near, further]))
 
 
-def may_have_drifted(
-    submap: Submap, keyframe: int, place: int, relation: RelativeSim3, settings: LoopClosingConfig
+def is_plausible_drift(
+    submap: Submap, keyframe: int, matched_keyframe: int, relation: RelativeSim3, settings: LoopClosingConfig
 ) -> bool:
-    """Whether so long a way can have drifted by what a loop says: places that only look alike lie further apart.
+    """Whether drift along the path between two keyframes can explain the Sim(3) of a loop.
 
-    The way is that of the keyframes between the two, in the order in which they were seen.
+    The Sim(3) between places that only look alike is mostly larger. The path is that of the keyframes between the two,
+    in temporal order.
     """
     slam_map = submap.map
     order = torch.argsort(slam_map.keys)
     rank = torch.argsort(order)
-    start, end = sorted((int(rank[place]), int(rank[keyframe])))
+    start, end = sorted((int(rank[matched_keyframe]), int(rank[keyframe])))
     centers_w = se3_inverse(slam_map.T_cw[order[start : end + 1]])[:, :3, 3]
     length = float(torch.linalg.vector_norm(centers_w.diff(dim=0), dim=-1).sum())
     here = se3_inverse(slam_map.T_cw[keyframe])[:3, 3]
@@ -149,16 +170,17 @@ def may_have_drifted(
 
 def are_consistent(one: LoopCandidate, other: LoopCandidate) -> bool:
     """Whether two candidates of one keyframe imply the same Sim(3); always true for different submaps."""
-    if one.other is not other.other:
+    target = one.matched_submap.map
+    if one.matched_submap is not other.matched_submap:
         return True
     S, Z = one.relation.S_21, other.relation.S_21
     scale, second = sim3_scale(S), sim3_scale(Z)
     turned = torch.rad2deg(rotation_angle(S[:3, :3] / scale @ (Z[:3, :3] / second).mT))
     camera_1 = se3_inverse(one.submap.map.T_cw[one.keyframe])[:3, 3]
     apart = torch.linalg.vector_norm((S - Z)[:3, :3] @ camera_1 + (S - Z)[:3, 3])
-    seen = one.other.map.observed_points(one.other.map.index_tensor(one.place))
-    T_cw = one.other.map.T_cw[one.place]
-    depth = (one.other.map.positions_w[seen] @ T_cw[2, :3] + T_cw[2, 3]).median()
+    observed = target.observed_points(target.index_tensor(one.matched_keyframe))
+    T_cw = target.T_cw[one.matched_keyframe]
+    depth = (target.positions_w[observed] @ T_cw[2, :3] + T_cw[2, 3]).median()
     ratio = float(scale / second)
     return (
         1 / _SAME_SCALE < ratio < _SAME_SCALE

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
@@ -27,26 +28,28 @@ from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity
-_AROUND = 10  # keyframes whose points are looked for in the other map
-_NEEDED = 12  # inliers of the first similarity that are worth a closer look
+_AROUND = 10  # keyframes whose points are searched for in the other map
+_NEEDED = 12  # inliers of the first similarity
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
 _KERNEL_SCALE = 2.0
-WIDER = 2.0  # times the noise: a similarity has its own
+_GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own
 
 
 @dataclass(frozen=True)
 class RelativeSim3:
-    """A keyframe of one map seen from another map.
+    """Sim(3) between two maps, estimated from a keyframe of each.
 
-    S_21:    (4, 4) similarity from the frame of map 1 to that of map 2
-    forward: points of map 2 that keyframe 1 sees where S_21 has them; backward: of map 1 in keyframe 2
-    pairs:   points that keyframe 1 sees and that both maps have
+    Attributes:
+        S_21: from the frame of map 1 to that of map 2.
+        inliers_1: number of points of map 2 that keyframe 1 observes where the Sim(3) predicts them.
+        inliers_2: number of points of map 1 that keyframe 2 observes where the Sim(3) predicts them.
+        shared_points: number of points that keyframe 1 observes and that both maps have.
     """
 
-    S_21: Tensor
-    forward: int
-    backward: int
-    pairs: int
+    S_21: Float[Tensor, "4 4"]
+    inliers_1: int
+    inliers_2: int
+    shared_points: int
 
 
 def estimate_relative_sim3(
@@ -71,50 +74,50 @@ def estimate_relative_sim3(
     if int(agrees.sum()) < settings.min_matches or len(ids) < settings.min_sim3_points:
         return None
     T_11 = map_1.T_cw[keyframe_1]
-    # How much longer the unit of map 1 is: the depths of the same points tell, as one pose alone does not.
+    # One pose does not determine the scale between the maps, but the depths of the same points do.
     depth_1 = transform(T_11, map_1.positions_w[own])[:, 2]
     depth_2 = transform(T_12, map_2.positions_w[ids])[:, 2]
     scale = (depth_2 / depth_1).median()
-    S_21 = se3_inverse(T_12) @ rescaling(scale) @ T_11
+    S_21 = se3_inverse(T_12) @ scaling_sim3(scale) @ T_11
     points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
-    T_21 = seen_from(map_2.T_cw[keyframe_2], S_21)
+    T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
     back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
     if len(back) < settings.min_matches // 2:
         return None
     return RelativeSim3(S_21, int(agrees.sum()), len(back), len(own))
 
 
-def verify(
+def verify_relative_sim3(
     relation: RelativeSim3,
     map_1: Map,
     other: int,
     map_2: Map,
-    near_2: Tensor,
+    near_2: Int[Tensor, " K"],
     camera: Camera,
     settings: Config,
 ) -> bool:
-    """Whether another keyframe of map 1 observes the points of keyframes (k,) of map 2 as the Sim(3) predicts."""
-    T_o2 = seen_from(map_1.T_cw[other], sim3_inverse(relation.S_21))
+    """Whether another keyframe of map 1 observes the points of keyframes of map 2 where the Sim(3) predicts them."""
+    T_o2 = transfer_pose(map_1.T_cw[other], sim3_inverse(relation.S_21))
     ids, _ = inlier_matches(map_2, map_2.observed_points(near_2), T_o2, map_1, other, camera, settings)
     return len(ids) >= settings.loop_closing.min_matches // 2
 
 
-def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Tensor:
-    """Return a keyframe and the most covisible ones, (k,)."""
+def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Int[Tensor, " R"]:
+    """Return a keyframe and the `count` most covisible ones."""
     near = slam_map.covisible_keyframes(keyframe, count)
     return torch.cat([near.new_tensor([keyframe]), near])
 
 
-def rescaling(scale: Tensor) -> Tensor:
-    """(4, 4) the similarity that multiplies by a scale ()."""
+def scaling_sim3(scale: Float[Tensor, ""]) -> Float[Tensor, "4 4"]:
+    """Return the Sim(3) that only scales."""
     eye = torch.eye(3, dtype=scale.dtype, device=scale.device)
     return rigid(scale * eye, eye.new_zeros(3))
 
 
-def seen_from(T_cw: Tensor, S_wv: Tensor) -> Tensor:
-    """(4, 4) the rigid pose in world v of a camera at T_cw in world w; S_wv: similarity from v to w.
+def transfer_pose(T_cw: Float[Tensor, "4 4"], S_wv: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return the pose T_cv in world v of a camera at T_cw in world w; S_wv: Sim(3) from v to w.
 
-    The scale has no effect on what a camera sees.
+    The scale is left out, as it has no effect on projections.
     """
     S_cv = T_cw @ S_wv
     scale = sim3_scale(S_cv)
@@ -122,9 +125,15 @@ def seen_from(T_cw: Tensor, S_wv: Tensor) -> Tensor:
 
 
 def match_by_sim3_pose(
-    slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
-) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) points (n,) of a map and keypoints of another map's keyframe, which is at T_cw in this one."""
+    slam_map: Map,
+    point_ids: Int[Tensor, " N"],
+    T_cw: Float[Tensor, "4 4"],
+    other: Map,
+    keyframe: int,
+    camera: Camera,
+    config: Config,
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """Match points of a map to the keypoints of another map's keyframe, whose pose in this map is T_cw."""
     view = other.frame_features(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
@@ -135,21 +144,27 @@ def match_by_sim3_pose(
 
 
 def inlier_matches(
-    slam_map: Map, point_ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, camera: Camera, config: Config
-) -> tuple[Tensor, Tensor]:
+    slam_map: Map,
+    point_ids: Int[Tensor, " N"],
+    T_cw: Float[Tensor, "4 4"],
+    other: Map,
+    keyframe: int,
+    camera: Camera,
+    config: Config,
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
     """Return the matches of `match_by_sim3_pose` that pass a gate widened for the noise of the Sim(3)."""
     ids, keypoints = match_by_sim3_pose(slam_map, point_ids, T_cw, other, keyframe, camera, config)
     view = other.frame_features(keyframe)
     points_c = transform(T_cw, slam_map.positions_w[ids])
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
-    good = passes_gate(errors, WIDER**2 * config.measurement.max_chi_square)
+    good = passes_gate(errors, _GATE_WIDENING**2 * config.measurement.max_chi_square)
     return ids[good], keypoints[good]
 
 
 def _first_guess(
     map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
-) -> Tensor | None:
-    """(4, 4) the pose of keyframe 1 in map 2, from points that both see; None where there is none."""
+) -> Float[Tensor, "4 4"] | None:
+    """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if none was found."""
     view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
     points_1 = map_1.keyframes["point_ids"][keyframe_1]
     points_2 = map_2.keyframes["point_ids"][keyframe_2]
@@ -161,7 +176,7 @@ def _first_guess(
     if len(rows_1) < _NEEDED:
         return None
     T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
-    # Where this many samples show no similarity that so few matches agree with, there is none.
+    # With this many samples, a similarity with at least _NEEDED inliers is found if there is one.
     samples = samples_needed(torch.tensor([_NEEDED]), torch.tensor([len(rows_1)]), 3, _CONFIDENCE)
     found = estimate_similarity(
         transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
@@ -178,13 +193,19 @@ def _first_guess(
     )
     if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
         return None
-    return seen_from(torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2)
+    return transfer_pose(torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2)
 
 
 def _refined(
-    slam_map: Map, ids: Tensor, T_cw: Tensor, other: Map, keyframe: int, keypoints: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor]:
-    """(4, 4), (n,): the pose of another map's keyframe by points (n,) it sees at keypoints (n,), and who agrees."""
+    slam_map: Map,
+    ids: Int[Tensor, " M"],
+    T_cw: Float[Tensor, "4 4"],
+    other: Map,
+    keyframe: int,
+    keypoints: Int[Tensor, " M"],
+    camera: Camera,
+) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " M"]]:
+    """The refined pose of another map's keyframe in this map, and which matches are inliers."""
     view, points_w = other.frame_features(keyframe), slam_map.positions_w[ids]
     pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
     refined = refine_pose(
