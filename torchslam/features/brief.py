@@ -96,8 +96,13 @@ def _moment_weights(device: torch.device) -> Tensor:
 def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
     """Angle from each keypoint to the intensity centroid of the disk around it.
 
-    pixels: (P,) uint8 flattened atlas; positions: (N,) int64 into it. Returns (N,) float32 radians in [-pi, pi],
-    from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
+    Args:
+        pixels: (P,) uint8 flattened atlas
+        positions: (N,) int64 into it.
+
+    Returns:
+        (N,) float32 radians in [-pi, pi], from x towards y; 0 on a uniform patch. The moments are whole
+            numbers below 2^24, hence exact.
     """
     patches = gather_patches(pixels, positions, stride, RADIUS).flatten(1)
     # As int8: what is subtracted is the same everywhere, and has no moment. The other order of factors is slower.
@@ -109,8 +114,12 @@ def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
 def blur(pixels: Tensor, stride: int) -> Tensor:
     """Smooth a flattened image by a 7x7 near-Gaussian of sigma 1.6 px, in whole numbers.
 
-    pixels: (P,) uint8. Returns (P - 6 stride - 6,) int16, 256 times the blurred value less 2^15: entry i belongs to
-    pixel i + BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
+    Args:
+        pixels: (P,) uint8.
+
+    Returns:
+        (P - 6 stride - 6,) int16, 256 times the blurred value less 2^15: entry i belongs to pixel i +
+            BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
     """
     margin = 2 * BLUR_RADIUS * (stride + 1)
     blurred = pixels.new_empty(max(0, pixels.shape[0] - margin), dtype=torch.int16)
@@ -140,8 +149,14 @@ def sample_rotated(
 ) -> Tensor:
     """Values of a blurred image at points around each keypoint, turned by its angle.
 
-    blurred: from `blur`; positions: (N,) int64 into the image before blurring; angles: (N,) radians; points: K times
-    (x, y) in pixels of the level. Returns (N, K) int16.
+    Args:
+        blurred: from `blur`
+        positions: (N,) int64 into the image before blurring
+        angles: (N,) radians
+        points: K times (x, y) in pixels of the level.
+
+    Returns:
+        (N, K) int16.
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)

@@ -21,8 +21,10 @@ MIN_SIDE = 40  # of a packed pyramid, so that every neighborhood fits whatever t
 class PackedPyramid:
     """Layout of the levels of a pyramid in one rectangle, in pixels of that rectangle.
 
-    sizes:  (height, width) of each level; corners: (top, left) of each level; scales: full-resolution pixels
-    (x, y) per pixel of the level.
+    Attributes:
+        sizes: (height, width) of each level
+        corners: (top, left) of each level
+        scales: full-resolution pixels (x, y) per pixel of the level
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -57,7 +59,11 @@ def plan_pyramid(height: int, width: int, scale_factor: float, num_levels: int) 
 def build_levels(images: Tensor, pyramid: PackedPyramid) -> list[Tensor]:
     """The pyramid in gray values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
 
-    images: (B, 1, H, W) in [0, 1]. Returns one (B, 1, h, w) per level; cutting off what follows the point rounds.
+    Args:
+        images: (B, 1, H, W) in [0, 1]
+
+    Returns:
+        one (B, 1, h, w) per level, rounded down to whole gray values
     """
     levels = [(images * 255).add_(0.5)]
     for size in pyramid.sizes[1:]:
@@ -81,8 +87,12 @@ def gather_level_patches(
 ) -> Tensor:
     """Patches around keypoints on their own levels, with gradients to the levels.
 
-    images, level: (N,) int64, which image and level; xy: (N, 2) int64, pixels of the level, at least `radius` inside.
-    Returns (N, side, side).
+    Args:
+        images, level: (N,) int64, image and level of each patch
+        xy: (N, 2) int64, pixels of the level, at least `radius` inside
+
+    Returns:
+        (N, side, side)
     """
     device = xy.device
     heights, widths = (torch.tensor([lv.shape[d] for lv in levels], device=device) for d in (-2, -1))

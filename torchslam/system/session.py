@@ -28,10 +28,11 @@ from torchslam.utils.timing import Stopwatch
 class Session:
     """One run of frames over an atlas.
 
-    camera:  camera of the frames of this and of all earlier sessions
-    atlas:   the submaps; changed by the session if `mapping`
-    number:  number of the session among those over the same atlas, from 0
-    mapping: whether keyframes, points and submaps are created; otherwise frames are only localized
+    Attributes:
+        camera: camera of the frames of this and of all earlier sessions
+        atlas: the submaps; the session changes them if `mapping`
+        number: number of the session among those over the same atlas, from 0
+        mapping: create keyframes, points and submaps; otherwise only localize frames
     """
 
     camera: Camera
@@ -105,7 +106,8 @@ class ActiveMap:
 class SystemContext:
     """The components of one session.
 
-    config: for images of the camera's size, see `Config.for_size`
+    Attributes:
+        config: configuration for images of the camera's size, see `Config.for_size`
     """
 
     camera: Camera

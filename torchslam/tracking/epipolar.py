@@ -20,8 +20,11 @@ from torchslam.types import Features, FrameFeatures
 class FreeKeypoints:
     """The keypoints of k keyframes that see no point yet; where one has fewer than others, rows are masked out.
 
-    features: (k, n, ...); rows: (k, n) of the keyframes' keypoints; normalized: (k, n, 2) undistorted;
-    noise: (k, n)
+    Attributes:
+        features: (k, n, ...)
+        rows: (k, n) of the keyframes' keypoints
+        normalized: (k, n, 2) undistorted
+        noise: (k, n)
     """
 
     features: Features
@@ -52,11 +55,14 @@ def match_along_epipolar_lines(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Keypoints of one keyframe and of k others that are each other's best on the epipolar line.
 
-    T_21: (k, 4, 4) from the one camera to the others. Returns for every match (m,) which of the others it is with, and
-    the rows in `here` and `there`, ordered by these three.
-
     The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
     contain the baseline, so that a plane is an angle around it.
+
+    Args:
+        T_21: (k, 4, 4) from the one camera to the others
+
+    Returns:
+        per match (m,) the row of the other view, and the rows in `here` and `there`, ordered by these three
     """
     rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
     (angles_1, _), (angles_2, sines) = (

@@ -196,11 +196,13 @@ def is_good(
 ) -> Tensor:
     """(n,) triangulated points that are known well enough for a map.
 
-    errors: (n,) the larger of the two squared errors, in units of the noise; sigmas: (n,) px
-
     With the criterion "uncertainty": the standard deviation of a depth z seen under the parallax a is about
     z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
     With "parallax": when the angle is large enough.
+
+    Args:
+        errors: (n,) the larger of the two squared errors, in units of the noise
+        sigmas: (n,) px
     """
     is_close = passes_gate(errors, TRIANGULATION_GATE_SIGMA**2)
     if settings.criterion == "parallax":
