@@ -63,7 +63,7 @@ def build_levels(images: Tensor, pyramid: PackedPyramid) -> list[Tensor]:
         images: (B, 1, H, W) in [0, 1]
 
     Returns:
-        one (B, 1, h, w) per level, rounded down to whole gray values
+        one (B, 1, h, w) per level; truncating the values rounds them to the nearest gray value
     """
     levels = [(images * 255).add_(0.5)]
     for size in pyramid.sizes[1:]:
