@@ -1,4 +1,4 @@
-"""A run that is killed in the middle, without warning, and gone on with from its last checkpoint."""
+"""A run that is killed in the middle and resumed from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 import torch
 
 from experiments.trials.edited import Edited
-from torchslam.cli.result_folder import Checkpoints
-from torchslam.cli.run import CHECKPOINT_EVERY
+from torchslam.cli.run import CHECKPOINT_EVERY, Checkpoints
 from torchslam.config import Config
 from torchslam.io.results import CHECKPOINT
 from torchslam.system.checkpoint import read_checkpoint

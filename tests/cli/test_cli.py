@@ -9,7 +9,6 @@ import signal
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ import pytest
 import torch
 
 import torchslam
-from torchslam.cli.main import COMMANDS, main
+from torchslam.cli.main import COMMANDS, load_command, main
 from torchslam.config import load_config
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
@@ -133,7 +132,7 @@ def test_info_describes_the_sequence(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_demo_writes_the_results_of_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchslam.cli.demo.SEQUENCE", ROOM)
+    monkeypatch.setattr("torchslam.cli.commands.DEMO_SEQUENCE", ROOM)
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "metrics.json").write_text("of an earlier time: the demo writes over it")
     status, out, err = run_and_read(capsys, "demo", "--output", str(tmp_path / "demo"), *FAST)
@@ -312,7 +311,7 @@ def test_a_folder_that_cannot_be_written_to_stops_before_the_run(
     def refuse(path: Path, content: bytes) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr("torchslam.cli.result_folder.write_whole", refuse)
+    monkeypatch.setattr("torchslam.io.results.write_whole", refuse)
     monkeypatch.setattr("torchslam.cli.run.SLAM", None)  # nothing is begun
     status, _, err = run_and_read(capsys, "run", ROOM, "--output", str(tmp_path))
     assert status == 2
@@ -343,8 +342,8 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_the_command_list_shows_each_commands_summary() -> None:
-    for home, summary in COMMANDS.values():
-        first = (import_module(f"torchslam.cli.{home}").__doc__ or "").split("\n")[0].rstrip(".")
+    for name, (_, summary) in COMMANDS.items():
+        first = load_command(name)[0].split("\n")[0].rstrip(".")
         assert summary == first[0].lower() + first[1:]
 
 

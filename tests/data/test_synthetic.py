@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.data.synthetic.building import QUARTER_TURN, corridors, rooms
+from torchslam.data.synthetic.buildings import PLAIN, QUARTER_TURN, corridors, rooms, storey
 from torchslam.data.synthetic.paths import OUTWARD
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import COVERAGE, MIP_LEVELS, Rectangle, surface, wall
-from torchslam.data.synthetic.storey import PLAIN, storey
 from torchslam.errors import SequenceError
 
 Build = Callable[[int], list[Rectangle]]

@@ -10,9 +10,9 @@ import torch
 from tests.walks import Walk, arc
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
-from torchslam.io.pictures import draw
 from torchslam.io.report import run_metrics
 from torchslam.io.results import read_results, results_in, write_results
+from torchslam.io.write_run import draw
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas

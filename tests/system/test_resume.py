@@ -348,13 +348,13 @@ def test_a_second_signal_ends_at_once(
 
 
 def test_checkpoints_become_rarer_as_the_map_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torchslam.cli import result_folder as folder
+    from torchslam.cli import run
 
     taken: list[int] = []
     slam_map, state = SimpleNamespace(num_keyframes=0), SimpleNamespace(mapping=True, can_checkpoint=True)
     state.atlas = [SimpleNamespace(map=slam_map)]
-    monkeypatch.setattr(folder, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
-    checkpoints = folder.Checkpoints(tmp_path, 10, state, RunProgress(), WALK)  # type: ignore[arg-type]
+    monkeypatch.setattr(run, "write_checkpoint", lambda *arguments: taken.append(slam_map.num_keyframes))
+    checkpoints = run.Checkpoints(tmp_path, 10, state, RunProgress(), WALK)  # type: ignore[arg-type]
     for count in range(1, 1001):
         slam_map.num_keyframes = count
         state.can_checkpoint = count not in (30, 31)

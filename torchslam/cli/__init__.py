@@ -1,1 +1,1 @@
-"""One module per command of the command line: `add_arguments(parser)` and `execute(options) -> exit status`."""
+"""The command line: a module for each large command, `add_arguments(parser)` and `execute(options) -> exit status`."""

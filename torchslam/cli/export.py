@@ -31,11 +31,10 @@ from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.colmap import colmap_camera, write_colmap
-from torchslam.io.export.images import WITHOUT, Images, open_images, undistorted, write_images
 from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.export.recording import import_rerun, write_recording
-from torchslam.io.export.scene import Scene, scene_of
+from torchslam.io.export.scene import WITHOUT, Images, Scene, open_images, scene_of, undistorted, write_images
 from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -20,7 +20,7 @@ from torchslam.utils.console import with_install_hint
 ERROR = 2
 INTERRUPTED = 130
 
-# Module and first docstring line of each command; only the module of the requested command is imported.
+# Module and first line of the description of each command; only the module of the requested command is imported.
 COMMANDS = {
     "run": ("run", "run SLAM on a sequence and write trajectory, map, metrics and plots"),
     "batch": (
@@ -32,25 +32,25 @@ COMMANDS = {
         "refine the poses of another program from the images and write them in their original format",
     ),
     "demo": (
-        "demo",
+        "commands",
         "run SLAM on a rendered room, evaluate and plot it: the whole system without any data",
     ),
-    "eval": ("evaluate", "compare two trajectories in TUM format: absolute and relative errors"),
+    "eval": ("commands", "compare two trajectories in TUM format: absolute and relative errors"),
     "plot": (
-        "plot",
+        "commands",
         "redraw the plots and view.html of a run from its results folder",
     ),
     "export": (
         "export",
         "export map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
     ),
-    "info": ("info", "describe a sequence: frames, size, rate, calibration, ground truth"),
+    "info": ("commands", "describe a sequence: frames, size, rate, calibration, ground truth"),
     "config": (
-        "config",
+        "commands",
         "print every setting with its description, range and default, as TOML for --config",
     ),
     "download": (
-        "download",
+        "commands",
         "download a public sequence; an interrupted transfer is resumed",
     ),
 }
@@ -97,6 +97,21 @@ def _compute_in_one_thread() -> None:
         torch.set_num_threads(1)
 
 
+def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int]]:
+    """Import a command; return its description, and the functions that add its arguments and execute it."""
+    from inspect import getdoc
+
+    home = COMMANDS[name][0]
+    module = import_module(f"torchslam.cli.{home}")
+    suffix = "" if home == name else f"_{name}"  # in a module of several commands
+    execute = getattr(module, f"execute{suffix}")
+    return (
+        getdoc(execute if suffix else module) or "",
+        getattr(module, f"add_arguments{suffix}"),
+        execute,
+    )
+
+
 def build_parser(chosen: str) -> argparse.ArgumentParser:
     """Build the parser of all commands, with the arguments of the chosen one only."""
     parser = argparse.ArgumentParser(
@@ -105,15 +120,14 @@ def build_parser(chosen: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for name, (home, summary) in COMMANDS.items():
+    for name, (_, summary) in COMMANDS.items():
         command = commands.add_parser(
             name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
         )
         if name == chosen:
-            module = import_module(f"torchslam.cli.{home}")
-            command.description = (module.__doc__ or "").strip()
-            module.add_arguments(command)
-            command.set_defaults(execute=module.execute)
+            command.description, add_arguments, execute = load_command(name)
+            add_arguments(command)
+            command.set_defaults(execute=execute)
     return parser
 
 

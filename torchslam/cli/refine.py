@@ -20,7 +20,6 @@ import torch
 
 from torchslam.calibration.find_camera import contradiction
 from torchslam.cli import arguments
-from torchslam.cli.result_folder import prepare
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
@@ -31,7 +30,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.io.report import run_metrics, summary
-from torchslam.io.results import CALIBRATION
+from torchslam.io.results import CALIBRATION, prepare
 from torchslam.io.write_run import write_run
 from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined

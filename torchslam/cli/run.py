@@ -20,7 +20,6 @@ import torch
 from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.cli import arguments
 from torchslam.cli.progress import ProgressBar, Stopping
-from torchslam.cli.result_folder import Checkpoints, prepare
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import is_found
@@ -31,12 +30,12 @@ from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
-from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP
+from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
 from torchslam.parallel.workers import with_workers
-from torchslam.system.checkpoint import read_checkpoint
+from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import source
 from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
@@ -46,6 +45,8 @@ from torchslam.utils.console import table
 DONE = 0
 NO_MAP = 3
 CHECKPOINT_EVERY = 20  # keyframes
+GROWTH = 0.05
+"""Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,37 @@ class Plan:
     view: bool = False
     video: bool = False
     fps: float | None = None
+
+
+class Checkpoints:
+    """Writes a checkpoint every few keyframes, whenever the system state allows it.
+
+    Args:
+        every: minimum number of keyframes between checkpoints, which is at least 5 % of all; 0: no checkpoints.
+    """
+
+    def __init__(self, folder: Path, every: int, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
+        self._path = folder / CHECKPOINT
+        self._every = every
+        self._run = slam, so_far, sequence
+        self._last = self._keyframes()
+
+    def offer(self, at_once: bool = False) -> None:
+        """Write a checkpoint after a frame if one is due, or `at_once` before the run ends."""
+        slam, so_far, sequence = self._run
+        if not self._every or not slam.mapping or not slam.can_checkpoint:
+            return
+        keyframes = self._keyframes()
+        if at_once or keyframes - self._last >= max(self._every, GROWTH * keyframes):
+            write_checkpoint(self._path, slam, so_far, sequence)
+            self._last = keyframes
+
+    def remove(self) -> None:
+        """Delete the checkpoint of a finished run."""
+        self._path.unlink(missing_ok=True)
+
+    def _keyframes(self) -> int:
+        return sum(submap.map.num_keyframes for submap in self._run[0].atlas)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from torchslam.data.trajectories import interpolate_poses
@@ -57,7 +58,7 @@ class Sequence(ABC):
         name: str,
         kind: str,
         camera: Camera | None,
-        timestamps: Tensor,
+        timestamps: Float[Tensor, " N"],
         groundtruth: Trajectory | None = None,
         *,
         size: tuple[int, int] | None = None,
@@ -130,19 +131,19 @@ class Sequence(ABC):
         return 0
 
     @abstractmethod
-    def image(self, index: int) -> Tensor:
-        """Return the gray image (1, 1, H, W), float32 in [0, 1]. Raises FrameError if unreadable or of another size."""
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
+        """Return the gray image in [0, 1]. Raises FrameError if unreadable or of another size."""
 
-    def color(self, index: int) -> Tensor:
-        """Return the RGB image (H, W, 3), uint8; three equal channels for a gray sequence. Raises FrameError."""
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
+        """Return the RGB image; three equal channels for a gray sequence. Raises FrameError."""
         return (self.image(index)[0, 0, :, :, None] * 255.0).round().to(torch.uint8).expand(-1, -1, 3)
 
     @abstractmethod
     def image_name(self, index: int) -> str:
         """Return the name of an image, for messages."""
 
-    def mask(self, index: int) -> Tensor | None:
-        """Return the mask (1, 1, H, W) of a frame, True where features are allowed; None: everywhere."""
+    def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
+        """Return the mask of a frame, True where features are allowed; None: everywhere."""
         return None
 
     @property
@@ -188,8 +189,8 @@ class Sequence(ABC):
                 return
             yield frame
 
-    def pose(self, index: int) -> Tensor | None:
-        """Return the true T_cw (4, 4) of a frame without reading its image; None if unknown."""
+    def pose(self, index: int) -> Float[Tensor, "4 4"] | None:
+        """Return the true T_cw of a frame without reading its image; None if unknown."""
         if self._T_cw is None or not self._has_pose[index]:
             return None
         return self._T_cw[index]
@@ -294,16 +295,16 @@ class Transformed(Sequence):
     def backlog(self) -> int:
         return self._whole.backlog
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         return self._whole.image(self._at(index))
 
-    def color(self, index: int) -> Tensor:
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         return self._whole.color(self._at(index))
 
     def image_name(self, index: int) -> str:
         return self._whole.image_name(self._at(index))
 
-    def mask(self, index: int) -> Tensor | None:
+    def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         return self._whole.mask(self._at(index))
 
     @property
@@ -316,7 +317,7 @@ class Transformed(Sequence):
     def timestamp(self, index: int) -> float:
         return self._whole.timestamp(self._at(index))
 
-    def pose(self, index: int) -> Tensor | None:
+    def pose(self, index: int) -> Float[Tensor, "4 4"] | None:
         return self._whole.pose(self._at(index))
 
     def describe(self) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
@@ -46,8 +47,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(table[:, 0].contiguous(), T_wc)
 
 
-def checked_poses(T_wc: Tensor, path: Path | str) -> Tensor:
-    """Return poses (..., 4, 4) unchanged. Raises TrajectoryError for an invalid rotation or position."""
+def checked_poses(T_wc: Float[Tensor, "*batch 4 4"], path: Path | str) -> Float[Tensor, "*batch 4 4"]:
+    """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position."""
     R, positions_w = T_wc[..., :3, :3], T_wc[..., :3, 3]
     error = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs()
     if not bool((error < ORTHOGONAL).all()):  # not so NaN either
@@ -69,15 +70,17 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     Path(path).write_text("".join(lines), encoding="utf-8")
 
 
-def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+def nearest(
+    timestamps: Float[Tensor, " N"], reference: Float[Tensor, " M"]
+) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
     """Find the nearest reference time of each timestamp; of two equally near ones, the earlier.
 
     Args:
-        timestamps: (N,) seconds.
-        reference: (M,) seconds, sorted, M >= 1.
+        timestamps: seconds.
+        reference: seconds, sorted, at least one.
 
     Returns:
-        Indices (N,) into `reference`, and distances (N,) in seconds.
+        Indices into `reference`, and distances in seconds.
     """
     right = _next(timestamps, reference)
     left = (right - 1).clamp(min=0)
@@ -85,16 +88,18 @@ def nearest(timestamps: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(to_left <= to_right, left, right), torch.minimum(to_left, to_right)
 
 
-def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+def interpolate_poses(
+    trajectory: Trajectory, timestamps: Float[Tensor, " N"], tolerance: float
+) -> tuple[Float[Tensor, "N 4 4"], Bool[Tensor, " N"]]:
     """Interpolate a trajectory along the geodesic between the two neighboring poses; constant beyond its ends.
 
     Args:
         trajectory: the poses.
-        timestamps: (N,) seconds.
+        timestamps: seconds.
         tolerance: seconds to the nearest pose up to which the result is valid.
 
     Returns:
-        T_wc (N, 4, 4), finite also where invalid, and valid (N,).
+        T_wc, finite also where invalid, and validity.
     """
     times = trajectory.timestamps
     _, distances = nearest(timestamps, times)
@@ -108,8 +113,8 @@ def interpolate_poses(trajectory: Trajectory, timestamps: Tensor, tolerance: flo
     return torch.where(exact, trajectory.T_wc[right], T_wc), distances <= tolerance
 
 
-def _next(timestamps: Tensor, reference: Tensor) -> Tensor:
-    """Return (N,) the index of the first reference time at or after each timestamp, or the last one."""
+def _next(timestamps: Float[Tensor, " N"], reference: Float[Tensor, " M"]) -> Int[Tensor, " N"]:
+    """Return the index of the first reference time at or after each timestamp, or the last one."""
     return torch.searchsorted(reference.contiguous(), timestamps.contiguous()).clamp(max=len(reference) - 1)
 
 

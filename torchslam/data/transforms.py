@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import size_text
@@ -65,13 +66,13 @@ class Resized(Transformed):
         camera = whole._camera
         super().__init__(whole, camera=None if camera is None else scale_camera(camera, size), size=size)
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         return self._resized(super().image(index)[0, 0])[None, None]
 
-    def color(self, index: int) -> Tensor:
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         return self._resized(super().color(index))
 
-    def mask(self, index: int) -> Tensor | None:
+    def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         mask = super().mask(index)
         if mask is None:
             return None
@@ -159,7 +160,7 @@ class Masked(Transformed):
             super().__init__(whole)
             self._mask = self._read(path)
 
-    def mask(self, index: int) -> Tensor | None:
+    def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         """Return the mask of a frame. Raises FrameError if it cannot be read."""
         if index not in self._files:
             return self._mask
@@ -213,5 +214,5 @@ class WithGroundTruth(Transformed):
     def __init__(self, whole: Sequence, groundtruth: Trajectory) -> None:
         super().__init__(whole, groundtruth=groundtruth)
 
-    def pose(self, index: int) -> Tensor | None:
+    def pose(self, index: int) -> Float[Tensor, "4 4"] | None:
         return Sequence.pose(self, index)

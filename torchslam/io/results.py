@@ -20,14 +20,14 @@ from torchslam.data.formats.image_file import read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.errors import FrameError, ResultsError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, rigid, transform
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.types import State, StepResult, Trajectory
-from torchslam.utils.files import JSON_BYTES, parse_json, read_text
+from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
 
 TRAJECTORY = "trajectory.txt"
 OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
@@ -43,6 +43,7 @@ METRICS = "metrics.json"
 FRAMES = "frames.csv"
 EXAMPLE_IMAGE = "example.png"
 PLOTS = "plots"
+PROBE = ".torchslam-can-write"
 NEEDED = ("submap", "submaps", "session", "posed", "keyframes")  # of metrics.json, to read and draw the rest
 
 
@@ -76,6 +77,40 @@ class Results:
     def session(self) -> int:
         """Number of the run on the map."""
         return int(self.metrics["session"])
+
+
+def aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
+    """Poses after a similarity (4, 4) of the world."""
+    rotation = S[:3, :3] / torch.linalg.det(S[:3, :3]) ** (1 / 3)
+    return Trajectory(
+        trajectory.timestamps,
+        rigid(rotation @ trajectory.T_wc[:, :3, :3], transform(S, trajectory.positions_w)),
+    )
+
+
+def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
+    """Create the results folder and check that it can be written to, before the run.
+
+    Args:
+        folder: the results folder.
+        overwrite: replace existing results; their checkpoint is deleted at once.
+        resume: continue from the checkpoint in the folder.
+
+    Raises:
+        ResultsError: if the folder has results that would be lost.
+        OSError: if the folder cannot be written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / PROBE, b"")
+    (folder / PROBE).unlink()
+    checkpoint, there = folder / CHECKPOINT, results_in(folder)
+    if overwrite:
+        checkpoint.unlink(missing_ok=True)
+    elif checkpoint.exists() and not resume:
+        raise ResultsError(f"{checkpoint}: an unfinished run: --resume continues it, --overwrite replaces it")
+    elif there and not checkpoint.exists():
+        what = "but no checkpoint to resume from" if resume else "which would be lost"
+        raise ResultsError(f"{there[0]}: results of an earlier run, {what}: --overwrite replaces them")
 
 
 def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:

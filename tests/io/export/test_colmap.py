@@ -12,8 +12,7 @@ import torch
 from tests.io.export.conftest import reprojection_error
 from torchslam.geometry import transform
 from torchslam.io.export.colmap import colmap_camera, write_colmap
-from torchslam.io.export.images import undistorted
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import Scene, undistorted
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 

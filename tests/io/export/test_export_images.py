@@ -11,8 +11,7 @@ import torch
 from torchslam.data import open_sequence
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.images import Undistorter, open_images, write_images
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import Scene, Undistorter, open_images, write_images
 
 FRAMES = 7
 

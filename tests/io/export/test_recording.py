@@ -15,9 +15,8 @@ from tests.io.export.conftest import reprojection_error
 from tests.walks import Walk, arc
 from torchslam.errors import ResultsError
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.export.images import Images, undistorted
 from torchslam.io.export.recording import import_rerun, write_recording
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import Images, Scene, undistorted
 
 chunks = pytest.importorskip("rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'")
 

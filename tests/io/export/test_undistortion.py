@@ -7,8 +7,7 @@ import torch
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.images import Undistorter, pinhole_within, undistorted
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import Scene, Undistorter, pinhole_within, undistorted
 
 
 def border(camera: Camera) -> torch.Tensor:

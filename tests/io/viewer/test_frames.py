@@ -17,7 +17,7 @@ from torchslam import SLAM, Run, load_config
 from torchslam.cli.main import main
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.io.export.images import pinhole_within
+from torchslam.io.export.scene import pinhole_within
 from torchslam.io.viewer.frames import (
     BAR,
     Film,

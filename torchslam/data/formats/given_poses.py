@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
@@ -48,24 +49,24 @@ class GivenPoses:
     Attributes:
         kind: "tum", "colmap" or "nerfstudio"
         path: the file, or the folder of a COLMAP model
-        T_cw: (N, 4, 4) world to camera, camera axes x right, y down, z forward
-        timestamps: (N,) seconds, if the file identifies images by times
+        T_cw: world to camera, camera axes x right, y down, z forward
+        timestamps: seconds, if the file identifies images by times
         names: N names of image files, if the file identifies images by names
         calibration: of the images, if known
     """
 
     kind: str
     path: Path
-    T_cw: Tensor
-    timestamps: Tensor | None = None
+    T_cw: Float[Tensor, "N 4 4"]
+    timestamps: Float[Tensor, " N"] | None = None
     names: tuple[str, ...] = ()
     calibration: Calibration | None = None
 
     def __len__(self) -> int:
         return len(self.T_cw)
 
-    def rows(self, sequence: Sequence) -> Tensor:
-        """(F,) which pose each frame of a sequence has, -1 where it has none; no pose is that of two frames.
+    def rows(self, sequence: Sequence) -> Int[Tensor, " F"]:
+        """Which pose each frame of a sequence has, -1 where it has none; no pose is that of two frames.
 
         Raises TrajectoryError where no frame has one.
         """
@@ -107,16 +108,16 @@ def read_poses(path: str | Path) -> GivenPoses:
 # --- which pose is whose -------------------------------------------------------------------------------------
 
 
-def _by_time(times: Tensor, frames: Tensor) -> Tensor:
-    """(F,) the nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
+def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Tensor, " F"]:
+    """The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
     rows, distances = nearest(frames, times)
     back, _ = nearest(times, frames)
     mutual = back[rows] == torch.arange(len(frames))
     return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
 
 
-def _by_name(names: tuple[str, ...], images: list[str]) -> Tensor:
-    """(F,) the pose with most of the name in common from its end: `0/a.png` is that of `rgb/0/a.png`.
+def _by_name(names: tuple[str, ...], images: list[str]) -> Int[Tensor, " F"]:
+    """The pose with most of the name in common from its end: `0/a.png` is that of `rgb/0/a.png`.
 
     Without a suffix as well (the first transforms.json had none); a name that two images have is that of none.
     """

@@ -16,6 +16,7 @@ import cv2
 import kornia_rs
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -31,8 +32,8 @@ MAX_PIXELS = 1 << 26
 """Maximum number of pixels; a small file may declare any number."""
 
 
-def read_gray(path: str | Path, where: str, bits: int = 8) -> Tensor:
-    """An image file as (1, 1, H, W) float32 gray in [0, 1].
+def read_gray(path: str | Path, where: str, bits: int = 8) -> Float[Tensor, "1 1 H W"]:
+    """An image file as gray in [0, 1].
 
     Args:
         bits: number of significant bits in files of 16 bits (`bit_depth`)
@@ -43,13 +44,13 @@ def read_gray(path: str | Path, where: str, bits: int = 8) -> Tensor:
     return gray_to_tensor(read_pixels(path, where), bits)
 
 
-def read_color(path: str | Path, where: str) -> Tensor:
-    """An image file as (H, W, 3) uint8 red, green, blue. Raises FrameError as `read_gray` does."""
+def read_color(path: str | Path, where: str) -> UInt8[Tensor, "H W 3"]:
+    """An image file as red, green, blue. Raises FrameError as `read_gray` does."""
     return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
 
 
-def read_pixels(path: str | Path, where: str) -> np.ndarray:
-    """An image file as (H, W) gray, uint8 or uint16. Raises FrameError as `read_gray`."""
+def read_pixels(path: str | Path, where: str) -> Shaped[np.ndarray, "H W"]:
+    """An image file as gray, uint8 or uint16. Raises FrameError as `read_gray`."""
     return _read(path, where, AS_GRAY)
 
 
@@ -86,8 +87,8 @@ def bit_depth(images: Iterable[np.ndarray]) -> int:
     return 8 if brightest == 0 else next(bits for bits in (10, 12, 14, 16) if brightest < 1 << bits)
 
 
-def gray_to_tensor(gray: np.ndarray, bits: int = 8) -> Tensor:
-    """(H, W) uint8, or uint16 of which `bits` carry something -> (1, 1, H, W) float32 in [0, 1]."""
+def gray_to_tensor(gray: Shaped[np.ndarray, "H W"], bits: int = 8) -> Float[Tensor, "1 1 H W"]:
+    """Convert uint8, or uint16 of which `bits` carry something, to float32 in [0, 1]."""
     if gray.dtype == np.uint16:
         white = (1 << bits) - 1 if bits > 8 else 65535
         floats = gray.astype(np.float32)
@@ -96,8 +97,8 @@ def gray_to_tensor(gray: np.ndarray, bits: int = 8) -> Tensor:
     return torch.from_numpy(gray).to(torch.float32).div_(255.0)[None, None]
 
 
-def bgr_to_tensor(image: np.ndarray) -> Tensor:
-    """(H, W, 3) uint8 blue, green, red, as OpenCV has it -> red, green, blue."""
+def bgr_to_tensor(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+    """Convert blue, green, red, the order of OpenCV, to red, green, blue."""
     return torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
@@ -162,8 +163,10 @@ CHANNELS = {
 """Orders of channels, and how OpenCV makes them gray."""
 
 
-def image_tensor(image: np.ndarray, channels: str = "rgb") -> Tensor:
-    """An array (H, W) or (H, W, C), uint8, or floats in [0, 1] -> (1, 1, H, W) float32 gray in [0, 1].
+def image_tensor(
+    image: Shaped[np.ndarray, "H W *channels"], channels: str = "rgb"
+) -> Float[Tensor, "1 1 H W"]:
+    """Convert an array, uint8 or floats in [0, 1], to gray in [0, 1].
 
     Args:
         channels: order of the C channels, one of CHANNELS; ignored for an image with one channel
@@ -209,8 +212,8 @@ TO_GRAY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
 32768th more than -1/2 makes the rounding of `cv2.transform` that; all sums are whole in float32."""
 
 
-def decode_png_gray(data: bytes) -> np.ndarray | None:
-    """A plain PNG file (gray of 8 or 16 bits, color of 8) as (H, W) gray, uint8 or uint16.
+def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
+    """Decode a plain PNG file (gray of 8 or 16 bits, color of 8) to gray, uint8 or uint16.
 
     None for any other file, and for a damaged one: then OpenCV has to say. An image is made of the size that a sound
     header promises, so who calls this has looked at that. Source: PNG specification, sections 5 and 11.

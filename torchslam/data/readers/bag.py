@@ -16,6 +16,7 @@ from urllib.parse import parse_qsl
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
@@ -122,7 +123,7 @@ class BagSequence(Sequence):
         self._connection = _connection(self._reader, state["_connection"])
         self._rewind()
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         try:
             gray = self._read(self._messages[index])
         except SequenceError as error:
@@ -137,8 +138,8 @@ class BagSequence(Sequence):
     def _rewind(self) -> None:
         self._stream, self._position = self._reader.messages([self._connection]), 0
 
-    def _read(self, message: int) -> np.ndarray:
-        """Return the gray pixels (H, W) of a message, by its index in the recording."""
+    def _read(self, message: int) -> Shaped[np.ndarray, "H W"]:
+        """Return the gray pixels of a message, by its index in the recording."""
         if message < self._position:
             self._rewind()
         where = f"{self._path}{self._connection.topic}, message {message}"
@@ -157,8 +158,8 @@ class BagSequence(Sequence):
             return to_gray(content, where)
 
 
-def to_gray(message: Any, where: str) -> np.ndarray:
-    """A sensor_msgs/Image as (H, W), uint8 or uint16. Raises SequenceError at `where` for other encodings."""
+def to_gray(message: Any, where: str) -> Shaped[np.ndarray, "H W"]:
+    """A sensor_msgs/Image as gray, uint8 or uint16. Raises SequenceError at `where` for other encodings."""
     encoding, step = message.encoding, message.step
     height, width = message.height, message.width
     if encoding in GRAY:

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
@@ -72,13 +73,13 @@ def _read_intrinsics(path: Path) -> Calibration:
     return Calibration.from_numbers(numbers, str(path), models[model[1]])
 
 
-def _read_extrinsics(path: Path) -> Tensor:
-    """(4, 4) T_bc: camera to body."""
+def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
+    """T_bc: camera to body."""
     block = _text(path).partition("T_BS:")[2]
     return torch.tensor(_bracketed(block, f"{path}: T_BS", "data", 16), dtype=torch.float64).view(4, 4)
 
 
-def _read_body_poses(path: Path, T_bc: Tensor) -> Trajectory:
+def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
     """Camera poses from the body's: nanoseconds, position, quaternion wxyz, then velocity and biases."""
     times: list[float] = []
     rows: list[list[float]] = []

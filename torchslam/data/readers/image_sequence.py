@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration, size_text
@@ -85,13 +86,13 @@ class ImageSequence(Sequence):
         )
         self._entries = entries
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         entry = self._entries[index]
         image = read_gray(entry.path, entry.where, self._bits)
         self._check_size(entry, (image.shape[-1], image.shape[-2]))
         return image
 
-    def color(self, index: int) -> Tensor:
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         entry = self._entries[index]
         image = read_color(entry.path, entry.where)
         self._check_size(entry, (image.shape[1], image.shape[0]))

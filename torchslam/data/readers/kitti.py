@@ -13,6 +13,7 @@ import re
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
@@ -80,7 +81,7 @@ def _read_projection(path: Path, label: str) -> tuple[Calibration, float]:
     raise CalibrationError(f"{path}: no line `{label}: ...`")
 
 
-def _read_odometry_poses(path: Path, times: Tensor, offset_x: float) -> Trajectory | None:
+def _read_odometry_poses(path: Path, times: Float[Tensor, " N"], offset_x: float) -> Trajectory | None:
     """The poses of camera 0, shifted to the camera that took the images."""
     resolved = path.resolve()
     candidates = (path / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
@@ -97,8 +98,8 @@ def _read_odometry_poses(path: Path, times: Tensor, offset_x: float) -> Trajecto
     return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
 
-def _read_table(path: Path, columns: int, error: type[SequenceError] | type[TrajectoryError]) -> Tensor:
-    """(N, columns) numbers, one row a line."""
+def _read_table(path: Path, columns: int, error: type[TorchslamError]) -> Float[Tensor, "N {columns}"]:
+    """Numbers, one row a line."""
     rows = []
     for number, line in numbered_lines(path, error):
         row = parse_floats(line, f"{path}:{number}", error)
@@ -215,7 +216,7 @@ def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajector
     return Trajectory(torch.tensor(kept, dtype=torch.float64), T_wc)
 
 
-def _read_rigid(path: Path) -> Tensor:
+def _read_rigid(path: Path) -> Float[Tensor, "4 4"]:
     rows = _read_rows(path)
     R, t = (
         torch.tensor(_row(rows, name, count, path), dtype=torch.float64)
@@ -224,8 +225,8 @@ def _read_rigid(path: Path) -> Tensor:
     return rigid(R.view(3, 3), t)
 
 
-def _read_packets(folder: Path, times: list[float]) -> tuple[Tensor, list[float]]:
-    """(N, 4, 4) T_wi of the GPS/INS and their times: east, north, up, by a Mercator projection, from the first one."""
+def _read_packets(folder: Path, times: list[float]) -> tuple[Float[Tensor, "N 4 4"], list[float]]:
+    """T_wi of the GPS/INS and their times: east, north, up, by a Mercator projection, from the first one."""
     rows: list[list[float]] = []
     kept: list[float] = []
     for file in sorted(folder.glob("*.txt")):

@@ -13,6 +13,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
@@ -114,7 +115,7 @@ class LiveSequence(Sequence):
         self._limit = stop
         return self
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         """The next frame. Raises EndOfSequence where the source has ended, FrameError for a frame that is gone."""
         if index < self._given:
             raise FrameError(

@@ -16,6 +16,7 @@ import re
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.calibration import PRESETS
@@ -142,8 +143,8 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
     return ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
 
 
-def _read_pose(path: Path) -> Tensor | None:
-    """(4, 4) T_wc; None where tracking had failed: the dataset then writes numbers that are no rotation."""
+def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
+    """T_wc; None where tracking had failed: the dataset then writes numbers that are no rotation."""
     rows = []
     for number, line in numbered_lines(path, TrajectoryError):
         if "nan" in line.lower() or "inf" in line.lower():

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
@@ -86,10 +87,10 @@ class VideoSequence(Sequence):
         self.__dict__.update(state)
         self._rewind()
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         return gray_to_tensor(cv2.cvtColor(self._frame(index), cv2.COLOR_BGR2GRAY))
 
-    def color(self, index: int) -> Tensor:
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         return bgr_to_tensor(self._frame(index))
 
     def image_name(self, index: int) -> str:

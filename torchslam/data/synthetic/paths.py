@@ -82,7 +82,7 @@ def sideways(phase: Tensor) -> Tensor:
 
 
 def round_the_core(phase: Tensor) -> Tensor:
-    """Around the core of `building`, one round a phase of 2 pi, from the door into the first room, to the right.
+    """Around the core of the four rooms, one round a phase of 2 pi, from the door into the first room, to the right.
 
     The heading is phase - sin(4 phase) / 4: straight on at the four doors, twice the mean rate in the four corners,
     at constant speed. Its integral closes for the fourfold symmetry; `HARMONICS` is its Fourier series. The camera
@@ -101,7 +101,7 @@ def round_the_core(phase: Tensor) -> Tensor:
 
 
 def round_the_storey(phase: Tensor) -> Tensor:
-    """Around the corridor of `storey` and into its room, one round a phase of 2 pi; the body turns in place.
+    """Around the corridor of the storey and into its room, one round a phase of 2 pi; the body turns in place.
 
     The camera is held at arm's length and looks ahead, it sways and glances to the sides.
     """

@@ -14,8 +14,7 @@ from torch import Tensor
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, corner_pixels
-from torchslam.io.export.images import Images
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import Images, Scene
 
 APPLICATION = "torchslam"
 JPEG_QUALITY = 90

@@ -1,15 +1,27 @@
-"""Scene for exports: posed frames of one run in one submap, their points and observations."""
+"""What an export consists of: posed frames of one run in one submap, their points, observations and images.
+
+Images and keypoints are undistorted on request.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.errors import ResultsError
+from torchslam.data import open_sequence
+from torchslam.data.sequence import Sequence
+from torchslam.data.transforms import resize
+from torchslam.errors import ResultsError, SequenceError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
 from torchslam.map.atlas import Submap
+
+MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
 
 
 @dataclass(frozen=True)
@@ -102,3 +114,126 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
         point_index=point_index,
         pixels=graph.pixels[seen].double(),
     )
+
+
+def pinhole_within(camera: Camera) -> Camera:
+    """Return the pinhole camera with the largest field of view that lies within the view of the camera.
+
+    It has the focal lengths of the camera, reduced only if the image would be more than MAX_GROWTH times as wide or
+    high. Raises ResultsError if the field of view is too wide.
+    """
+    if camera.model == "pinhole":
+        return camera
+    x, y = (torch.arange(size, dtype=camera.params.dtype) for size in camera.size)
+    left, right = (camera.normalize(_line(at, y))[:, 0] for at in (0, camera.width - 1))
+    top, bottom = (camera.normalize(_line(at, x).flip(1))[:, 1] for at in (0, camera.height - 1))
+    low, high = torch.stack((left.max(), top.max())), torch.stack((right.min(), bottom.min()))
+    focal = camera.params[:2]
+    extent, size = (high - low) * focal, torch.tensor(camera.size)
+    if not bool((extent >= 1).all()):
+        raise ResultsError("the field of view of the camera is too wide for an undistorted image")
+    scale = (MAX_GROWTH * size / extent).min().clamp(max=1.0)
+    width, height = (int(side) + 1 for side in scale * extent)
+    params = torch.cat((scale * focal, -scale * focal * low))
+    return Camera("pinhole", params, (width, height))
+
+
+def undistorted(scene: Scene) -> Scene:
+    """Return the scene for `pinhole_within` of its camera; keypoints may lie outside of the new images."""
+    if scene.camera.model == "pinhole":
+        return scene
+    pinhole = pinhole_within(scene.camera)
+    return replace(scene, camera=pinhole, pixels=undistorted_pixels(scene.pixels, scene.camera, pinhole))
+
+
+def undistorted_pixels(pixels: Tensor, camera: Camera, pinhole: Camera) -> Tensor:
+    """Convert pixels (N, 2) of a camera to its `pinhole_within`."""
+    return camera.normalize(pixels) * pinhole.params[:2] + pinhole.params[2:]
+
+
+class Undistorter:
+    """Converts images of a camera to its `pinhole_within`."""
+
+    def __init__(self, camera: Camera) -> None:
+        pinhole = pinhole_within(camera)
+        v, u = torch.meshgrid(*(torch.arange(size) for size in reversed(pinhole.size)), indexing="ij")
+        rays = torch.nn.functional.pad(
+            pinhole.normalize(torch.stack((u, v), -1).flatten(0, 1).double()), (0, 1), value=1.0
+        )
+        pixels = camera.project(rays)[0].reshape(pinhole.height, pinhole.width, 2)
+        self._x, self._y = (pixels[..., axis].float().numpy() for axis in (0, 1))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, C) uint8 -> the same in the new size."""
+        # Border pixels may fall outside by a rounding error, so the border is replicated.
+        return cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _line(at: int, values: Tensor) -> Tensor:
+    """(N, 2) pixels (at, values)."""
+    return torch.stack((torch.full_like(values, at), values), dim=-1)
+
+
+WITHOUT = "use --sequence for its new location, or --no-images"
+
+
+class Images:
+    """Color images by frame, optionally undistorted.
+
+    Args:
+        rows: index in the sequence of each frame of the run
+    """
+
+    def __init__(
+        self, sequence: Sequence, rows: Mapping[int, int], camera: Camera, undistort: bool = False
+    ) -> None:
+        self._sequence = sequence
+        self._rows = rows
+        self._undistort = Undistorter(camera) if undistort and camera.model != "pinhole" else None
+
+    def bgr(self, frame_id: int) -> np.ndarray:
+        """(H, W, 3) uint8 as OpenCV writes it: blue first. Raises FrameError where it cannot be read."""
+        image = cv2.cvtColor(
+            self._sequence.color(self._rows[frame_id]).contiguous().numpy(), cv2.COLOR_RGB2BGR
+        )
+        return image if self._undistort is None else self._undistort(image)
+
+
+def open_images(source: str, scene: Scene, undistort: bool = False, fps: float | None = None) -> Images:
+    """Open the images of a scene, in the size of the run.
+
+    Images are matched by timestamp, since the run may have read a part of the sequence. Raises ResultsError if the
+    sequence is missing or a different one.
+
+    Args:
+        source: path of the sequence.
+        scene: the exported frames.
+        undistort: undistort the images.
+        fps: frame rate with which the run read images without timestamps.
+    """
+    times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
+    try:
+        sequence = open_sequence(source)
+        if fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
+            sequence = open_sequence(source, fps=fps)
+        if sequence.size != scene.camera.size:
+            sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
+    except SequenceError as error:
+        raise ResultsError(f"the sequence of this run cannot be read: {error}; {WITHOUT}") from None
+    row_at = {time: row for row, time in enumerate(sequence.timestamps.tolist())}
+    if not all(time in row_at for time in times.values()):
+        raise ResultsError(
+            f"{source}: not the sequence of this run, whose frames have other times; {WITHOUT}"
+        )
+    rows = {frame_id: row_at[time] for frame_id, time in times.items()}
+    return Images(sequence, rows, scene.camera, undistort)
+
+
+def write_images(folder: Path, scene: Scene, images: Images) -> None:
+    """Write the image of every frame as PNG; images of an earlier export are deleted."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("[0-9]" * 6 + ".png"):
+        old.unlink()
+    for frame_id, name in zip(scene.frame_ids.tolist(), scene.image_names, strict=True):
+        if not cv2.imwrite(str(folder / name), images.bgr(frame_id)):
+            raise ResultsError(f"{folder / name}: cannot be written")

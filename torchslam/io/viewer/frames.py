@@ -18,8 +18,8 @@ from torch import Tensor
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ResultsError
 from torchslam.geometry import se3_inverse
-from torchslam.io.export.images import Undistorter, pinhole_within, undistorted_pixels
 from torchslam.io.export.recording import APPLICATION, CAMERA, Recorder, gaps, import_rerun
+from torchslam.io.export.scene import Undistorter, pinhole_within, undistorted_pixels
 from torchslam.map.map import Map
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM

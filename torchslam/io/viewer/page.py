@@ -20,9 +20,8 @@ from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
-from torchslam.io.pictures import aligned
 from torchslam.io.plots.style import robust_box, thin
-from torchslam.io.results import Results
+from torchslam.io.results import Results, aligned
 from torchslam.map.atlas import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory

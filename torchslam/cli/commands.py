@@ -1,0 +1,128 @@
+"""The commands that need no module of their own: `add_arguments_NAME(parser)`, `execute_NAME(options)` for each.
+
+Imports are inside of the functions, so that each command starts as fast as it can.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from torchslam.cli import arguments
+from torchslam.utils.console import table
+
+DEMO_SEQUENCE = "synthetic:room"
+
+
+def add_arguments_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--output",
+        "-o",
+        type=Path,
+        default=Path("results/demo"),
+        metavar="DIR",
+        help="folder for the results (default: %(default)s)",
+    )
+    arguments.add_device(parser)
+    arguments.add_config(parser)
+
+
+def execute_demo(options: argparse.Namespace) -> int:
+    """Run SLAM on a rendered room, evaluate and plot it: the whole system without any data."""
+    from torchslam.cli.run import Plan, run
+    from torchslam.data import open_sequence
+
+    # The results can be reproduced, so overwriting loses nothing.
+    plan = Plan(DEMO_SEQUENCE, options.output, options.device, overwrite=True)
+    return run(open_sequence(DEMO_SEQUENCE), arguments.config(options), plan)
+
+
+def add_arguments_eval(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "estimate",
+        type=Path,
+        metavar="ESTIMATE",
+        help="estimated trajectory, or folder that `torchslam run` wrote",
+    )
+    parser.add_argument("groundtruth", type=Path, metavar="GROUNDTRUTH", help="true trajectory")
+    parser.add_argument("--json", action="store_true", help="print all figures as JSON instead of a table")
+
+
+def execute_eval(options: argparse.Namespace) -> int:
+    """Compare two trajectories in TUM format: absolute and relative errors."""
+    from torchslam.data.trajectories import read_trajectory
+    from torchslam.evaluation import evaluate
+    from torchslam.io.report import accuracy
+    from torchslam.io.results import TRAJECTORY
+
+    results: Path = options.estimate
+    estimate = read_trajectory(results / TRAJECTORY if results.is_dir() else results)
+    groundtruth = read_trajectory(options.groundtruth)
+    metrics = evaluate(estimate, groundtruth).as_dict()
+    print(json.dumps(metrics, indent=2) if options.json else table(accuracy(metrics)))
+    return 0
+
+
+def add_arguments_plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+
+
+def execute_plot(options: argparse.Namespace) -> int:
+    """Redraw the plots and view.html of a run from its results folder."""
+    from torchslam.io.results import read_results
+    from torchslam.io.viewer.page import write_view
+    from torchslam.io.write_run import draw
+
+    results = read_results(options.directory)
+    for path in [*draw(results, options.directory), write_view(results, options.directory)]:
+        print(path)
+    return 0
+
+
+def add_arguments_info(parser: argparse.ArgumentParser) -> None:
+    arguments.add_sequence(parser)
+
+
+def execute_info(options: argparse.Namespace) -> int:
+    """Describe a sequence: frames, size, rate, calibration, ground truth."""
+    print(table(arguments.sequence(options).describe()))
+    return 0
+
+
+def add_arguments_config(parser: argparse.ArgumentParser) -> None:
+    arguments.add_config(parser)
+
+
+def execute_config(options: argparse.Namespace) -> int:
+    """Print every setting with its description, range and default, as TOML for --config.
+
+    With --config and --set, the values that a run would use are printed.
+    """
+    from torchslam.config.schema import to_commented_toml
+
+    print(to_commented_toml(arguments.config(options)), end="")
+    return 0
+
+
+def add_arguments_download(parser: argparse.ArgumentParser) -> None:
+    from torchslam.data.download import ETH3D_URL
+
+    parser.add_argument("name", metavar="NAME", help="eth3d/SEQUENCE, for example eth3d/plant_1")
+    parser.add_argument(
+        "--to",
+        type=Path,
+        default=Path("data"),
+        metavar="DIR",
+        help="folder to place the sequence in (default: %(default)s)",
+    )
+    parser.add_argument("--sha256", metavar="HEX", help="expected checksum; another archive is deleted")
+    parser.add_argument("--url", default=ETH3D_URL, help="server of the archives (default: %(default)s)")
+
+
+def execute_download(options: argparse.Namespace) -> int:
+    """Download a public sequence; an interrupted transfer is resumed."""
+    from torchslam.data.download import download
+
+    print(download(options.name, options.to, options.url, sha256=options.sha256))
+    return 0
