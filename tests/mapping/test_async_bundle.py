@@ -17,7 +17,7 @@ from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingResult, adjust_local, solve_here
 from torchslam.optim import BundleProblem
-from torchslam.parallel.bundle_worker import BundleWorker
+from torchslam.parallel.workers import BundleWorker
 
 SCENE = Scene.of(150)
 ROWS = rows_of(SCENE)
@@ -159,7 +159,7 @@ def worker(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
 def test_another_process_computes_the_same_result(
     worker: BundleWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchslam.parallel.bundle_worker.solve_local", None)  # here nothing is solved
+    monkeypatch.setattr("torchslam.parallel.workers.solve_local", None)  # here nothing is solved
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True)
     adjusting.solver = worker
     for seed in (0, 1):

@@ -14,9 +14,16 @@ from torchslam.data.sequence import Sequence
 from torchslam.features import OpenCVORB
 from torchslam.geometry import Camera
 from torchslam.mapping.local_bundle import solve_here
-from torchslam.parallel.bundle_worker import BundleWorker
 from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
-from torchslam.parallel.workers import WORTH, WORTH_AT_ONCE, best_number, processors, why_alone, with_workers
+from torchslam.parallel.workers import (
+    WORTH,
+    WORTH_AT_ONCE,
+    BundleWorker,
+    best_number,
+    processors,
+    why_alone,
+    with_workers,
+)
 from torchslam.system.slam import SLAM
 
 CONFIG = load_config(None, ["features.kind=opencv-orb"])

@@ -1,29 +1,64 @@
 """The workers of a run; its result does not depend on their number.
 
 Prefetch workers read frames and extract features ahead of their turn (`prefetch`); the bundle worker solves local
-bundle adjustments while the next frames are tracked (`bundle_worker`).
+bundle adjustments while the next frames are tracked. `mapping.local_bundle` selects their windows and applies the
+results.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
 
+import numpy as np
+import torch
+
+from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.parallel.bundle_worker import BundleWorker
+from torchslam.geometry import Camera
+from torchslam.mapping.local_bundle import BundleResult, PendingResult, solve_local
+from torchslam.mapping.mapper import Mapper
+from torchslam.optim import BundleProblem, Marginals
 from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
-from torchslam.parallel.worker import starts_at_once
+from torchslam.parallel.worker import (
+    WithWorker,
+    pack_task,
+    requests,
+    send_result,
+    starts_at_once,
+    try_call,
+    unwrap,
+)
 from torchslam.system.run import Frames
-
-if TYPE_CHECKING:
-    from torchslam.system.slam import SLAM
+from torchslam.utils.timing import Stopwatch
 
 WORTH, WORTH_AT_ONCE = 100, 10
 """Frames of a run for which other processes are worth their start: one that has to import everything costs as much as
 some 40 frames; a copy of this process starts at once."""
+SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
+"""The fields of a problem that differ between problems of one run."""
+
+
+class System(Protocol):
+    """The part of `torchslam.system.slam.SLAM` that workers need."""
+
+    camera: Camera
+    config: Config
+    clock: Stopwatch
+    mapper: Mapper
+    has_custom_components: bool
+
+    @property
+    def mapping(self) -> bool: ...
+
+    def warm_up(self) -> None: ...
+
+    def precompute_undistortion(self) -> None: ...
 
 
 def processors() -> int:
@@ -42,7 +77,7 @@ def best_number(sequence: Sequence, start: int) -> int:
 
 
 @contextmanager
-def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> Iterator[Frames]:
+def with_workers(sequence: Sequence, slam: System, processes: int | None, start: int = 0) -> Iterator[Frames]:
     """The frames of a sequence from `start` on, for a run that uses workers while this is entered.
 
     Args:
@@ -72,7 +107,7 @@ def with_workers(sequence: Sequence, slam: SLAM, processes: int | None, start: i
 
 
 def reader(
-    sequence: Sequence, slam: SLAM, processes: int, is_asked_for: bool
+    sequence: Sequence, slam: System, processes: int, is_asked_for: bool
 ) -> FeaturePrefetcher | LivePrefetcher | None:
     """The prefetcher of a sequence; None if frames cannot or should not be prefetched."""
     alone = why_alone(sequence, slam)
@@ -85,7 +120,7 @@ def reader(
     return FeaturePrefetcher(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
 
 
-def why_alone(sequence: Sequence, slam: SLAM) -> str:
+def why_alone(sequence: Sequence, slam: System) -> str:
     """Why the frames of a sequence cannot be prefetched; empty if they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
@@ -94,3 +129,66 @@ def why_alone(sequence: Sequence, slam: SLAM) -> str:
     if slam.config.matching.matcher != "descriptors":
         return "the matcher may want images"
     return ""
+
+
+class BundleWorker(WithWorker):
+    """A `mapping.local_bundle.Solver` that uses a worker, which runs while this is entered.
+
+    Problems are solved in this process until the worker has started, and after it was killed.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__(_work)
+        self._camera = camera
+        self._has_task = False
+        self._number = 0  # of the last problem that was sent
+
+    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
+        number = self._send(problem, iterations, covariances)
+
+        def answer() -> BundleResult:
+            found = None if number is None else self._receive(number)
+            return solve_local(problem, iterations, covariances) if found is None else found
+
+        return answer
+
+    def _send(self, problem: BundleProblem, iterations: int, covariances: bool) -> int | None:
+        """Send a problem; return its number, or None without a worker."""
+        if not self._worker.is_there():
+            return None
+        if not self._has_task:
+            self._has_task = self._worker.send(pack_task(self._camera))
+        self._number += 1
+        arrays = {name: getattr(problem, name).numpy() for name in SENT}
+        message = pickle.dumps((self._number, arrays, iterations, covariances))
+        return self._number if self._worker.send(message) else None
+
+    def _receive(self, number: int) -> BundleResult | None:
+        """Wait for the result of a problem, and skip those of dropped ones; None without a worker."""
+        while (answer := self._worker.receive()) is not None:
+            answered, found = answer
+            if answered == number:
+                return _adjusted(unwrap(found))
+        return None
+
+
+def _adjusted(arrays: list[np.ndarray]) -> BundleResult:
+    """What `_arrays` packed."""
+    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
+    return BundleResult(T_cw, points_w, Marginals(*covariances) if covariances else None)
+
+
+def _arrays(adjusted: BundleResult) -> list[np.ndarray]:
+    """For the way between processes: tensors are slow to pickle."""
+    return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
+
+
+def _work(connection: Connection, camera: Camera) -> None:
+    """Solve one numbered problem after the other."""
+
+    def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
+        columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
+        return _arrays(solve_local(BundleProblem(camera=camera, **columns), iterations, covariances))
+
+    for number, *problem in requests(connection):
+        send_result(connection, (number, try_call("adjusts", solve, *problem)))
