@@ -182,7 +182,7 @@ def test_a_frame_has_the_true_pose_and_observations() -> None:
 def test_an_accepted_frame_counts_visible_and_found_points() -> None:
     here, follower = submap(), tracker()
     points, estimate = here.map.points, followed(here, SCENE.view(50, se3_exp(3 * STEP)))
-    estimate = replace(estimate, point_ids=estimate.point_ids[:50])
+    estimate = replace(estimate, point_ids=estimate.point_ids[:50], keypoints=estimate.keypoints[:50])
     visible, found = points["times_visible"].clone(), points["times_found"].clone()
     follower.count_visible(here.map, estimate)
     follower.count_found(here.map, estimate)
@@ -331,9 +331,9 @@ def test_the_explained_fraction_counts_cells_with_inliers() -> None:
         + [(10.0, 200.0)]
         + [(200.0, 100.0)] * 2
     )
-    view = SCENE.view(0, pose())
+    keypoints, one = torch.tensor(places).double(), torch.ones(len(places)).double()
     mask = torch.arange(len(places)) < 8  # the last two are no keypoints
-    some = replace(view, keypoints=torch.tensor(places).double(), mask=mask)
+    some = FrameFeatures(0, 0.0, keypoints, one, 0 * one, one[:, None], mask)
     for used, share in (([0, 3, 5], 1.0), ([1, 2], 1 / 3), ([4, 6, 7], 2 / 3), ([7], 0.0)):
         assert explained_ratio(some, torch.tensor(used), (320, 240)) == pytest.approx(share)
     nothing = replace(some, mask=torch.zeros_like(mask))

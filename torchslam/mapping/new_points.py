@@ -97,8 +97,8 @@ def _match(
             *match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None
         )
     views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
-    prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=epipolar_px)
-    return NewPointMatches(*match_each(matcher, views, here, there, prior))
+    priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=epipolar_px) for each in T_21]
+    return NewPointMatches(*match_each(matcher, views, here, there, priors))
 
 
 def _triangulate(
@@ -162,16 +162,16 @@ def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
 
 
 def match_each(
-    matcher: Matcher, views: list[FrameFeatures], here: FreeKeypoints, there: FreeKeypoints, prior: MatchPrior
+    matcher: Matcher,
+    views: list[FrameFeatures],
+    here: FreeKeypoints,
+    there: FreeKeypoints,
+    priors: list[MatchPrior],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights (m,) as well.
-
-    prior: with T_21 (k, 4, 4) to all of the others
-    """
-    assert prior.T_21 is not None
+    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights (m,) as well."""
     parts, weights = [], []
-    for row, (view, T_21) in enumerate(zip(views[1:], prior.T_21, strict=True)):
-        pairs = run_matcher(matcher, views[0], view, replace(prior, T_21=T_21))
+    for row, (view, prior) in enumerate(zip(views[1:], priors, strict=True)):
+        pairs = run_matcher(matcher, views[0], view, prior)
         at_1, at_2 = slots_among(here.rows[0])[pairs.first], slots_among(there.rows[row])[pairs.second]
         order = torch.argsort(at_1 * len(view.mask) + at_2)
         parts.append(torch.stack([torch.full_like(at_1, row), at_1, at_2])[:, order])
