@@ -55,7 +55,11 @@ class ClipGraph:
 
     @staticmethod
     def stack(graphs: Sequence[ClipGraph]) -> ClipGraph:
-        """Combine graphs of one clip each, with the same number of frames. Raises ValueError otherwise."""
+        """Combine graphs of one clip each.
+
+        Raises:
+            ValueError: The graphs have different numbers of frames, or several clips.
+        """
         if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
             raise ValueError("stack needs graphs of one clip each with the same number of frames")
         clips = ((graph.runs[0], graph.cameras[0], graph.reasons[0]) for graph in graphs)
@@ -174,7 +178,7 @@ class ClipSLAM(nn.Module):
     def __init__(
         self,
         extractor: nn.Module,
-        keypoint_weight: Callable[[Features], Tensor] | None = None,
+        keypoint_weight: Callable[[Features], Float[Tensor, "T N"]] | None = None,
         config: Config | None = None,
     ) -> None:
         """Create a module with the parameters of the front end."""
@@ -251,6 +255,9 @@ class ClipSLAM(nn.Module):
             features: Of the clip, or one per clip: the same keypoints in the same rows as when the graph was built,
                 possibly moved. Rows with a False mask do not count.
             camera: As in `forward`; that of the graph, without gradient, if None.
+
+        Raises:
+            ValueError: The features have other shapes than the graph.
         """
         seen = _per_clip(features)
         cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))

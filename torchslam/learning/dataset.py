@@ -192,6 +192,7 @@ class Clips(Dataset[Clip]):
             self.chosen += [(number, start, found[start]) for start in sorted(found)]
 
     def __len__(self) -> int:
+        """The number of clips."""
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Clip:
@@ -231,6 +232,7 @@ class Batches(Sampler[list[int]]):
         self.rank, self.ranks = rank, ranks
 
     def __iter__(self) -> Iterator[list[int]]:
+        """Iterate over batches from `first` on, without end."""
         epoch, order = -1, torch.empty(0)
         for number in itertools.count(self.first):
             rows = []

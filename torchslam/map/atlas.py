@@ -53,7 +53,7 @@ class TrackingState:
     explained_ratio: float = 1.0
 
     @classmethod
-    def empty(cls, like: Tensor) -> TrackingState:
+    def empty(cls, like: Float[Tensor, "..."]) -> TrackingState:
         """Create the state before the first keyframe, with the device and floating-point type of `like`."""
         none = torch.empty(0, dtype=torch.int64, device=like.device)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
@@ -79,7 +79,7 @@ class Submap:
     num_cull_checked: int = 0
 
     @classmethod
-    def empty(cls, number: int, like: Tensor) -> Submap:
+    def empty(cls, number: int, like: Float[Tensor, "..."]) -> Submap:
         """Create an empty submap with the device and floating-point type of `like`."""
         return cls(number, TrackingState.empty(like))
 
@@ -145,9 +145,15 @@ class Submap:
 
 
 class Atlas:
-    """The submaps of a run in the order of their creation; numbers are not reused."""
+    """The submaps of a run in the order of their creation; numbers are not reused.
 
-    def __init__(self, like: Tensor, submaps: Iterable[Submap] = (), num_created: int = 0) -> None:
+    Attributes:
+        num_created: Number of submaps ever created.
+    """
+
+    def __init__(
+        self, like: Float[Tensor, "..."], submaps: Iterable[Submap] = (), num_created: int = 0
+    ) -> None:
         """Create an atlas.
 
         Args:
@@ -160,9 +166,11 @@ class Atlas:
         self.num_created = num_created
 
     def __len__(self) -> int:
+        """The number of submaps."""
         return len(self._submaps)
 
     def __iter__(self) -> Iterator[Submap]:
+        """Iterate over the submaps."""
         return iter(self._submaps)
 
     def create(self) -> Submap:
@@ -177,7 +185,7 @@ class Atlas:
         self._submaps = [other for other in self._submaps if other is not submap]
 
     def main(self, session: int | None = None) -> Submap | None:
-        """Return the submap of `main_submap`."""
+        """Return the main submap, see `main_submap`."""
         return main_submap(self._submaps, session)
 
     def find(self, key: int) -> tuple[Submap, int] | None:

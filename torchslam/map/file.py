@@ -80,7 +80,7 @@ def write_atlas(path: str | Path, submaps: Iterable[Submap], camera: Camera, ses
 
 
 def read_atlas(path: str | Path, device: torch.device | str = "cpu") -> SavedAtlas:
-    """Read and check a file that `write_atlas` wrote.
+    """Read and check a file that `write_atlas` wrote, onto a device.
 
     Raises:
         ResultsError: The file is missing or damaged, belongs to another program or format, or has tables that do not
@@ -103,7 +103,7 @@ def read_map(path: str | Path) -> tuple[Map, Camera]:
 
 def pack_submaps(
     submaps: Iterable[Submap], camera: Camera, sessions: int, num_created: int | None = None
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
+) -> tuple[dict[str, Shaped[Tensor, "..."]], dict[str, Any]]:
     """Convert submaps to tensors and a JSON description.
 
     Args:
@@ -132,7 +132,10 @@ def pack_submaps(
 
 
 def unpack_submaps(
-    path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any], device: torch.device | str = "cpu"
+    path: str | Path,
+    tensors: dict[str, Shaped[Tensor, "..."]],
+    about: dict[str, Any],
+    device: torch.device | str = "cpu",
 ) -> SavedAtlas:
     """Check and convert the tensors and the description that `pack_submaps` made.
 

@@ -37,6 +37,7 @@ class Map:
     """
 
     def __init__(self) -> None:
+        """Create an empty map."""
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
         self.images: dict[int, Shaped[Tensor, "1 1 H W"]] = {}

@@ -54,6 +54,7 @@ class PosedFrames:
     """
 
     def __init__(self) -> None:
+        """Create tables without frames."""
         self.frames = Table(FRAMES)
         self.observations = Table(OBSERVATIONS)
 
@@ -79,6 +80,7 @@ class PosedFrames:
         )
 
     def __len__(self) -> int:
+        """The number of frames."""
         return len(self.frames)
 
     def count(self, session: int | None = None) -> int:

@@ -125,15 +125,18 @@ class Table:
         self._size = 0
 
     def __len__(self) -> int:
+        """The number of rows in use."""
         return self._size
 
     def __contains__(self, name: str) -> bool:
+        """Test whether a column exists."""
         return name in self._columns
 
     def __getitem__(self, name: str) -> Shaped[Tensor, "R ..."]:
+        """Return a view of a column."""
         return self._columns[name][: self._size]
 
-    def columns(self) -> dict[str, Tensor]:
+    def columns(self) -> dict[str, Shaped[Tensor, "R ..."]]:
         """Return all columns by name, rows in use only."""
         return {name: self[name] for name in self._columns}
 

@@ -44,6 +44,7 @@ class NamedScene(Scene):
 
     @property
     def image_names(self) -> list[str]:
+        """The names of the images, one per frame."""
         return [self.names[index] for index in self.frame_ids.tolist()]
 
 
