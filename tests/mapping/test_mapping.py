@@ -279,7 +279,7 @@ def test_keyframes_are_chosen_by_translation_rotation_and_overlap(slam: SLAM) ->
         pose = se3_exp(torch.tensor(T_cr, dtype=torch.float64)) @ reference
         slam.submap.tracking.reference_size = int(estimate.inliers / overlap)
         moved = replace(estimate, T_cw=pose)
-        return keyframe_reason(view, moved, slam.submap, Config().keyframes)
+        return str(keyframe_reason(view, moved, slam.submap, Config().keyframes) or "")
 
     assert why([0.0] * 6) == ""
     assert why([2.0, 0, 0, 0, 0, 0]).startswith("moved")

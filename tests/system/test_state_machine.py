@@ -9,7 +9,7 @@ import torch
 
 from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.system.run import why_no_map
+from torchslam.system.run import no_map_message
 from torchslam.system.slam import SLAM
 from torchslam.types import Reason, State, StepResult
 
@@ -21,11 +21,11 @@ def result(index: int, reason: str) -> StepResult:
 def test_a_video_without_texture_is_reported() -> None:
     few = "too few matches with the reference frame: 12, 100 are needed"
     results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
-    assert why_no_map(results, []) == f"no map was initialized in 1000 frames: {few}"
+    assert no_map_message(results, []) == f"no map was initialized in 1000 frames: {few}"
 
 
 def test_a_single_reference_frame_is_reported_as_too_few_frames() -> None:
-    assert "1 frames are too few" in why_no_map([result(0, Reason.NEW_REFERENCE)], [])
+    assert "1 frames are too few" in no_map_message([result(0, Reason.NEW_REFERENCE)], [])
 
 
 @pytest.fixture

@@ -33,10 +33,10 @@ def test_two_certain_frames_confirm_an_uncertain_one() -> None:
     confirmation = PoseConfirmation(Config())
     confirmation.push(*frame(0), ODD)
     assert confirmation.is_holding
-    assert confirmation.reason == "to be confirmed by 2 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 2 more frames"
     confirmation.push(*frame(1), None)
     assert confirmation.is_holding
-    assert confirmation.reason == "to be confirmed by 1 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 1 more frames"
     confirmation.push(*frame(2), None)
     assert not confirmation.is_holding
     assert not confirmation.is_relocalized
@@ -57,10 +57,10 @@ def test_relocalized_frames_need_more_confirmations() -> None:
     confirmation.start_after_relocalization(*frame(0))
     assert confirmation.is_holding
     assert confirmation.is_relocalized
-    assert confirmation.reason == "to be confirmed by 3 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 3 more frames"
     confirmation.push(*frame(1), None)
     confirmation.push(*frame(2), ODD)
-    assert confirmation.reason == "to be confirmed by 3 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 3 more frames"
     for index in (3, 4):
         confirmation.push(*frame(index), None)
         assert confirmation.is_holding
@@ -99,7 +99,7 @@ def test_popped_frames_still_have_to_be_confirmed() -> None:
     confirmation.push(*frame(1), None)
     assert [held[0].index for held in confirmation.pop_all()] == [0, 1]
     assert confirmation.views() == []
-    assert confirmation.reason == "to be confirmed by 1 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 1 more frames"
     confirmation.push(*frame(2), None)
     assert not confirmation.is_holding
     assert [held[0].index for held in confirmation.confirm()] == [2]
@@ -109,7 +109,7 @@ def test_mapped_frames_need_as_many_certain_frames_as_were_uncertain() -> None:
     confirmation = PoseConfirmation(Config())
     for index in range(5):
         confirmation.push(*frame(index), ODD, is_mapped=index > 2)
-    assert confirmation.reason == "to be confirmed by 5 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 5 more frames"
     for index in range(5, 9):
         confirmation.push(*frame(index), None, is_mapped=True)
         assert confirmation.is_holding
@@ -117,7 +117,7 @@ def test_mapped_frames_need_as_many_certain_frames_as_were_uncertain() -> None:
     assert not confirmation.is_holding
     confirmation.confirm()
     confirmation.push(*frame(10), ODD, is_mapped=True)  # who was believed begins anew
-    assert confirmation.reason == "to be confirmed by 2 more frames"
+    assert str(confirmation.reason) == "to be confirmed by 2 more frames"
 
 
 def test_the_number_of_pending_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

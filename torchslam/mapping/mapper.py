@@ -19,7 +19,7 @@ from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.new_points import fuse, triangulate_against
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
+from torchslam.types import Explanation, FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
 YOUNG = 3  # keyframes after its own for which a point may be culled
@@ -93,7 +93,9 @@ class Mapper:
                 self.cull_recent_points(slam_map, keyframe)
             neighbors = slam_map.covisible_keyframes(keyframe, 2 * settings.num_partners)
             last = range(keyframe - 1, max(keyframe - 1 - settings.num_partners, -1), -1)
-            partners = neighbors if settings.triangulation_partners == "covisible" else slam_map.index_tensor(*last)
+            partners = (
+                neighbors if settings.triangulation_partners == "covisible" else slam_map.index_tensor(*last)
+            )
             partners = partners[: settings.num_partners]
             normalize = self.undistortion.normalize
             triangulate_against(
@@ -198,8 +200,8 @@ class MapInitializer:
 
 def keyframe_reason(
     view: FrameFeatures, estimate: PoseEstimate, submap: Submap, settings: KeyframesConfig
-) -> str:
-    """Describe why a tracked frame should become a keyframe; empty if it should not.
+) -> Explanation | None:
+    """Return why a tracked frame should become a keyframe; None if it should not.
 
     Either it is far from all local keyframes, in translation relative to the scene depth or in rotation, or it observes
     too few points of its reference keyframe.
@@ -209,14 +211,14 @@ def keyframe_reason(
     age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
     overlap = estimate.inliers / max(tracking.reference_size, 1)
     if age < max(1, settings.min_interval) or (age < view.backlog and overlap > ENOUGH_OVERLAP):
-        return ""
+        return None
     around = torch.cat([tracking.local_keyframes, tracking.local_keyframes.new_tensor([newest])])
     translation, rotation = pose_distance(estimate.T_cw, slam_map.T_cw[around], estimate.depth)
     has_moved, has_turned = translation > settings.max_translation, rotation > settings.max_rotation_deg
     if bool((has_moved | has_turned).all()):
         if bool(has_moved.all()):
-            return f"moved by {float(translation.min()):.2f} of the depth of the scene"
-        return f"turned by {float(rotation[~has_moved].min()):.1f} degrees"
+            return Explanation.of(Reason.MOVED, ratio=float(translation.min()))
+        return Explanation.of(Reason.TURNED, degrees=float(rotation[~has_moved].min()))
     if overlap < settings.min_overlap:
-        return f"sees {overlap:.0%} of the points of its reference keyframe"
-    return ""
+        return Explanation.of(Reason.LOW_OVERLAP, ratio=overlap)
+    return None

@@ -15,7 +15,7 @@ from torchslam.config import Config
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
-from torchslam.features.contract import check_features, only_where
+from torchslam.features.contract import apply_mask, check_features
 from torchslam.geometry import Camera
 from torchslam.plugins import load_front_end
 from torchslam.types import Features, Frame
@@ -23,7 +23,7 @@ from torchslam.types import Features, Frame
 FrontEnd = Callable[..., Features]
 """Extracts features of images (B, 1, H, W), floats in [0, 1]: `ORB()`, `XFeat(weights)`, any module or function.
 
-It may take a second argument: (B, 1, H, W) bool, where keypoints are wanted. The same object serves `SLAM`, `ClipSLAM`
+It may take a second argument: (B, 1, H, W) bool, where keypoints may lie. The same object serves `SLAM`, `ClipSLAM`
 and, by its name, the command line.
 """
 
@@ -49,17 +49,17 @@ def image_extractor(
 
     def extract(frame: Frame) -> Features:
         image = frame.image.to(device)
-        wanted = None if frame.mask is None else frame.mask.to(device)
+        mask = None if frame.mask is None else frame.mask.to(device)
         height, width = image.shape[-2:]
         factor = settings.reduction((width, height))
-        small, wanted_there = reduced(image, wanted, factor)
-        features = front_end(small, wanted_there) if takes_mask else front_end(small)
+        small, small_mask = reduced(image, mask, factor)
+        features = front_end(small, small_mask) if takes_mask else front_end(small)
         check_features(features, small, name)
         if factor > 1:
             ratio = width / small.shape[-1], height / small.shape[-2]
             features = _enlarged(features, ratio, factor)
         # Refined to less than a pixel, keypoints at the edge may have moved beyond it.
-        return features if wanted is None else only_where(features, wanted)
+        return features if mask is None else apply_mask(features, mask)
 
     return extract
 
@@ -76,16 +76,16 @@ def _takes_two(front_end: FrontEnd) -> bool:
     return True
 
 
-def reduced(image: Tensor, wanted: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
+def reduced(image: Tensor, mask: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
     """Reduce an image and its mask by a factor."""
     height, width = image.shape[-2:]
     size = max(1, round(height / factor)), max(1, round(width / factor))
     if image.shape[-2:] == size:
-        return image, wanted
-    if wanted is not None:
-        wanted = F.interpolate(wanted.float(), size, mode="nearest-exact") > 0
+        return image, mask
+    if mask is not None:
+        mask = F.interpolate(mask.float(), size, mode="nearest-exact") > 0
     # Bilinear reduction blurs: the corners of a reduced image would be others than those of a small one.
-    return F.interpolate(image, size, mode="bicubic", antialias=True).clamp(0, 1), wanted
+    return F.interpolate(image, size, mode="bicubic", antialias=True).clamp(0, 1), mask
 
 
 def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> Features:

@@ -11,7 +11,7 @@ from torchslam.mapping.mapper import keyframe_reason
 from torchslam.system.session import SystemContext
 from torchslam.tracking.backward_tracking import UnposedFrames, track_back
 from torchslam.tracking.pose_validation import PendingFrame
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate
 
 
 class LocalMapping:
@@ -26,28 +26,26 @@ class LocalMapping:
         view: FrameFeatures,
         estimate: PoseEstimate,
         apply_at: ApplyAt = ApplyAt.NOW,
-    ) -> str:
-        """Add a frame with a confirmed pose; return why it became a keyframe, or "".
+    ) -> Explanation | None:
+        """Add a frame with a confirmed pose; return why it became a keyframe, or None.
 
         While an adjustment is pending there is no other keyframe: it is applied after this frame instead.
         """
         context = self.context
         context.tracker.count_visible(submap.map, estimate)
-        why = (
-            keyframe_reason(view, estimate, submap, context.config.keyframes)
-            if context.session.mapping
-            else ""
-        )
-        if why and self.adjustment.is_pending:
+        reason = None
+        if context.session.mapping:
+            reason = keyframe_reason(view, estimate, submap, context.config.keyframes)
+        if reason and self.adjustment.is_pending:
             self.adjustment.set_deadline(view.index)
-            why = ""
-        if why:
+            reason = None
+        if reason:
             keyframe = context.mapper.insert(submap.map, view, estimate, apply_at)
             context.loop_closer.add(submap.map, keyframe)
             context.tracker.reset_to_keyframe(submap, keyframe)
         context.tracker.count_found(submap.map, estimate)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
-        return why
+        return reason
 
     def add_pending_frames(self, submap: Submap, frames: list[PendingFrame]) -> None:
         """Add frames whose poses were confirmed by later ones."""

@@ -30,9 +30,9 @@ from torchslam.system.front_end import FrontEnd, check_order, check_size, image_
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
-from torchslam.tracking.non_static import NonStaticFilter
 from torchslam.tracking.initialization import ProvisionalMap
 from torchslam.tracking.matcher import make_matcher, prepare_view
+from torchslam.tracking.non_static import NonStaticFilter
 from torchslam.tracking.pose_validation import PoseConfirmation
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
@@ -301,6 +301,6 @@ class SLAM:
             is_keyframe=outcome.is_keyframe,
             matches=estimate.matches if estimate else 0,
             inliers=estimate.inliers if estimate else 0,
-            reason=outcome.reason,
+            reason="; ".join(map(str, outcome.reasons)),
             stage_ms=self.clock.take(),
         )

@@ -7,6 +7,7 @@ keyframe was adjusted -> `KeyframeActions`: detect and close loops, cull, compac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchslam.map.atlas import Submap
@@ -15,18 +16,25 @@ from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, TentativeMapping
 from torchslam.system.session import SystemContext
-from torchslam.tracking.non_static import NOTHING
 from torchslam.tracking.initialization import Initializer, ProvisionalMap
+from torchslam.tracking.non_static import NOTHING
 from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
 from torchslam.tracking.relocalization import Relocalizer
-from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 
 
 @dataclass(frozen=True)
 class FrameOutcome:
-    """Effect of a frame: without a submap it has no pose, and `reason` says why."""
+    """Effect of a frame.
 
-    reason: str
+    Attributes:
+        reasons: why the frame has no pose, an uncertain one, or became a keyframe.
+        submap: the submap in which it has a pose; None without a pose.
+        estimate: pose and inliers; None if the frame was not tracked.
+        is_keyframe: True if it became a keyframe.
+    """
+
+    reasons: Sequence[Reason | Explanation]
     submap: Submap | None = None
     estimate: PoseEstimate | None = None
     is_keyframe: bool = False
@@ -223,11 +231,11 @@ class LostState:
         self.backward.unposed.add(view)
         waits = self.num_frames <= context.config.relocalization.frames_before_new_submap
         if has_submaps and (waits or not context.session.mapping):
-            return FrameOutcome(Reason.LOST)
+            return FrameOutcome([Reason.LOST])
         rejection = self.initialization.step(view)
         if rejection:
-            return FrameOutcome(str(rejection))
-        return FrameOutcome(Reason.STARTED, context.active_map.submap, is_keyframe=True)
+            return FrameOutcome([rejection])
+        return FrameOutcome([Reason.STARTED], context.active_map.submap, is_keyframe=True)
 
     def _on_relocalized(self, view: FrameFeatures, submap: Submap, estimate: PoseEstimate) -> FrameOutcome:
         """Track in the submap from here; the next frames have to confirm the pose."""
@@ -235,7 +243,7 @@ class LostState:
         context.tracker.start_at_estimate(submap, view, estimate)
         context.active_map.activate(submap, State.UNCERTAIN)
         context.confirmation.start_after_relocalization(view, estimate, submap.tracking)
-        return FrameOutcome(Reason.FOUND_AGAIN, submap, estimate)
+        return FrameOutcome([Reason.FOUND_AGAIN], submap, estimate)
 
 
 class StateMachine:
@@ -289,15 +297,18 @@ class StateMachine:
             self.mapping.apply_adjustment(self.active_map.current)
         self.initialization.confirm_map()
 
-    def _on_confident(self, view: FrameFeatures, estimate: PoseEstimate, motion: str) -> FrameOutcome:
+    def _on_confident(
+        self, view: FrameFeatures, estimate: PoseEstimate, motion: Explanation | None
+    ) -> FrameOutcome:
         """Map the frame, close loops, remove static overlays, confirm a provisional map.
 
-        motion: description of what moves independently of the scene
+        Args:
+            motion: note about keypoints that move independently of the scene.
         """
         context, mapping, actions = self.context, self.mapping, self.keyframe_actions
         self.active_map.set_state(State.TRACKING)
-        why = mapping.add_frame(self.active_map.current, view, estimate, self._apply_at())
-        is_keyframe = bool(why)
+        reason = mapping.add_frame(self.active_map.current, view, estimate, self._apply_at())
+        is_keyframe = reason is not None
         if is_keyframe and not mapping.adjustment.is_pending:
             actions.detect_and_close()
         has_new_overlay = context.session.mapping and context.non_static_filter.update_overlay(
@@ -311,13 +322,14 @@ class StateMachine:
         if self.initialization.is_almost_confirmed:
             actions.apply_pending_adjustment()
         if self.initialization.add_frame(view):
-            return FrameOutcome(Reason.STARTED_ANEW, self.active_map.submap, is_keyframe=True)
+            return FrameOutcome([Reason.STARTED_ANEW], self.active_map.submap, is_keyframe=True)
         if not is_keyframe and not mapping.adjustment.is_due(view.index):
             actions.precheck_loop()
         if not is_keyframe:
             actions.apply_pending_adjustment(view.index)
-        why = "; ".join(filter(None, [why, Reason.STATIC_OVERLAY if has_new_overlay else "", motion]))
-        return FrameOutcome(why, self.active_map.submap, estimate, is_keyframe)
+        notes = [reason, Reason.STATIC_OVERLAY if has_new_overlay else None, motion]
+        reasons = [note for note in notes if note is not None]
+        return FrameOutcome(reasons, self.active_map.submap, estimate, is_keyframe)
 
     def _apply_at(self) -> ApplyAt:
         """When the adjustment around a new keyframe is applied: soon, as long as it moves the whole map."""
@@ -343,7 +355,7 @@ class StateMachine:
             if confirmation.is_full:
                 self._keep_uncertain()
             self.active_map.set_state(State.UNCERTAIN)
-            return FrameOutcome(str(doubt or confirmation.reason), submap, estimate)
+            return FrameOutcome([doubt or confirmation.reason], submap, estimate)
         self.tentative.commit(submap)
         was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
         self.mapping.add_pending_frames(submap, frames)
@@ -351,7 +363,7 @@ class StateMachine:
             first, first_estimate, _, _ = frames[0]
             self.backward.from_frame(submap, first, first_estimate)
         self.active_map.set_state(State.TRACKING)
-        return FrameOutcome("", submap, estimate)
+        return FrameOutcome([], submap, estimate)
 
     def _keep_uncertain(self) -> None:
         """Keep the poses of frames that are held back, and their tentative keyframes."""
@@ -367,4 +379,4 @@ class StateMachine:
         self.backward.unposed.add(*self.context.confirmation.views(), view)
         is_discarded = self.initialization.on_lost()
         self.lost.enter()
-        return FrameOutcome(Reason.LOST_AT_START if is_discarded else Reason.LOST)
+        return FrameOutcome([Reason.LOST_AT_START if is_discarded else Reason.LOST])

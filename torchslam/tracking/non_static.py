@@ -22,7 +22,7 @@ from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
 from torchslam.tracking.data_association import cell_numbers, image_cells, match_views
 from torchslam.tracking.matcher import max_distance
-from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
 _OVERLAY_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the possible depths of a keypoint
 _OVERLAY_STRIDE = 8  # stride of the keypoints in the first test whether the camera moved far enough
@@ -217,12 +217,13 @@ class _Mover:
 class Movement:
     """Independent motion in a frame.
 
-    rejection: why it makes the frame's pose uncertain; None if it does not
-    note:      what is masked out, as text; empty for nothing
+    Attributes:
+        rejection: why it makes the frame's pose uncertain; None if it does not.
+        note: number of keypoints that are masked out; None if there are none.
     """
 
     rejection: Rejection | None = None
-    note: str = ""
+    note: Explanation | None = None
 
 
 NOTHING = Movement()
@@ -324,7 +325,7 @@ class IndependentMotion:
             return NOTHING
         self._frames_since_motion = 0
         count = int((belongs & view.mask).sum())
-        return Movement(note=f"{count} keypoints move by themselves and are left out")
+        return Movement(note=Explanation.of(Reason.INDEPENDENT_MOTION, count=count))
 
     def _is_pose_on_object(self, pixels: Tensor, group: Tensor, strays: Tensor, known: Tensor) -> bool:
         """Whether the pose may follow the moving object, so that the group is the static scene.

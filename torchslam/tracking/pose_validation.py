@@ -14,7 +14,7 @@ from torchslam.config import Config, PoseValidationConfig
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.map.atlas import TrackingState
-from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
 
 def validate_pose(
@@ -104,9 +104,9 @@ class PoseConfirmation:
         return self._needed > 0
 
     @property
-    def reason(self) -> str:
-        """The countdown, as text."""
-        return f"to be confirmed by {self._needed} more frames"
+    def reason(self) -> Explanation:
+        """Number of frames that have to confirm those held back."""
+        return Explanation.of(Reason.UNCONFIRMED, count=self._needed)
 
     def start_after_relocalization(
         self, view: FrameFeatures, estimate: PoseEstimate, tracking: TrackingState
