@@ -25,6 +25,7 @@ PRESETS = "tum-fr1, tum-fr2, tum-fr3, euroc, kitti, 7-scenes, tartanair, icl"
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments for the sequence, its camera and the selection of frames."""
     parser.add_argument("path", metavar="PATH", help=SEQUENCE_HELP)
     add_reading(parser)
 
@@ -82,6 +83,7 @@ def sequence(options: argparse.Namespace) -> Sequence:
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments for the configuration."""
     parser.add_argument(
         "--config",
         metavar="FILE|NAME",
@@ -130,6 +132,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for the device."""
     parser.add_argument(
         "--device",
         type=_device,
@@ -140,6 +143,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def add_processes(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for the number of processes."""
     parser.add_argument(
         "--processes",
         type=positive,

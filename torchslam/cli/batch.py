@@ -43,6 +43,7 @@ READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam batch`."""
     parser.add_argument("list", type=Path, metavar="LIST", help="list of sequences: a text or CSV file")
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for all results"
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
+    """Execute `torchslam batch`; returns the exit status."""
     rows = [row.with_defaults(_defaults(options)) for row in read_list(options.list)]
     arguments.config(options)  # report an invalid configuration once
     output, device = str(options.output.absolute()), options.device

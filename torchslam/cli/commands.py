@@ -16,6 +16,7 @@ DEMO_SEQUENCE = "synthetic:room"
 
 
 def add_arguments_demo(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam demo`."""
     parser.add_argument(
         "--output",
         "-o",
@@ -39,6 +40,7 @@ def execute_demo(options: argparse.Namespace) -> int:
 
 
 def add_arguments_eval(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam eval`."""
     parser.add_argument(
         "estimate",
         type=Path,
@@ -65,6 +67,7 @@ def execute_eval(options: argparse.Namespace) -> int:
 
 
 def add_arguments_plot(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam plot`."""
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
 
 
@@ -81,6 +84,7 @@ def execute_plot(options: argparse.Namespace) -> int:
 
 
 def add_arguments_info(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam info`."""
     arguments.add_sequence(parser)
 
 
@@ -91,6 +95,7 @@ def execute_info(options: argparse.Namespace) -> int:
 
 
 def add_arguments_config(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam config`."""
     arguments.add_config(parser)
 
 
@@ -106,6 +111,7 @@ def execute_config(options: argparse.Namespace) -> int:
 
 
 def add_arguments_download(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam download`."""
     from torchslam.data.download import ETH3D_URL
 
     parser.add_argument("name", metavar="NAME", help="eth3d/SEQUENCE, for example eth3d/plant_1")

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 
 from torchslam.cli import arguments
 from torchslam.data.trajectories import read_trajectory, write_kitti, write_trajectory
@@ -73,8 +74,8 @@ class Job:
         return int(self.metrics["session"])
 
     @property
-    def R_up(self) -> torch.Tensor:
-        """(3, 3) rotation from the map frame to the upright one, the same for every format."""
+    def R_up(self) -> Float[torch.Tensor, "3 3"]:
+        """Rotation from the map frame to the upright one, the same for every format."""
         return upright_rotation(se3_inverse(self.submap.map.T_cw).double())
 
     def scene(self) -> tuple[Scene, Images | None]:
@@ -112,6 +113,7 @@ class Target:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam export`."""
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
     parser.add_argument("--to", choices=TARGETS, required=True, help="export format")
     parser.add_argument(
@@ -138,6 +140,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
+    """Execute `torchslam export`; returns the exit status."""
     target = TARGETS[options.to]
     if options.undistort and not target.is_of_images:
         raise ConfigError(f"--undistort: an export to {options.to} contains no images")

@@ -56,6 +56,7 @@ class Plan:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam refine`."""
     arguments.add_sequence(parser)
     parser.add_argument(
         "--poses",
@@ -83,6 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
+    """Execute `torchslam refine`; returns the exit status."""
     if options.fix_camera and options.refine_distortion:
         raise ConfigError("--refine-distortion cannot be combined with --fix-camera")
     given = read_poses(options.poses)

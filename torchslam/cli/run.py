@@ -111,6 +111,7 @@ class Checkpoints:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam run`."""
     arguments.add_sequence(parser)
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
@@ -152,6 +153,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
+    """Execute `torchslam run`; returns the exit status."""
     if options.map is not None and (options.refine_camera or options.refine_distortion):
         raise ConfigError("--refine-camera cannot be combined with --map: a map keeps its camera")
     if options.localize and options.map is None:

@@ -100,6 +100,7 @@ class Preset:
 
     @property
     def guessed(self) -> bool:
+        """True if a camera is only approximate."""
         return any(camera.guessed for camera in self.cameras)
 
     def camera(self, size: Size) -> Camera:

@@ -41,6 +41,7 @@ class FromExif:
     guessed: bool = True
 
     def camera(self, size: Size) -> Camera:
+        """Raise CalibrationError: the first image is not an image file."""
         raise CalibrationError("--camera exif: only image files have an EXIF block")
 
 

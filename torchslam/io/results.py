@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import to_toml
@@ -59,7 +60,7 @@ class Results:
         submaps, camera: all submaps and their camera.
         frames: one result per frame, without poses.
         metrics: the content of metrics.json.
-        example_image: (H, W) in [0, 1], of keyframe `example_keyframe(map, session)`, if readable.
+        example_image: gray in [0, 1], of keyframe `example_keyframe(map, session)`, if readable.
     """
 
     trajectory: Trajectory
@@ -71,7 +72,7 @@ class Results:
     camera: Camera
     frames: list[StepResult]
     metrics: dict[str, Any]
-    example_image: Tensor | None
+    example_image: Float[Tensor, "H W"] | None
 
     @property
     def session(self) -> int:
@@ -79,8 +80,8 @@ class Results:
         return int(self.metrics["session"])
 
 
-def aligned(trajectory: Trajectory, S: Tensor) -> Trajectory:
-    """Poses after a similarity (4, 4) of the world."""
+def aligned(trajectory: Trajectory, S: Float[Tensor, "4 4"]) -> Trajectory:
+    """Return the poses after a similarity of the world."""
     rotation = S[:3, :3] / torch.linalg.det(S[:3, :3]) ** (1 / 3)
     return Trajectory(
         trajectory.timestamps,

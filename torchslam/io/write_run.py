@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.sequence import Sequence
@@ -184,7 +185,7 @@ def _evaluation(results: Results) -> Evaluation | None:
     return evaluate(results.trajectory, results.groundtruth)
 
 
-def _example(slam_map: Map, session: int, image: Tensor) -> Iterator[tuple[str, Figure]]:
+def _example(slam_map: Map, session: int, image: Float[Tensor, "H W"]) -> Iterator[tuple[str, Figure]]:
     """Plot the keypoints of the example keyframe, with tails to the previous keyframe."""
     keyframe = example_keyframe(slam_map, session)
     if keyframe is None:

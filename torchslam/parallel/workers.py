@@ -54,11 +54,14 @@ class System(Protocol):
     has_custom_components: bool
 
     @property
-    def mapping(self) -> bool: ...
+    def mapping(self) -> bool:
+        """True if the run changes the map, False if frames are only localized."""
 
-    def warm_up(self) -> None: ...
+    def warm_up(self) -> None:
+        """Initialize ORB and PyTorch."""
 
-    def precompute_undistortion(self) -> None: ...
+    def precompute_undistortion(self) -> None:
+        """Compute the undistortion table of the camera."""
 
 
 def processors() -> int:

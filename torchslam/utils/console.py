@@ -31,11 +31,13 @@ class Lines:
         self._file = file
 
     def write(self, text: str) -> None:
+        """Write a text as a line of its own; nothing if it is blank."""
         line = text.strip()
         if line:
             self._file.write(f"{line}\n")
 
     def flush(self) -> None:
+        """Flush the file."""
         self._file.flush()
 
 

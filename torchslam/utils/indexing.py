@@ -5,28 +5,31 @@ For dense numbers this is several times faster than the sorting of `torch.unique
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 
-def true_indices(mask: Tensor) -> Tensor:
-    """Return the positions (K,) int64 at which a flat boolean mask is true, ascending."""
+def true_indices(mask: Bool[Tensor, " N"]) -> Int[Tensor, " R"]:
+    """Return the positions at which a flat boolean mask is true, ascending."""
     if mask.is_cpu:  # twice as fast in NumPy for sparse masks
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.nonzero().squeeze(1)
 
 
-def distinct(ids: Tensor) -> Tensor:
-    """Return the distinct values (m,) of ids (n,), ascending, as `torch.unique`."""
+def distinct(ids: Int[Tensor, " N"]) -> Int[Tensor, " R"]:
+    """Return the distinct values of ids, ascending, as `torch.unique`."""
     if len(ids) == 0:
         return ids
     low, flags = _flags(ids)
     return true_indices(flags) + low
 
 
-def ranks_among(ids: Tensor, ascending: Tensor) -> Tensor:
-    """Return the position (n,) of each of ids (n,) in distinct ascending ids (m,) that contain all of them."""
+def ranks_among(ids: Int[Tensor, " N"], ascending: Int[Tensor, " M"]) -> Int[Tensor, " N"]:
+    """Return the position of each id in distinct ascending ids that contain all of them."""
     if len(ids) == 0:
         return ids
     low, high = int(ascending[0]), int(ascending[-1])
@@ -35,8 +38,8 @@ def ranks_among(ids: Tensor, ascending: Tensor) -> Tensor:
     return ranks.index_select(0, ids - low)
 
 
-def is_among(ids: Tensor, others: Tensor) -> Tensor:
-    """Return (n,) bool: membership of each of ids (n,) in others (m,), as `torch.isin`."""
+def is_among(ids: Int[Tensor, " N"], others: Int[Tensor, " M"]) -> Bool[Tensor, " N"]:
+    """Return the membership of each id in others, as `torch.isin`."""
     if len(ids) == 0 or len(others) == 0:
         return torch.zeros_like(ids, dtype=torch.bool)
     low, flags = _flags(others)
@@ -45,8 +48,21 @@ def is_among(ids: Tensor, others: Tensor) -> Tensor:
     return flags.index_select(0, at.clamp_(0, len(flags) - 1)) & is_within
 
 
-def _flags(ids: Tensor) -> tuple[int, Tensor]:
-    """Return the lowest of ids (n,) and a flag for each number from there on."""
+def row_mask(name: str, rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
+    """Return a bool mask of the shape (B, N) of `like`; `rows` are a mask, (N,) or (B, N), or indices."""
+    batch, count = like.shape
+    rows = torch.as_tensor(() if rows is None else rows, device=like.device)
+    if rows.dtype == torch.bool:
+        if rows.shape not in ((count,), (1, count), (batch, count)):
+            raise ValueError(f"{name} as a mask must have shape ({count},), not {tuple(rows.shape)}")
+        return rows.expand(batch, count)
+    mask = torch.zeros(count, dtype=torch.bool, device=like.device)
+    mask[rows.long()] = True
+    return mask.expand(batch, count)
+
+
+def _flags(ids: Int[Tensor, " N"]) -> tuple[int, Bool[Tensor, " R"]]:
+    """Return the lowest of ids and a flag for each number from there on."""
     low, high = (int(end) for end in ids.aminmax())
     flags = torch.zeros(high - low + 1, dtype=torch.bool, device=ids.device)
     return low, flags.index_fill_(0, ids - low, True)

@@ -36,13 +36,17 @@ STALE = 0.5
 class Capture(Protocol):
     """The subset of cv2.VideoCapture that a live source uses."""
 
-    def grab(self) -> bool: ...
+    def grab(self) -> bool:
+        """Wait for the next frame; False at the end."""
 
-    def retrieve(self) -> tuple[bool, np.ndarray]: ...
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Decode the last frame, BGR; False if it is damaged."""
 
-    def get(self, property_id: int) -> float: ...
+    def get(self, property_id: int) -> float:
+        """Return a property, one of cv2.CAP_PROP_*."""
 
-    def release(self) -> None: ...
+    def release(self) -> None:
+        """Close the source."""
 
 
 class LiveSequence(Sequence):

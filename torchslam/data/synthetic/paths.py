@@ -1,10 +1,11 @@
-"""Smooth camera paths through the synthetic scenes, (N, 4, 4) float64 T_wc, from the phase of each frame."""
+"""Smooth camera paths through the synthetic scenes: float64 T_wc from the phase of each frame."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.lie import rigid, so3_exp
@@ -42,7 +43,7 @@ ARM = 0.3
 """Meters: so far in front of the body is the camera held, so that it moves where the body only turns."""
 
 
-def loop(phase: Tensor) -> Tensor:
+def loop(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """A figure of eight through the middle of the room, one round a phase of 2 pi, held in a hand that sways.
 
     The sway's periods do not divide the round's, so that no two rounds are the same.
@@ -56,12 +57,12 @@ def loop(phase: Tensor) -> Tensor:
     return _poses(x, y, z, yaw, pitch, roll)
 
 
-def standstill(phase: Tensor) -> Tensor:
+def standstill(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """No motion at all."""
     return _poses(*[torch.zeros_like(phase)] * 6)
 
 
-def rotation(phase: Tensor) -> Tensor:
+def rotation(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """A camera that turns about its own center and back."""
     zero = torch.zeros_like(phase)
     return _poses(
@@ -69,7 +70,7 @@ def rotation(phase: Tensor) -> Tensor:
     )
 
 
-def sideways(phase: Tensor) -> Tensor:
+def sideways(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """A slow walk along the wall and back, turned toward it from changing angles."""
     return _poses(
         1.2 * torch.sin(phase),
@@ -81,7 +82,7 @@ def sideways(phase: Tensor) -> Tensor:
     )
 
 
-def round_the_core(phase: Tensor) -> Tensor:
+def round_the_core(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """Around the core of the four rooms, one round a phase of 2 pi, from the door into the first room, to the right.
 
     The heading is phase - sin(4 phase) / 4: straight on at the four doors, twice the mean rate in the four corners,
@@ -100,7 +101,7 @@ def round_the_core(phase: Tensor) -> Tensor:
     )
 
 
-def round_the_storey(phase: Tensor) -> Tensor:
+def round_the_storey(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     """Around the corridor of the storey and into its room, one round a phase of 2 pi; the body turns in place.
 
     The camera is held at arm's length and looks ahead, it sways and glances to the sides.
@@ -117,8 +118,8 @@ def round_the_storey(phase: Tensor) -> Tensor:
     )
 
 
-def _walked(phase: Tensor) -> Tensor:
-    """(3, N) x, z and yaw of the body on `WALK`, eased by a Hann window over the time."""
+def _walked(phase: Float[Tensor, " N"]) -> Float[Tensor, "3 N"]:
+    """x, z and yaw of the body on `WALK`, eased by a Hann window over the time."""
     ends = torch.tensor(WALK, dtype=torch.float64)
     steps = ends.diff(dim=0)
     durations = steps[:, :2].norm(dim=-1) + QUARTER_TIME * steps[:, 2].abs()
@@ -135,8 +136,8 @@ def _walked(phase: Tensor) -> Tensor:
     return (at * weights).sum(-1) / weights.sum()
 
 
-def phases(frames: int, frames_per_round: int) -> Tensor:
-    """(frames,) the phase of each frame, from 0."""
+def phases(frames: int, frames_per_round: int) -> Float[Tensor, " N"]:
+    """Return the phase of each frame, from 0."""
     return torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames_per_round)
 
 

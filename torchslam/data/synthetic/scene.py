@@ -154,6 +154,7 @@ class Painter:
     def rectangle(
         self, origin: np.ndarray, axis_u: np.ndarray, axis_v: np.ndarray, size: tuple[float, float]
     ) -> Rectangle:
+        """Return a rectangle with a new texture; `size` is in meters along its axes."""
         texture = surface(self.rng, size, self.texel, 2 ** (MIP_LEVELS - 1), self.coverage)
         normal = np.cross(axis_u, axis_v)
         light = 0.8 + 0.15 * abs(float(normal @ Z)) + 0.2 * float(abs(normal @ Y))

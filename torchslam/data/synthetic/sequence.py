@@ -10,6 +10,7 @@ from urllib.parse import parse_qsl
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
@@ -95,7 +96,7 @@ class SyntheticSequence(Sequence):
         self._options = options
         self._poses_cw = se3_inverse(T_wc).numpy()
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry import Camera
@@ -38,7 +39,7 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
     return about | dict(zip(names, params, strict=True))
 
 
-def write_nerfstudio(folder: Path, scene: Scene, R_up: Tensor) -> None:
+def write_nerfstudio(folder: Path, scene: Scene, R_up: Float[Tensor, "3 3"]) -> None:
     """Write transforms.json and the point cloud into a folder that is made if need be.
 
     Args:

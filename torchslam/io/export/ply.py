@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse
@@ -44,20 +45,21 @@ def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
 
 def write_ply(
     path: str | Path,
-    points_w: Tensor,
-    colors: Tensor,
-    centers_w: Tensor,
-    normals_w: Tensor | None = None,
-    observations: Tensor | None = None,
+    points_w: Float[Tensor, "N 3"],
+    colors: UInt8[Tensor, "N 3"],
+    centers_w: Float[Tensor, "K 3"],
+    normals_w: Float[Tensor, "N 3"] | None = None,
+    observations: Int[Tensor, " N"] | None = None,
 ) -> None:
     """Write points and camera centers as one cloud.
 
     Args:
-        points_w: (L, 3)
-        colors: (L, 3) uint8 red, green, blue
-        centers_w: (K, 3) camera centers, red, with 0 observations
-        normals_w: (L, 3) direction from each point to the cameras that observed it; None: zero
-        observations: (L,) number of keyframes that observe each point; None: 0
+        path: the file.
+        points_w: points.
+        colors: red, green, blue.
+        centers_w: camera centers, drawn red, with 0 observations.
+        normals_w: direction from each point to the cameras that observed it; None: zero.
+        observations: number of keyframes that observe each point; None: 0.
     """
     vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
     points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Num, UInt8
 from torch import Tensor
 
 from torchslam.errors import ResultsError
@@ -58,15 +59,15 @@ class Recorder:
         )
         self._log(entity, pinhole, static=True)
 
-    def points(self, points_w: Tensor, colors: Tensor | None) -> None:
-        """Replace the points (P, 3) of the map, with or without colors (P, 3) uint8."""
+    def points(self, points_w: Float[Tensor, "N 3"], colors: UInt8[Tensor, "N 3"] | None) -> None:
+        """Replace the points of the map, with or without colors."""
         content = self._rr.Points3D(
             _numpy(points_w), colors=UNPAINTED if colors is None else colors.cpu().numpy()
         )
         self._log("world/points", content, static=True)
 
-    def path(self, positions_w: Tensor, breaks: list[int]) -> None:
-        """Replace the path (F, 3), interrupted before some rows."""
+    def path(self, positions_w: Float[Tensor, "K 3"], breaks: list[int]) -> None:
+        """Replace the path, interrupted before some rows."""
         strips = [_numpy(part) for part in torch.tensor_split(positions_w, breaks)]
         self._log("world/path", self._rr.LineStrips3D(strips), static=True)
 
@@ -75,13 +76,15 @@ class Recorder:
         self._recording.set_time("frame", sequence=frame)
         self._recording.set_time("time", duration=seconds)
 
-    def pose(self, entity: str, T_wc: Tensor) -> None:
-        """Log the pose (4, 4) of a camera."""
+    def pose(self, entity: str, T_wc: Float[Tensor, "4 4"]) -> None:
+        """Log the pose of a camera."""
         pose = _numpy(T_wc)
         self._log(entity, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
-    def keypoints(self, entity: str, pixels: Tensor, colors: Tensor | None = None) -> None:
-        """Log the keypoints (N, 2) of a camera; colors (N, 3) uint8."""
+    def keypoints(
+        self, entity: str, pixels: Float[Tensor, "N 2"], colors: UInt8[Tensor, "N 3"] | None = None
+    ) -> None:
+        """Log the keypoints of a camera."""
         content = self._rr.Points2D(
             _numpy(corner_pixels(pixels)),
             colors=TRACKED if colors is None else colors.cpu().numpy(),
@@ -89,8 +92,8 @@ class Recorder:
         )
         self._log(f"{entity}/keypoints", content)
 
-    def image(self, entity: str, image: np.ndarray) -> None:
-        """Log the image of a camera: uint8, gray or BGR."""
+    def image(self, entity: str, image: UInt8[np.ndarray, "H W *channels"]) -> None:
+        """Log the image of a camera, gray or BGR."""
         _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
@@ -102,14 +105,14 @@ class Recorder:
         self._recording.log(entity, content, static=static)
 
 
-def write_recording(path: Path, scene: Scene, R_up: Tensor, images: Images | None) -> None:
+def write_recording(path: Path, scene: Scene, R_up: Float[Tensor, "3 3"], images: Images | None) -> None:
     """Write a .rrd file with the timelines `frame` and `time`, in a world whose z is up.
 
     `world/camera` has the pose of every frame, `world/keyframe` pose, image and observed keypoints of those that are
     one; a pinhole camera is all that rerun knows, so the scene must be undistorted.
 
     Args:
-        R_up: (3, 3) from the map's world to the upright one
+        R_up: rotation from the map's world to the upright one
         images: undistorted images of the keyframes; None: no images
     """
     upright = scene.turned(R_up)
@@ -138,8 +141,8 @@ def _numpy(values: Tensor) -> np.ndarray:
     return values.detach().cpu().numpy()
 
 
-def gaps(times: Tensor) -> list[int]:
-    """Return the rows before which the path is interrupted. times: (F,) ascending, frames or seconds."""
+def gaps(times: Num[Tensor, " K"]) -> list[int]:
+    """Return the rows before which the path is interrupted; `times` are ascending frames or seconds."""
     if len(times) < 3:
         return []
     steps = times.diff()

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data import open_sequence
@@ -26,33 +27,31 @@ MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees 
 
 @dataclass(frozen=True)
 class Scene:
-    """F posed frames in order of time, P points and O observations, ordered by frame; on the CPU.
+    """Posed frames in order of time, points and observations, ordered by frame; on the CPU.
 
     Attributes:
-        frame_ids: (F,) in the sequence
-        timestamps: (F,) seconds
-        is_keyframe: (F,) bool
-        T_cw: (F, 4, 4)
-        points_w: (P, 3), each seen by two frames or more
-        colors: (P, 3) uint8 red, green, blue
-        frame_index, point_index: (O,)
-        pixels: (O, 2) of the observed keypoints
+        frame_ids: indices of the frames in the sequence.
+        timestamps: seconds.
+        points_w: points, each observed by two frames or more.
+        colors: red, green, blue.
+        frame_index, point_index: rows of the frame and the point of each observation.
+        pixels: observed keypoints.
     """
 
     camera: Camera
-    frame_ids: Tensor
-    timestamps: Tensor
-    is_keyframe: Tensor
-    T_cw: Tensor
-    points_w: Tensor
-    colors: Tensor
-    frame_index: Tensor
-    point_index: Tensor
-    pixels: Tensor
+    frame_ids: Int[Tensor, " K"]
+    timestamps: Float[Tensor, " K"]
+    is_keyframe: Bool[Tensor, " K"]
+    T_cw: Float[Tensor, "K 4 4"]
+    points_w: Float[Tensor, "N 3"]
+    colors: UInt8[Tensor, "N 3"]
+    frame_index: Int[Tensor, " O"]
+    point_index: Int[Tensor, " O"]
+    pixels: Float[Tensor, "O 2"]
 
     @property
-    def T_wc(self) -> Tensor:
-        """(F, 4, 4) camera to world."""
+    def T_wc(self) -> Float[Tensor, "K 4 4"]:
+        """Camera to world."""
         return se3_inverse(self.T_cw)
 
     @property
@@ -60,19 +59,19 @@ class Scene:
         """Image file names of an export, in the order of the frames."""
         return [f"{index:06d}.png" for index in self.frame_ids.tolist()]
 
-    def turned(self, R: Tensor) -> Scene:
-        """Return the scene rotated by R (3, 3): points p become R p."""
+    def turned(self, R: Float[Tensor, "3 3"]) -> Scene:
+        """Return the scene rotated by R: points p become R p."""
         T_cw = self.T_cw.clone()
         T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
         return replace(self, T_cw=T_cw, points_w=self.points_w @ R.mT)
 
-    def errors(self) -> Tensor:
-        """Return the reprojection errors (O,)."""
+    def errors(self) -> Float[Tensor, " O"]:
+        """Return the reprojection errors, in pixels."""
         points_c = transform(self.T_cw[self.frame_index], self.points_w[self.point_index][:, None])
         return squared_reprojection_errors(points_c[:, 0], self.pixels, self.camera).sqrt()
 
-    def point_errors(self) -> Tensor:
-        """Return the mean error (P,) of each point; their mean is the reprojection error of COLMAP."""
+    def point_errors(self) -> Float[Tensor, " N"]:
+        """Return the mean error of each point; their mean is the reprojection error of COLMAP."""
         total = torch.zeros(len(self.points_w), dtype=self.pixels.dtype)
         count = torch.bincount(self.point_index, minlength=len(total))
         return total.index_add(0, self.point_index, self.errors()) / count
@@ -146,8 +145,8 @@ def undistorted(scene: Scene) -> Scene:
     return replace(scene, camera=pinhole, pixels=undistorted_pixels(scene.pixels, scene.camera, pinhole))
 
 
-def undistorted_pixels(pixels: Tensor, camera: Camera, pinhole: Camera) -> Tensor:
-    """Convert pixels (N, 2) of a camera to its `pinhole_within`."""
+def undistorted_pixels(pixels: Float[Tensor, "N 2"], camera: Camera, pinhole: Camera) -> Float[Tensor, "N 2"]:
+    """Convert pixels of a camera to its `pinhole_within`."""
     return camera.normalize(pixels) * pinhole.params[:2] + pinhole.params[2:]
 
 
@@ -163,8 +162,8 @@ class Undistorter:
         pixels = camera.project(rays)[0].reshape(pinhole.height, pinhole.width, 2)
         self._x, self._y = (pixels[..., axis].float().numpy() for axis in (0, 1))
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, C) uint8 -> the same in the new size."""
+    def __call__(self, image: UInt8[np.ndarray, "H W *channels"]) -> UInt8[np.ndarray, "h w *channels"]:
+        """Undistort an image; the result has the size of the pinhole camera."""
         # Border pixels may fall outside by a rounding error, so the border is replicated.
         return cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
@@ -191,8 +190,8 @@ class Images:
         self._rows = rows
         self._undistort = Undistorter(camera) if undistort and camera.model != "pinhole" else None
 
-    def bgr(self, frame_id: int) -> np.ndarray:
-        """(H, W, 3) uint8 as OpenCV writes it: blue first. Raises FrameError where it cannot be read."""
+    def bgr(self, frame_id: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Return an image as OpenCV writes it: blue, green, red. Raises FrameError if it cannot be read."""
         image = cv2.cvtColor(
             self._sequence.color(self._rows[frame_id]).contiguous().numpy(), cv2.COLOR_RGB2BGR
         )

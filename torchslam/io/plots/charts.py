@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.io.plots import style
@@ -26,19 +27,19 @@ _SHADES = {
 
 
 def plot_errors(
-    timestamps: Tensor,
-    errors_m: Tensor,
-    errors_rad: Tensor | None = None,
+    timestamps: Float[Tensor, " N"],
+    errors_m: Float[Tensor, " N"],
+    errors_rad: Float[Tensor, " N"] | None = None,
     results: Sequence[StepResult] = (),
     title: str = "",
 ) -> Figure:
     """The error of every posed frame over time, colored by its size; spans without a pose shaded.
 
     Args:
-        timestamps: (N,) seconds of the posed frames that have ground truth
-        errors_m: (N,) meters between the aligned and the true camera center
-        errors_rad: (N,) radians between the aligned and the true orientation
-        results: of all frames, for the shading
+        timestamps: seconds of the posed frames that have ground truth.
+        errors_m: meters between the aligned and the true camera center.
+        errors_rad: radians between the aligned and the true orientation.
+        results: results of all frames, for the shading.
     """
     seconds = style.to_numpy(timestamps)
     origin = _origin(seconds, results)

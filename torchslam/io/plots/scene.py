@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.io.plots import style
@@ -44,7 +45,7 @@ class _Scene:
 
 def plot_scene(
     trajectory: Trajectory,
-    points_w: Tensor,
+    points_w: Float[Tensor, "N 3"],
     groundtruth: Trajectory | None = None,
     keyframes: Trajectory | None = None,
     unit: str = "m",
@@ -54,7 +55,7 @@ def plot_scene(
 
     Args:
         trajectory: every posed frame, aligned to the ground truth if there is one
-        points_w: (L, 3) in the same frame
+        points_w: points in the same frame
         keyframes: frames to draw axes for: red x, green y, blue z (the viewing direction); default: all
         unit: unit of length; "" if the scale is unknown
     """
@@ -75,20 +76,19 @@ def plot_scene(
 
 def plot_top_view(
     trajectory: Trajectory,
-    points_w: Tensor,
+    points_w: Float[Tensor, "N 3"],
     groundtruth: Trajectory | None = None,
     keyframes: Trajectory | None = None,
     unit: str = "m",
     title: str = "",
-    keyframe_covariances_w: Tensor | None = None,
-    point_covariances_w: Tensor | None = None,
+    keyframe_covariances_w: Float[Tensor, "K 3 3"] | None = None,
+    point_covariances_w: Float[Tensor, "N 3 3"] | None = None,
 ) -> Figure:
     """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
 
     Args:
-        keyframe_covariances_w, point_covariances_w: (K, 3, 3) and (L, 3, 3) of the positions, drawn as
-            ellipses of three standard deviations, those of keyframes magnified by the power of ten in the
-            legend; none where they are zero
+        keyframe_covariances_w, point_covariances_w: covariances of the positions, drawn as ellipses of three
+            standard deviations, those of keyframes magnified by the power of ten in the legend; none where zero
     """
     scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
@@ -319,16 +319,21 @@ def draw_ellipses(
 
 
 def plot_features(
-    image: Tensor, keypoints: Tensor, matched: Tensor, previous: Tensor, lengths: Tensor, title: str = ""
+    image: Float[Tensor, "H W"],
+    keypoints: Float[Tensor, "N 2"],
+    matched: Bool[Tensor, " N"],
+    previous: Float[Tensor, "N 2"],
+    lengths: Int[Tensor, " N"],
+    title: str = "",
 ) -> Figure:
     """Keypoints on an image: map points as dots with a tail to where they were before, the others as rings.
 
     Args:
-        image: (H, W) in [0, 1]
-        keypoints: (N, 2) pixels
-        matched: (N,) bool, keypoints of map points
-        previous: (N, 2) pixels of the same map points in an earlier frame, NaN if it did not observe them
-        lengths: (N,) number of keyframes that observe the point, for the color
+        image: gray in [0, 1].
+        keypoints: pixels.
+        matched: keypoints of map points.
+        previous: pixels of the same map points in an earlier frame, NaN if it did not observe them.
+        lengths: number of keyframes that observe the point, for the color.
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -76,16 +77,18 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def to_numpy(values: Tensor) -> np.ndarray:
-    """A tensor of whatever device and dtype as float64 numpy, without its graph."""
+def to_numpy(values: Shaped[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """A tensor of any device and dtype as float64 array, without its graph."""
     return values.detach().cpu().double().numpy()
 
 
-def upright_axes(T_wc: np.ndarray) -> tuple[np.ndarray, tuple[str, str, str]]:
+def upright_axes(
+    T_wc: Float[np.ndarray, "K 4 4"],
+) -> tuple[Float[np.ndarray, "3 3"], tuple[str, str, str]]:
     """The signed axis permutation that brings the cameras' mean up direction closest to +z, and its names.
 
-    T_wc (N, 4, 4) -> matrix (3, 3), labels such as ("x", "z", "-y"). The world's own axes are kept, so the
-    labels stay true: a world whose y points down (cameras, KITTI) is drawn over its x-z plane.
+    The names are labels such as ("x", "z", "-y"). The world's own axes are kept, so the labels stay true: a world
+    whose y points down (cameras, KITTI) is drawn over its x-z plane.
     """
     up = -T_wc[:, :3, 1].mean(axis=0) if len(T_wc) else np.array([0.0, 0.0, 1.0])
     vertical = int(np.abs(up).argmax())
@@ -100,8 +103,10 @@ def upright_axes(T_wc: np.ndarray) -> tuple[np.ndarray, tuple[str, str, str]]:
     return rows, (names[0], names[1], names[2])
 
 
-def robust_box(path: np.ndarray, points: np.ndarray, margin: float = 0.06) -> np.ndarray:
-    """Limits (D, 2) that hold the whole path (N, D) and the bulk of the points (L, D), but no far outliers.
+def robust_box(
+    path: Float[np.ndarray, "K D"], points: Float[np.ndarray, "N D"], margin: float = 0.06
+) -> Float[np.ndarray, "D 2"]:
+    """Limits that hold the whole path and the bulk of the points, but no far outliers.
 
     Points count between their 3rd and 97th percentile, and only as far from the path's center as 4 times
     the median point is, or 1.5 times the path extends.
@@ -123,12 +128,12 @@ def robust_box(path: np.ndarray, points: np.ndarray, margin: float = 0.06) -> np
     return np.stack([low - pad, high + pad], axis=1)
 
 
-def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(L,) bool: which points (L, D) lie in the limits (D, 2)."""
+def inside(points: Float[np.ndarray, "N D"], box: Float[np.ndarray, "D 2"]) -> Bool[np.ndarray, " N"]:
+    """True for points within the limits."""
     return np.all((points >= box[:, 0]) & (points <= box[:, 1]), axis=1)
 
 
-def thin(count: int, limit: int) -> np.ndarray:
+def thin(count: int, limit: int) -> Int[np.ndarray, " R"]:
     """Indices of at most `limit` of `count` rows, evenly spread, first and last included."""
     return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
 

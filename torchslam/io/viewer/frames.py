@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchslam.data.sequence import Sequence, Transformed
@@ -44,25 +45,28 @@ class FrameSnapshot:
     """One frame and its tracking result.
 
     Attributes:
-        image: (H, W) uint8 gray
-        keypoints: (N, 2) all keypoints
-        tracked: (m, 2) keypoints of the map points that support a reliable pose
+        image: gray.
+        keypoints: all keypoints, in pixels.
+        tracked: keypoints of the map points that support a reliable pose.
     """
 
     result: StepResult
-    image: np.ndarray
-    keypoints: Tensor
-    tracked: Tensor
+    image: UInt8[np.ndarray, "H W"]
+    keypoints: Float[Tensor, "N 2"]
+    tracked: Float[Tensor, "M 2"]
 
 
 class FrameViewer(Protocol):
     """Interface of a viewer: shows frames one after the other."""
 
-    def show(self, glimpse: FrameSnapshot) -> None: ...
+    def show(self, glimpse: FrameSnapshot) -> None:
+        """Show a processed frame."""
 
-    def end(self, run: Run) -> None: ...
+    def end(self, run: Run) -> None:
+        """Show the result of the run."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release files and connections."""
 
 
 class FrameViewers:
@@ -114,13 +118,13 @@ class _Memory(Transformed):
 
     last: Tensor | None = None
 
-    def image(self, index: int) -> Tensor:
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         self.last = super().image(index)
         return self.last
 
 
-def tracked_pixels(slam: SLAM, index: int) -> Tensor:
-    """(m, 2) where a frame of this session sees map points; none while its pose is not believed."""
+def tracked_pixels(slam: SLAM, index: int) -> Float[Tensor, "M 2"]:
+    """Pixels at which a frame of this session observes map points; none while its pose is unreliable."""
     frames, seen = slam.posed_frames.frames, slam.posed_frames.observations
     if len(frames) == 0 or len(seen) == 0:
         return torch.zeros(0, 2, dtype=torch.float64)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int, Num, Shaped, UInt8
 from torch import Tensor
 
 from torchslam.data.trajectories import nearest
@@ -104,7 +105,7 @@ def page_data(results: Results) -> dict[str, Any]:
     }
 
 
-def encoded(values: Tensor | np.ndarray | list[Any], kind: str) -> dict[str, str]:
+def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> dict[str, str]:
     """Encode numbers as base64 of their little-endian bytes, row by row."""
     array = np.ascontiguousarray(np.asarray(values, dtype=kind))
     if sys.byteorder == "big":
@@ -112,7 +113,7 @@ def encoded(values: Tensor | np.ndarray | list[Any], kind: str) -> dict[str, str
     return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
-def decoded(packed: dict[str, str]) -> np.ndarray:
+def decoded(packed: dict[str, str]) -> Shaped[np.ndarray, " N"]:
     """Decode the result of `encoded` to a flat array."""
     kind = np.dtype(packed["type"]).newbyteorder("<")
     return np.frombuffer(base64.b64decode(packed["data"]), kind)
@@ -199,8 +200,8 @@ def _during(results: Results, path: Trajectory) -> Trajectory:
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
-def _points(submap: Submap) -> tuple[Tensor, Tensor]:
-    """Return positions (P, 3) and colors (P, 3) of the valid points."""
+def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3"]]:
+    """Return positions and colors of the valid points."""
     if submap.map.num_points == 0:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
     ids = submap.map.valid_points()
@@ -209,7 +210,9 @@ def _points(submap: Submap) -> tuple[Tensor, Tensor]:
     return positions_w[finite], submap.map.points["colors"][ids][finite]
 
 
-def _shown_rows(timestamps: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+def _shown_rows(
+    timestamps: Float[Tensor, " K"], times: Float[Tensor, " S"]
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Return the displayed frames that have a pose, ascending, and the rows of their poses."""
     if len(timestamps) == 0 or len(times) == 0:
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
@@ -218,8 +221,8 @@ def _shown_rows(timestamps: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     return frame, row[frame]
 
 
-def _corners(camera: Camera) -> Tensor:
-    """Return (4, 3) rays of unit depth through the image corners, in order around the image."""
+def _corners(camera: Camera) -> Float[Tensor, "4 3"]:
+    """Return rays of unit depth through the image corners, in order around the image."""
     fx, fy, cx, cy = camera.params.double()[:4]
     x = (torch.tensor([0.0, 1, 1, 0]) * (camera.width - 1) - cx) / fx
     y = (torch.tensor([0.0, 0, 1, 1]) * (camera.height - 1) - cy) / fy
