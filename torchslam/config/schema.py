@@ -219,7 +219,7 @@ def _short(text: str) -> str:
 
 
 def _is_unicode(text: str) -> bool:
-    """Whether there are no lone surrogates, as of a file name in another encoding."""
+    """Return True without lone surrogates, which file names in other encodings have."""
     return not any("\ud800" <= character <= "\udfff" for character in text)
 
 

@@ -33,7 +33,7 @@ CHUNK = 1 << 20
 TIMEOUT = 60.0
 """Seconds without a byte before a transfer is given up."""
 ATTEMPTS = 5
-"""How often a transfer that breaks off is taken up again, as long as it gets further each time."""
+"""Maximum number of attempts of an interrupted transfer; each one must get further than the last."""
 MAX_BYTES = 1 << 34
 """An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
 UNPACKING, CONTENT = ".unpacking", "content"
@@ -45,7 +45,7 @@ MARGIN = 1 << 30
 """Bytes that unpacking leaves free on the disk."""
 SMALL = 1 << 28
 MAX_RATIO = 100
-"""How many times its own size an archive may unpack to, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
+"""Maximum ratio of unpacked to packed bytes, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
 
 
 def download(
@@ -93,7 +93,7 @@ def download(
 
 
 class NoRoomError(DownloadError):
-    """What an archive holds does not fit on the disk."""
+    """The content of an archive does not fit on the disk."""
 
 
 def unpack(archive: Path, target: Path) -> None:

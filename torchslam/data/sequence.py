@@ -30,7 +30,7 @@ class EndOfSequence(IndexError):
 
 
 class Calibrated(Enum):
-    """How the camera of a sequence is known."""
+    """Source of the camera of a sequence."""
 
     GIVEN = "given"
     """Given by the user or the data, or estimated from the images."""
@@ -87,7 +87,7 @@ class Sequence(ABC):
             self._T_cw = se3_inverse(T_wc)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What another process reads the same frames from, while this one keeps what `holder` holds."""
+        """Return the state for another process, which reads the same frames; this one keeps `holder`."""
         return self.__dict__ | {"holder": None}
 
     @property
@@ -112,7 +112,7 @@ class Sequence(ABC):
 
     @property
     def known_length(self) -> int | None:
-        """How many frames there are; None for a live source without an end, which has no `len`."""
+        """Number of frames; None for a live source, which has no end and no `len`."""
         return len(self)
 
     def indices(self, start: int = 0) -> Iterable[int]:

@@ -30,7 +30,7 @@ from torchslam.utils.timing import Stopwatch
 AHEAD = 8
 """Frames that are requested from a worker ahead of their turn: it may be held up while a keyframe is adjusted."""
 NICENESS = 5
-"""Of prefetch workers relative to this process, and to the bundle worker that it waits for."""
+"""Niceness of prefetch workers, relative to this process and to the bundle worker that it waits for."""
 
 Arrays = dict[str, Any]
 """Columns as NumPy arrays, as tensors are slow to pickle."""

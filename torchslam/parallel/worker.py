@@ -29,7 +29,7 @@ THREADS = Path("/proc/self/task")  # one entry each, on Linux
 
 
 def starts_at_once() -> bool:
-    """Whether workers may be forked: a lock that another thread holds would stay locked in the fork.
+    """Return True if workers may be forked: a lock that another thread holds would stay locked in the fork.
 
     The use of a GPU does not survive a fork either. Elsewhere than on Linux the system's own libraries may hold locks.
     """
@@ -63,7 +63,7 @@ class Worker:
         theirs.close()  # so that its end is noticed
 
     def is_there(self) -> bool:
-        """Whether the process has started, which takes a while, and has not ended."""
+        """Return True once the process has started, which takes a while, until it ends."""
         try:
             if not self._is_there and not self._has_ended and self._ours.poll():
                 self._is_there = self._ours.recv_bytes() == READY

@@ -176,13 +176,13 @@ class BundleWorker(WithWorker):
 
 
 def _adjusted(arrays: list[np.ndarray]) -> BundleResult:
-    """What `_arrays` packed."""
+    """Unpack the result of `_arrays`."""
     T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
     return BundleResult(T_cw, points_w, Marginals(*covariances) if covariances else None)
 
 
 def _arrays(adjusted: BundleResult) -> list[np.ndarray]:
-    """For the way between processes: tensors are slow to pickle."""
+    """Pack a result as arrays, since tensors are slow to pickle."""
     return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
 
 

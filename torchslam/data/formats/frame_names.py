@@ -83,7 +83,7 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
 
 
 def other_kind(file: Path) -> str | None:
-    """What an image is, in the plural, that is no frame; None for a frame."""
+    """Return the kind of an image that is not a frame, in the plural; None for a frame."""
     if file.name.startswith("."):
         return "hidden files"
     words = re.split(r"[^a-z]+", file.stem.lower())
@@ -91,7 +91,7 @@ def other_kind(file: Path) -> str | None:
 
 
 def folder_kind(folder: Path) -> str | None:
-    """What all images of a folder are by its name, `depth/` or `masks/`, that are no frames; None for frames."""
+    """Return the kind of the images of a folder such as `depth/` or `masks/`, in the plural; None for frames."""
     return OTHER_KINDS.get(folder.resolve().name.lower())
 
 
@@ -130,7 +130,7 @@ def _others(series: dict[str, set[str]], name: str) -> list[set[str]]:
 
 
 def is_pattern(path: str) -> bool:
-    """Whether a path names files by a pattern, as `left-*.png`."""
+    """Return True for a pattern of file names, such as `left-*.png`."""
     return "*" in Path(path).name and not Path(path).exists()
 
 

@@ -66,7 +66,7 @@ class GivenPoses:
         return len(self.T_cw)
 
     def rows(self, sequence: Sequence) -> Int[Tensor, " F"]:
-        """Which pose each frame of a sequence has, -1 where it has none; no pose is that of two frames.
+        """Return the row of the pose of each frame of a sequence, -1 without a pose; no pose belongs to two frames.
 
         Raises TrajectoryError where no frame has one.
         """

@@ -82,7 +82,7 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:
-    """How many bits carry something: 8, or what the brightest pixel of some images of 16 bits needs, 10 to 16."""
+    """Return the number of significant bits: 8, or 10 to 16 by the brightest pixel of images of 16 bits."""
     brightest = max((int(image.max()) for image in images if image.dtype == np.uint16), default=0)
     return 8 if brightest == 0 else next(bits for bits in (10, 12, 14, 16) if brightest < 1 << bits)
 
@@ -116,7 +116,10 @@ def _declared_pixels(data: bytes) -> int:
 
 
 def _tiff_pixels(data: bytes) -> int:
-    """Of the first page of a TIFF: Pillow does not open all kinds that OpenCV reads. Source: TIFF 6.0, section 2."""
+    """Return the pixels of the first page of a TIFF, since Pillow does not open all kinds that OpenCV reads.
+
+    Source: TIFF 6.0, section 2.
+    """
     order: Literal["little", "big"] = "little" if data.startswith(b"II") else "big"
 
     def number(at: int, size: int) -> int:
@@ -131,7 +134,7 @@ def _tiff_pixels(data: bytes) -> int:
 
 
 def _is_truncated(data: bytes) -> bool:
-    """Whether a JPEG or PNG file lacks its end; other formats are left to the decoder."""
+    """Return True for a JPEG or PNG file without its end marker; other formats are left to the decoder."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
     if data.startswith(b"\xff\xd8"):
@@ -140,7 +143,7 @@ def _is_truncated(data: bytes) -> bool:
 
 
 def _start_of_scan(data: bytes) -> int:
-    """Where a JPEG's own pixels start, behind any embedded thumbnail; the file's end if they never do."""
+    """Return the offset of the pixels of a JPEG, after any embedded thumbnail; the length of the file without them."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -235,7 +238,7 @@ def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
 
 
 def _is_plain_png(data: bytes) -> bool:
-    """Whether a PNG file has a sound header, is not interlaced, and nothing before its pixels bears on them."""
+    """Return True for a PNG file with a sound header, not interlaced, without chunks that change its pixels."""
     header, sum_ = data[12:29], data[29:33]
     if (
         not data.startswith(PNG_SIGNATURE + PNG_HEADER_BYTES + b"IHDR")

@@ -184,7 +184,7 @@ def to_gray(message: Any, where: str) -> Shaped[np.ndarray, "H W"]:
 
 
 def _is_bag(path: str) -> bool:
-    """True for a bag file or the folder of a ROS 2 recording."""
+    """Return True for a bag file and for the folder of a ROS 2 recording."""
     source = Path(path.partition("?topic=")[0])
     return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
 

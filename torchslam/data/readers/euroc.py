@@ -27,7 +27,7 @@ TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
 def _is_euroc(path: str) -> bool:
-    """Whether the folder, or its `mav0`, has a camera in this layout."""
+    """Return True if the folder, or its `mav0`, has a camera in this layout."""
     return (_root(Path(path)) / "cam0" / "data.csv").is_file()
 
 

@@ -116,8 +116,10 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
 
 
 def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
-    """(width, height) that most of the first three readable images have, since the first may be the odd one, and how
-    many of their bits are used: of 16, what the brightest pixel of some images all along needs."""
+    """Return the most common size of the first three readable images, since the first may differ, and their bit depth.
+
+    The depth of images of 16 bits is that of the brightest pixel of a sample over the whole sequence.
+    """
     sizes: list[tuple[int, int]] = []
     failures: list[FrameError] = []
     bits = 8
@@ -148,7 +150,7 @@ def find_calibration(path: Path) -> Calibration | None:
 
 
 def _is_folder(path: str) -> bool:
-    """Whether there are frames, in a folder or one of `FOLDERS` in it, or for a pattern such as `left-*.png`."""
+    """Return True if there are frames: in a folder, in one of its `FOLDERS`, or for a pattern such as `left-*.png`."""
     if is_pattern(path):
         return bool(match_pattern(path).frames)
     folder = Path(path)

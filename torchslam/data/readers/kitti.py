@@ -36,7 +36,7 @@ TIME = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?")
 
 
 def _is_kitti(path: str) -> bool:
-    """True for a sequence of the odometry benchmark."""
+    """Return True for a sequence of the odometry benchmark."""
     return (Path(path) / "times.txt").is_file() and any((Path(path) / name).is_dir() for name in CAMERAS)
 
 
@@ -112,7 +112,7 @@ def _read_table(path: Path, columns: int, error: type[TorchslamError]) -> Float[
 
 
 def _is_kitti_raw(path: str) -> bool:
-    """Whether the folder is a drive (`2011_09_26_drive_0001_sync`)."""
+    """Return True for a drive (`2011_09_26_drive_0001_sync`)."""
     return _raw_camera(Path(path)) is not None
 
 

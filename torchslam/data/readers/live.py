@@ -50,14 +50,13 @@ class Capture(Protocol):
 
 
 class LiveSequence(Sequence):
-    """Frames as they come, by a thread that keeps the newest few; `image` waits for one that is newer than the last.
+    """Frames of a live source, read by a thread that keeps the newest few; `image` waits for a new one.
 
-    It watches from the first frame that is asked for: until then nothing is missed, and there is no thread, beside
-    which other processes could not be copies of this one.
+    The thread starts with the first requested frame, since a process with threads cannot be forked.
 
-    Frames are numbered as they are given, without gaps, whatever was dropped between them. Nobody knows how many there
-    will be, so that there is no `len`; behind the last frame comes `EndOfSequence`. Timestamps are seconds since 1970
-    at which a frame was captured, by the source's own clock where it has one that runs.
+    Frames are numbered as they are delivered, without gaps for dropped ones. Their number is unknown, so there is no
+    `len`; after the last frame `EndOfSequence` is raised. Timestamps are seconds since 1970 at which a frame was
+    captured, by the clock of the source if it has one.
     """
 
     def __init__(
@@ -187,7 +186,7 @@ class LiveSequence(Sequence):
         return thread
 
     def _keep_next(self) -> bool:
-        """Whether there was one more frame, or one that could not be decoded."""
+        """Return True if there was another frame, even one that could not be decoded."""
         if not self._capture.grab():
             return False
         captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
@@ -228,7 +227,7 @@ class CaptureClock:
 
 
 def is_live(path: str) -> bool:
-    """Whether this is an address, or the number of a camera and no file."""
+    """Return True for an address, and for the number of a camera that is not a file."""
     if ADDRESS.fullmatch(path):
         return (
             not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES

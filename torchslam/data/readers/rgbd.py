@@ -43,14 +43,14 @@ ICL_MIRROR = (1.0, -1.0, 1.0, 1.0)
 points down, so that camera and world are mirrored."""
 SEVEN_SCENES_COLOR = "frame-*.color.png"
 ORTHOGONAL = 0.05
-"""How far R R^T of a pose may be from the identity; fused poses are printed with few digits."""
+"""Tolerated deviation of R R^T from the identity; fused poses are printed with few digits."""
 TARTANAIR_CAMERAS = ("left", "lcam_front")
 TARTANAIR_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """The axes of our cameras, right, down, forward, as columns in the dataset's: forward, right, down."""
 
 
 def _is_tum(path: str) -> bool:
-    """Whether the folder has a list of images in this layout."""
+    """Return True if the folder has a list of images."""
     return (Path(path) / "rgb.txt").is_file()
 
 
@@ -90,7 +90,7 @@ def read_image_list(path: Path) -> list[ImageEntry]:
 
 
 def _is_icl_nuim(path: str) -> bool:
-    """Whether the folder has a trajectory under this dataset's name, and images."""
+    """Return True if the folder has images and a trajectory of this dataset."""
     return (Path(path) / "rgb").is_dir() and next(Path(path).glob(ICL_TRUTH), None) is not None
 
 
@@ -114,7 +114,7 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
 
 
 def _is_seven_scenes(path: str) -> bool:
-    """Whether the folder has color frames of this dataset's names."""
+    """Return True if the folder has color frames with the names of this dataset."""
     return Path(path).is_dir() and next(Path(path).glob(SEVEN_SCENES_COLOR), None) is not None
 
 
@@ -163,7 +163,7 @@ def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
 
 
 def _is_tartanair(path: str) -> bool:
-    """Whether the folder is a trajectory (`P000`) of the dataset."""
+    """Return True for a trajectory (`P000`) of the dataset."""
     return _tartanair_camera(Path(path)) is not None
 
 

@@ -131,7 +131,7 @@ class VideoSequence(Sequence):
 
 
 def _is_video(path: str) -> bool:
-    """True for a file with a video suffix."""
+    """Return True for a file with a video suffix."""
     return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
 
 
@@ -203,7 +203,7 @@ def _boxes(
 
 
 def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
-    """How many samples a table speaks of; 0 for other boxes."""
+    """Return the number of samples that a table declares; 0 for other boxes."""
     at = {b"stsz": 8, b"stz2": 8, b"stts": 4, b"ctts": 4, b"trun": 4}.get(kind)
     if at is None or end - start < at + 4:
         return 0

@@ -41,7 +41,7 @@ ROOMS_HALF = 3.9
 ROOMS_CORE = 1.3
 """Meters from the center to the inner walls."""
 ROOMS_DOOR = (-3.4, -1.95)
-"""Where the door begins and ends along x."""
+"""Begin and end of the door along x."""
 ROOMS_DOOR_TOP = -0.7
 SIZE_SPREAD = 0.12
 """Furniture is up to that share larger or smaller ..."""
@@ -73,10 +73,10 @@ STOREY_CORE = (4.2, 3.2)
 STOREY_ROOM = (0.4, 4.1, -2.4, 2.4)
 """x from and to, z from and to."""
 STOREY_DOOR = (-0.6, 0.6)
-"""Where the door begins and ends along z."""
+"""Begin and end of the door along z."""
 STOREY_DOOR_TOP = -0.75
 PLAIN = 0.03
-"""Of a wall of the corridor: the largest shapes cover an eighth of what they cover elsewhere."""
+"""Coverage of a wall of the corridor by the largest shapes: an eighth of that of other surfaces."""
 BOARD_EVERY = 3.2
 """Meters along the corridor between two notice boards, on one wall and on the other."""
 BOARD = (0.6, 0.9, 0.03)

@@ -15,7 +15,8 @@ RADIUS = 2.87
 OUTWARD = 0.5
 """Radians from the heading to where the camera looks."""
 HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
-"""Of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n, weights J_n(1 / 4) / (1 - 4 n)."""
+"""Fourier series of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n,
+weights J_n(1 / 4) / (1 - 4 n)."""
 
 WALK = (  # over the storey: x, z and heading in quarter turns to the right from z, of each end of a step or a turn
     (-4.0, -4.1, 1),

@@ -15,7 +15,7 @@ NEAR = 0.05
 """Meters: what is nearer to the camera is not drawn."""
 PADDING = 2
 SHARPNESS = 0.7
-"""Of the choice of level: 1 takes one texel a pixel; less is sharper, at the price of some aliasing."""
+"""Choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing."""
 
 
 class Renderer:
@@ -71,7 +71,7 @@ class Renderer:
         return np.where(hit, image, 0.0).astype(np.float32)
 
     def _linear_forms(self, T_cw: np.ndarray) -> np.ndarray:
-        """(R, 3, 3): per rectangle, (u, v, 1) / z in meters as linear forms of the pixel (x, y, 1)."""
+        """Return (R, 3, 3): (u, v, 1) / z of each rectangle, in meters, as linear forms of the pixel (x, y, 1)."""
         R, t = T_cw[:3, :3], T_cw[:3, 3]
         M = np.stack((self._axes_u @ R.T, self._axes_v @ R.T, self._origins @ R.T + t), axis=-1)
         # A rectangle seen exactly edge-on has no inverse and is invisible: forms of zero never win.
@@ -80,7 +80,7 @@ class Renderer:
         return np.where(edge_on[:, None, None], 0.0, forms)
 
     def _nearest(self, forms: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-        """(H, W) int64: the rectangle seen at each pixel, -1 for none."""
+        """Return (H, W) int64: the rectangle seen at each pixel, -1 for none."""
         best = np.zeros(self._size[::-1], np.float32)
         winner = np.full(self._size[::-1], -1, np.int64)
         for row, (x0, y0, x1, y1) in enumerate(bounds.tolist()):
@@ -100,7 +100,7 @@ class Renderer:
         return winner
 
     def _bounds(self, T_cw: np.ndarray) -> np.ndarray:
-        """(R, 4) int64: the pixels x0, y0, x1, y1 (end exclusive) that each rectangle may cover; empty out of sight."""
+        """Return (R, 4) int64: the pixels x0, y0, x1, y1 (end exclusive) that each rectangle may cover."""
         corners = self._corners @ T_cw[:3, :3].T + T_cw[:3, 3]
         following = np.roll(corners, -1, axis=1)
         z, z_following = corners[..., 2:], following[..., 2:]

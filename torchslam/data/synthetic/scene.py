@@ -16,7 +16,7 @@ KINDS = ("polygon", "bar", "ellipse", "letter")
 MIN_CONTRAST = 30
 """Gray levels between a shape and what is below its center."""
 FRACTION_BITS = 4
-"""Of the coordinates of polygons, so that their corners lie off the pixel grid."""
+"""Factor of the coordinates of polygons, so that their corners lie off the pixel grid."""
 
 
 def surface(

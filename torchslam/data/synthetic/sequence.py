@@ -32,7 +32,7 @@ FOCAL = 500.0
 
 @dataclass(frozen=True)
 class Scene:
-    """What is seen and how the camera moves.
+    """A scene and the path of the camera in it.
 
     Attributes:
         build: rectangles from a seed
@@ -114,7 +114,7 @@ class SyntheticSequence(Sequence):
 
 
 def is_synthetic(path: str) -> bool:
-    """Whether this is the name of a rendered sequence."""
+    """Return True for the name of a rendered sequence."""
     return path.startswith("synthetic:")
 
 

@@ -1,4 +1,4 @@
-"""What an export consists of: posed frames of one run in one submap, their points, observations and images.
+"""Content of an export: posed frames of one run in one submap, their points, observations and images.
 
 Images and keypoints are undistorted on request.
 """
@@ -169,7 +169,7 @@ class Undistorter:
 
 
 def _line(at: int, values: Tensor) -> Tensor:
-    """(N, 2) pixels (at, values)."""
+    """Return (N, 2) pixels (at, values)."""
     return torch.stack((torch.full_like(values, at), values), dim=-1)
 
 

@@ -265,7 +265,7 @@ def _by_name(
 
 
 def _sorted(axes: Axes, values: Sequence[float]) -> None:
-    """For each value the share of the sequences that have at most this."""
+    """Draw the share of the sequences that have at most each value."""
     ordered = np.sort(np.array(values, dtype=float))
     axes.step(ordered, 100.0 * np.arange(1, len(ordered) + 1) / max(len(ordered), 1), color=style.ESTIMATE)
     axes.set(ylabel=f"of {len(ordered)} sequences (%)", ylim=(0.0, 103.0))

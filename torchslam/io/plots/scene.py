@@ -237,7 +237,7 @@ def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _dots(points: np.ndarray) -> dict[str, Any]:
-    """How points are drawn: larger where there are few, in muted colors away from those of the path."""
+    """Return the style of points: larger if there are few, in muted colors unlike those of the path."""
     from matplotlib.colors import LinearSegmentedColormap
 
     heights = LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])

@@ -1,4 +1,4 @@
-"""What all pictures share: palette, type, axes limits that far outliers cannot stretch, saving."""
+"""Common style of all plots: palette, fonts, axes limits without far outliers, saving."""
 
 from __future__ import annotations
 
