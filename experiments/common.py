@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
 
 from torchslam.batch import ERROR, Columns, Engine, Row, Task, run_batch
 from torchslam.batch.engines import ENGINES
@@ -16,22 +21,22 @@ from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
 from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
+from torchslam.geometry import Camera
 from torchslam.io.results import read_metrics
+from torchslam.types import Trajectory
 
+T = TypeVar("T")
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
-def sequences(names: list[str]) -> list[Frames]:
+def place_of(name: str) -> str:
+    """The argument of `open_sequence` for a rendered sequence or one in `DATA_DIR`."""
+    return name if name.startswith("synthetic:") else str(DATA_DIR / name)
+
+
+def sequences(names: Iterable[str]) -> list[Frames]:
     """Open the available sequences; report the others."""
-    found = []
-    for name in names:
-        if name.startswith("synthetic:"):
-            found.append(open_sequence(name))
-        elif (DATA_DIR / name).is_dir():
-            found.append(open_sequence(DATA_DIR / name))
-        else:
-            print(f"{name}: not at {DATA_DIR}, left out")
-    return found
+    return [open_sequence(place_of(name)) for name in available(names)]
 
 
 def available(names: Iterable[str]) -> list[str]:
@@ -47,18 +52,37 @@ def available(names: Iterable[str]) -> list[str]:
 
 def row_of(name: str, *labels: str, overrides: Iterable[str] = (), **more: Any) -> Row:
     """A row of a batch; `labels` distinguish it from other runs over the same sequence."""
-    place = name if name.startswith("synthetic:") else str(DATA_DIR / name)
     label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *labels))
-    return Row(label, place, overrides=tuple(overrides), **more)
+    return Row(label, place_of(name), overrides=tuple(overrides), **more)
 
 
-def parser_of(description: str | None, output: Path | None = None) -> argparse.ArgumentParser:
-    """Create the parser of an experiment with its module's description and, optionally, the file of its table."""
+class PosedSequence(Frames):
+    """A camera on a path (F, 4, 4) T_wc with blank images, for simulated features."""
+
+    def __init__(self, name: str, camera: Camera, T_wc: Tensor, timestamps: Tensor) -> None:
+        super().__init__(name, "poses", camera, timestamps, Trajectory(timestamps, T_wc))
+
+    def image(self, index: int) -> Tensor:
+        return torch.zeros(1, 1, self.camera.height, self.camera.width)
+
+    def image_name(self, index: int) -> str:
+        return f"pose {index}"
+
+
+def parser_of(
+    description: str | None, output: Path | None = None, readme: bool = False
+) -> argparse.ArgumentParser:
+    """Create the parser of an experiment.
+
+    description: of its module; output: default of the file for its table; readme: whether it writes into a README
+    """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     if output is not None:
         parser.add_argument("--output", type=Path, default=output)
+    if readme:
+        parser.add_argument("--no-readme", action="store_true", help="print only")
     return parser
 
 
@@ -79,6 +103,25 @@ def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: boo
     check(run_batch(tasks, Engine(options.engine, options.workers), on_progress=_log))
     folders = [output / RUNS / row.name for row in rows]
     return [read_metrics(folder) | read_times(folder) for folder in folders]
+
+
+def tabulate_runs(
+    rows: Sequence[Row],
+    options: argparse.Namespace,
+    header: str,
+    cells: Callable[[int, Columns], list[str]],
+    module: str,
+) -> None:
+    """Run the rows, print the table of their metrics, and write it into the README unless --no-readme is given.
+
+    cells: maps the number of a row and its metrics to its line of the table; module: file next to the README
+    """
+    text = table(
+        header, [cells(number, metrics) for number, metrics in enumerate(metrics_of_runs(rows, options))]
+    )
+    print(text)
+    if not options.no_readme:
+        write_between(Path(module).parent / "README.md", text)
 
 
 def cached_run(
@@ -127,14 +170,37 @@ def _log(columns: Columns) -> None:
     print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
 
 
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """Format a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
+def timed(call: Callable[[], T]) -> tuple[T, float]:
+    """Call a function; return its result and the processor time in ms."""
+    start = time.process_time()
+    result = call()
+    return result, 1e3 * (time.process_time() - start)
+
+
+def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
+    """Median processor time of each task, taken in turns so that a busy machine slows all of them alike.
+
+    A task may return a float: the milliseconds that count. Two more rounds before the others are not counted.
+    """
+    times: list[list[float]] = [[] for _ in tasks]
+    for _ in range(repeats + 2):
+        for task, record in zip(tasks, times, strict=True):
+            result, spent = timed(task)
+            record.append(result if isinstance(result, float) else spent)
+    return [statistics.median(record[2:]) for record in times]
+
+
+def table(header: str | Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Format a Markdown table; header: the titles of the columns, in one string separated by " | "."""
+    titles = header.split(" | ") if isinstance(header, str) else header
+    lines = [titles, ["---"] * len(titles), *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + "\n"
 
 
-def write_between(readme: Path, text: str) -> None:
-    """Replace the text between the marks `<!-- table -->` and `<!-- end -->` of a README."""
-    before, _, rest = readme.read_text(encoding="utf-8").partition("<!-- table -->\n")
-    _, _, after = rest.partition("<!-- end -->")
-    readme.write_text(f"{before}<!-- table -->\n{text}<!-- end -->{after}", encoding="utf-8")
+def write_between(
+    readme: Path, text: str, start: str = "<!-- table -->\n", end: str = "<!-- end -->"
+) -> None:
+    """Replace the text between two marks of a README."""
+    before, _, rest = readme.read_text(encoding="utf-8").partition(start)
+    _, _, after = rest.partition(end)
+    readme.write_text(f"{before}{start}{text}{end}{after}", encoding="utf-8")

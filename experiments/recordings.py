@@ -17,9 +17,9 @@ from torchslam.io.results import read_metrics
 SEEDS = (0, 1, 2)
 DEFAULT = "default"
 KEPT_ORB = ("features.kind=experiments.cached_features:ORB",)
-"""The default's features, found once: the same bytes."""
+"""The default's features, cached: the same bytes."""
 ENOUGH = 0.9
-"""Of the frames that the default poses: with fewer an error is that of another path, and not compared."""
+"""Fraction of the frames posed by the default; with fewer, the path is another one and errors are not compared."""
 _DRAWS = 2000
 
 
@@ -27,11 +27,11 @@ _DRAWS = 2000
 class Recording:
     """A real sequence: file or folder in the data; camera, truth, limit as of a `Row`.
 
-    kin: recordings of the same images, which are drawn together for intervals
+    group: recordings of the same images, which the bootstrap draws together
     """
 
     name: str
-    kin: str
+    group: str
     camera: str | None = None
     groundtruth: str | None = None
     limit: int | None = None
@@ -131,15 +131,17 @@ def geometric_mean(ratios: dict[str, dict[int, float]]) -> float:
     return math.exp(sum(means) / len(means)) if means else math.nan
 
 
-def interval(ratios: dict[str, dict[int, float]], kin: dict[str, str], seed: int = 0) -> tuple[float, float]:
-    """95 % of `geometric_mean` when images are drawn anew, with the recordings that share them, and seeds within each.
+def interval(
+    ratios: dict[str, dict[int, float]], group: dict[str, str], seed: int = 0
+) -> tuple[float, float]:
+    """95 % interval of `geometric_mean` by a bootstrap over images, with the recordings that share them, and seeds.
 
-    ratios: by recording; kin: of each recording
+    ratios: by recording; group: of each recording
     """
     groups: dict[str, list[list[float]]] = {}
     for label, by_seed in ratios.items():
         if by_seed:
-            groups.setdefault(kin[label], []).append(list(by_seed.values()))
+            groups.setdefault(group[label], []).append(list(by_seed.values()))
     if len(groups) < 2:
         return math.nan, math.nan
     generator = torch.Generator().manual_seed(seed)
@@ -164,11 +166,11 @@ def report(outcomes: Outcomes, arms: Sequence[str], reference: str = DEFAULT) ->
     labels = list(dict.fromkeys(label for label, _, _ in outcomes))
     made = dict.fromkeys((label, arm) for label, arm, _ in outcomes)
     rows = [_row(outcomes, label, arm, reference) for label in labels for arm in arms if (label, arm) in made]
-    kin = {label: RECORDINGS[label].kin for label in labels}
+    group = {label: RECORDINGS[label].group for label in labels}
     for arm in arms:
         ratios = {label: log_ratios(outcomes, label, arm, reference) for label in labels}
         counted = sum(bool(by_seed) for by_seed in ratios.values())
-        low, high = interval(ratios, kin)
+        low, high = interval(ratios, group)
         mean = f"**{geometric_mean(ratios):.2f}**"
         if not math.isnan(low):  # of one recording there is none
             mean += f" ({low:.2f} to {high:.2f})"

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, milliseconds, rmse
-from experiments.common import parser_of, table
+from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, rmse
+from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
 
@@ -175,7 +175,7 @@ def windows() -> list[str]:
         lambda: each(step),
         repeats=5,
     )
-    header = [f"{WINDOWS} windows", "one after the other, ms", "in one call, ms", "throughput"]
+    header = [f"{WINDOWS} windows", "in a loop, ms", "in one call, ms", "throughput"]
     rows = [
         [what, f"{apart:.0f}", f"{at_once:.0f}", f"{apart / at_once:.1f}"]
         for what, apart, at_once in (
@@ -199,14 +199,14 @@ def main() -> None:
     lines = [
         "# Bundle adjustment, large and in batches",
         "",
-        "One thread, float64, median CPU time of the process, measured in turns.",
+        "One thread, float64, median CPU time of the process, interleaved.",
         "",
         "    python -m experiments.benchmarks.bundle",
         "",
         "## As large as theseus's issue 565",
         "",
         *large(),
-        "The issue tells of 30 s an iteration. The others on the same problem: [bundle_peers.md](bundle_peers.md).",
+        "The issue reports 30 s per iteration. Other libraries on this problem: [bundle_peers.md](bundle_peers.md).",
         "",
         "## Many small ones at once",
         "",

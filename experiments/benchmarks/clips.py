@@ -8,16 +8,15 @@ pixel at random, as training would move them. Prints a table and writes it to FI
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from experiments.common import parser_of, sequences, table
+from experiments.common import parser_of, sequences, table, timed
 from torchslam import ORB, ClipGraph, ClipSLAM, Features, clip_loss
 from torchslam.learning.dataset import Clip, Clips
 from torchslam.learning.losses import relative_ate
@@ -26,8 +25,6 @@ HERE = Path(__file__).parent
 NAMES = ["redkitchen", "machine_hall", "fr2_desk_20", "shelf_bin", "synthetic:room"]
 CLIPS, STEPS = 5, 5
 MOVE_PX = 0.5
-
-T = TypeVar("T")
 
 
 class Step(NamedTuple):
@@ -63,7 +60,7 @@ def prepare(clip_slam: ClipSLAM, clip: Clip) -> PreparedClip:
 def step(clip_slam: ClipSLAM, prepared: Sequence[PreparedClip], together: bool, seed: int) -> Step:
     """A step with gradients to keypoints, scores and cameras.
 
-    together: all clips in one call, or in one after the other; seed: of how keypoints move
+    together: all clips in one call, or one call each; seed: of how keypoints move
     """
     generator = torch.Generator().manual_seed(seed)
     cameras = torch.stack([each.clip.camera.params for each in prepared]).requires_grad_()
@@ -98,8 +95,11 @@ def alone(clip_slam: ClipSLAM, prepared: PreparedClip) -> list[float]:
 
 
 class Compared(NamedTuple):
-    """Clips in turn and in one call: CPU milliseconds per clip, medians of steps of either kind in alternation; by what
-    shares of their length the gradients to the cameras differ, (STEPS, B)."""
+    """Clips in separate calls and in one call.
+
+    in_turn_ms, at_once_ms: CPU time per clip, medians of interleaved steps
+    apart: (STEPS, B) relative difference of the gradients to the cameras
+    """
 
     in_turn_ms: float
     at_once_ms: float
@@ -113,12 +113,6 @@ def compared(clip_slam: ClipSLAM, prepared: Sequence[PreparedClip]) -> Compared:
     in_turn, at_once = (torch.tensor([pair[kind].ms for pair in pairs]).median() for kind in (0, 1))
     apart = [(one.gradient - other.gradient).norm(dim=-1) / one.gradient.norm(dim=-1) for one, other in pairs]
     return Compared(float(in_turn), float(at_once), torch.stack(apart))
-
-
-def timed(call: Callable[[], T]) -> tuple[T, float]:
-    start = time.process_time()
-    result = call()
-    return result, 1e3 * (time.process_time() - start)
 
 
 def main() -> None:
@@ -152,16 +146,11 @@ def main() -> None:
             ]
         )
         print(rows[-1], flush=True)
-    header = [
-        "sequence",
-        "clips with a map",
-        "keyframes, observations",
-        "front end, ms",
-        "build_graph",
-        "pose",
-    ]
-    header += ["backward", "step", "slowest step", "step, all clips in one call", "times faster"]
-    header += ["gradients differ by"]
+    header = (
+        "sequence | clips with a map | keyframes, observations | front end, ms | build_graph"
+        " | pose | backward | step | slowest step | step, all clips in one call | times faster"
+        " | gradients differ by"
+    )
     text = (
         "# Training through clips\n\nClips of 8 frames, 1000 ORB keypoints each, moved by half a pixel before every "
         "step; gradients of the ATE to keypoints, weights and camera. Medians of the CPU time of one thread, in "

@@ -4,15 +4,11 @@
 
 FOLDER holds the sequences. Both extractors give 1000 keypoints, and the same matcher matches them; OpenCV's keypoints
 are those of `OpenCVORB`, that is with the half pixel put right that cv2.ORB is off on its higher levels. Times are CPU
-time of the thread, so that other work on the machine counts as little as possible, taken in turns with the peer.
+time of the thread, so that other work on the machine counts as little as possible, interleaved with the peer.
 """
 
 from __future__ import annotations
 
-import argparse
-import statistics
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from experiments.benchmarks.problems import match_pixels
+from experiments.common import DATA_DIR, milliseconds, parser_of, table
 from torchslam.features import ORB, OpenCVORB, match, match_by_projection
 from torchslam.types import Features
 
@@ -50,27 +48,6 @@ def gray(path: Path) -> NDArray:
     return image
 
 
-def in_turns(tasks: dict[str, Callable[[], Any]], rounds: int = 30) -> dict[str, float]:
-    """Median CPU milliseconds of each task."""
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    for lap in range(rounds + 3):
-        for name, task in tasks.items():
-            begin = time.thread_time()
-            task()
-            if lap >= 3:
-                times[name].append(1e3 * (time.thread_time() - begin))
-    return {name: statistics.median(values) for name, values in times.items()}
-
-
-def match_pixels(first: Features, second: Features, **options: Any) -> tuple[NDArray, NDArray]:
-    """Pixels (M, 2) of the matches in both images."""
-    matches = match(first, second, **options)
-    rows = matches.mask[0]
-    pixels_1 = first.keypoints[0][matches.indices_1[0][rows]]
-    pixels_2 = second.keypoints[0][matches.indices_2[0][rows]]
-    return pixels_1.double().numpy(), pixels_2.double().numpy()
-
-
 def epipolar(
     data: Path, sequence: str, gap: int, pairs: int, extract: nn.Module, **options: Any
 ) -> tuple[float, float]:
@@ -82,7 +59,8 @@ def epipolar(
         images = [gray(paths[start]), gray(paths[start + gap])]
         height, width = images[0].shape
         camera = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
-        pixels_1, pixels_2 = match_pixels(*(extract(to_tensor(image)) for image in images), **options)
+        first, second = (extract(to_tensor(image)) for image in images)
+        pixels_1, pixels_2 = (side.numpy() for side in match_pixels(first, second, **options))
         ransac = {"max_epipolar_error": 1.0, "min_iterations": 200, "max_iterations": 1000, "seed": 0}
         _, found = poselib.estimate_relative_pose(pixels_1, pixels_2, camera, camera, ransac, {})
         counts.append(sum(found["inliers"]))
@@ -144,7 +122,8 @@ def known_change(
     seen_1 = shared(first, homography)
     seen_2 = mapped(homography, shared(second, np.linalg.inv(homography)))
     nearest = np.linalg.norm(seen_1[:, None] - seen_2[None], axis=-1).min(1)
-    pixels_1, pixels_2 = match_pixels(first, second, ratio=None, max_distance=None)
+    matched = match_pixels(first, second, ratio=None, max_distance=None)
+    pixels_1, pixels_2 = (side.numpy() for side in matched)
     errors = np.linalg.norm(mapped(homography, pixels_1) - pixels_2, axis=1)
     right = errors < RIGHT
     return [float(v) for v in ((nearest < NEAR).mean(), right.mean(), right.sum(), np.median(errors[right]))]
@@ -160,68 +139,57 @@ def random_descriptors(count: int, seed: int) -> Features:
 
 def speed_tables(image: NDArray) -> list[str]:
     peer, tensor = cv2.ORB.create(1000), to_tensor(image)
-    pair = in_turns(
-        {"torchslam": partial(ORB(1000), tensor), "cv2": lambda: peer.detectAndCompute(image, None)}
+    ours, theirs = milliseconds(
+        partial(ORB(1000), tensor), lambda: peer.detectAndCompute(image, None), repeats=30
     )
-    times = {"torchslam": (pair["torchslam"], pair["cv2"])}
-    lines = ["| ORB, 1000 keypoints, 640x480 | ms | cv2.ORB | ratio |", "|---|---|---|---|"]
-    lines += [f"| {name} | {a:.1f} | {b:.1f} | {a / b:.1f} |" for name, (a, b) in times.items()]
-    lines += ["", "| Hamming, mutual | ms | cv2.BFMatcher | ratio |", "|---|---|---|---|"]
+    row = ["torchslam", f"{ours:.1f}", f"{theirs:.1f}", f"{ours / theirs:.1f}"]
+    tables = [table("ORB, 1000 keypoints, 640x480 | ms | cv2.ORB | ratio", [row])]
+    rows = []
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     for count in (1000, 2000):
         a, b = random_descriptors(count, 0), random_descriptors(count, 1)
         arrays = a.descriptors[0].numpy(), b.descriptors[0].numpy()
-        t = in_turns(
-            {
-                "ours": partial(match, a, b, ratio=None, max_distance=None),
-                "cv2": partial(matcher.match, *arrays),
-            }
+        ours, theirs = milliseconds(
+            partial(match, a, b, ratio=None, max_distance=None), partial(matcher.match, *arrays), repeats=30
         )
-        lines.append(f"| {count} x {count} | {t['ours']:.2f} | {t['cv2']:.2f} | {t['ours'] / t['cv2']:.2f} |")
-    lines += [
-        "",
-        "| matching by projection, points x keypoints | radius 15 px | radius 50 px |",
-        "|---|---|---|",
-    ]
+        rows.append([f"{count} x {count}", f"{ours:.2f}", f"{theirs:.2f}", f"{ours / theirs:.2f}"])
+    tables.append(table("Hamming, mutual | ms | cv2.BFMatcher | ratio", rows))
+    rows = []
     for points, keypoints in ((1000, 1000), (2000, 1000), (3000, 2000)):
         a, b = random_descriptors(points, 0), random_descriptors(keypoints, 1)
-        t = in_turns(
-            {
-                str(radius): partial(match_by_projection, a.descriptors, a.keypoints, radius, b)
-                for radius in (15.0, 50.0)
-            }
-        )
-        lines.append(f"| {points} x {keypoints} | {t['15.0']:.1f} ms | {t['50.0']:.1f} ms |")
-    return lines
+        searches = [
+            partial(match_by_projection, a.descriptors, a.keypoints, radius, b) for radius in (15.0, 50.0)
+        ]
+        times = milliseconds(*searches, repeats=30)
+        rows.append([f"{points} x {keypoints}", *(f"{spent:.1f} ms" for spent in times)])
+    header = "matching by projection, points x keypoints | radius 15 px | radius 50 px"
+    return [*tables, table(header, rows)]
 
 
 def quality_tables(data: Path, pairs: int) -> list[str]:
     extractors: dict[str, nn.Module] = {"ours": ORB(1000), "cv2": OpenCVORB(1000)}
-    lines = []
+    tables = []
     for title, options in (
         ("mutual nearest neighbors", {"ratio": None, "max_distance": None}),
         ("mutual and ratio 0.8", {"ratio": 0.8, "max_distance": None}),
     ):
-        lines += [
-            f"| {title}, frames apart | " + " | ".join(str(gap) for gap in GAPS) + " |",
-            "|---" * 5 + "|",
-        ]
+        rows = []
         for sequence in SEQUENCES:
-            cells = []
+            cells = [sequence]
             for gap in GAPS:
                 results = {
                     n: epipolar(data, sequence, gap, pairs, e, **options) for n, e in extractors.items()
                 }
                 (ours, share), (theirs, their_share) = results["ours"], results["cv2"]
                 cells.append(f"{ours:.0f} / {theirs:.0f}, {share:.3f} / {their_share:.3f}")
-            lines.append(f"| {sequence} | " + " | ".join(cells) + " |")
-        lines.append("")
-    lines += ["| known change | repeatability | precision | right matches | error, px |", "|---" * 5 + "|"]
+            rows.append(cells)
+        tables.append(table([f"{title}, frames apart", *map(str, GAPS)], rows))
     images = [
         gray(path)
         for name in SEQUENCES
         for path in (lambda p: p[:: max(1, len(p) // 3)][:3])(read(data, name))
     ]
+    rows = []
     for name in changes(2, 2):
         ours, theirs = (
             np.mean([known_change(image, changes(*image.shape)[name], e) for image in images], axis=0)
@@ -229,31 +197,28 @@ def quality_tables(data: Path, pairs: int) -> list[str]:
         )
         formats = ("{:.3f}", "{:.3f}", "{:.0f}", "{:.2f}")
         cells = [f"{f.format(a)} / {f.format(b)}" for f, a, b in zip(formats, ours, theirs, strict=True)]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return lines
+        rows.append([name, *cells])
+    return [*tables, table("known change | repeatability | precision | right matches | error, px", rows)]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
-    parser.add_argument("--output", type=Path, default=HERE / "features.md")
+    parser = parser_of(__doc__, HERE / "features.md")
+    parser.add_argument("--data", type=Path, default=DATA_DIR)
     parser.add_argument("--pairs", type=int, default=8, help="of images, per sequence and distance")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     with torch.no_grad():
         image = cv2.resize(gray(read(arguments.data, "redkitchen")[0]), (640, 480))
-        lines = ["One thread, CPU time, medians.", "", *speed_tables(image), ""]
-        lines += [
-            "Quality, torchslam / OpenCV: matches that one essential matrix explains to 1 px, and their share.",
-            "",
+        parts = [
+            "One thread, CPU time, medians.\n",
+            *speed_tables(image),
+            "Quality, torchslam / OpenCV: matches that one essential matrix explains to 1 px, and their share.\n",
             *quality_tables(arguments.data, arguments.pairs),
         ]
-    text = "\n".join(lines)
+    text = "\n".join(parts)
     print(text)
-    arguments.output.write_text(f"# Features and matching compared with OpenCV\n\n{text}\n")
+    arguments.output.write_text(f"# Features and matching compared with OpenCV\n\n{text}")
 
 
 if __name__ == "__main__":

@@ -3,14 +3,12 @@
     python -m experiments.benchmarks.geometry [--peers FOLDER] [--output FILE] [--problems 60]
 
 FOLDER holds `problems.py`, which makes the fixed problems. Times are CPU time of the thread, so that other work on
-the machine counts as little as possible, taken in turns with the peer. Prints tables and writes them to FILE.
+the machine counts as little as possible, interleaved with the peer. Prints tables and writes them to FILE.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -25,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from experiments.benchmarks.problems import PEERS, load_problems
+from experiments.common import milliseconds, parser_of, table, timed
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose
 
 HERE = Path(__file__).parent
@@ -42,13 +41,6 @@ class Errors(NamedTuple):
     translation: float
 
 
-def timed(task: Callable[[], Any]) -> tuple[float, Any]:
-    """CPU milliseconds of the thread, and the result."""
-    begin = time.thread_time()
-    result = task()
-    return 1e3 * (time.thread_time() - begin), result
-
-
 def batch_of_one(*arrays: NDArray) -> list[Tensor]:
     return [torch.from_numpy(array)[None] for array in arrays]
 
@@ -59,14 +51,14 @@ def relative(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
     for seed in range(count):
         x_1, x_2, R, t, _ = problems.two_view(seed, 500, outliers)
         options = {"max_epipolar_error": RELATIVE_THRESHOLD}
-        ms, (pose, _) = timed(
+        (pose, _), ms = timed(
             partial(poselib.estimate_relative_pose, x_1, x_2, POSELIB_CAMERA, POSELIB_CAMERA, options, {})
         )
         theirs.append(
             Errors(ms, problems.rot_err_deg(R, pose.R), problems.dir_err_deg(t, pose.t, signed=True))
         )
         one, two = batch_of_one(x_1, x_2)
-        ms, found = timed(
+        found, ms = timed(
             partial(estimate_relative_pose, one, two, CAMERA, CAMERA, threshold=RELATIVE_THRESHOLD)
         )
         T_21 = found.T_21[0].numpy()
@@ -83,12 +75,12 @@ def absolute(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
     for seed in range(count):
         points, pixels, R, t, _ = problems.pnp(seed, 300, outliers)
         options = {"max_reproj_error": ABSOLUTE_THRESHOLD}
-        ms, (pose, _) = timed(
+        (pose, _), ms = timed(
             partial(poselib.estimate_absolute_pose, pixels, points, POSELIB_CAMERA, options, {})
         )
         theirs.append(Errors(ms, problems.rot_err_deg(R, pose.R), float(np.linalg.norm(t - pose.t))))
         one, two = batch_of_one(points, pixels)
-        ms, found = timed(partial(estimate_absolute_pose, one, two, CAMERA, threshold=ABSOLUTE_THRESHOLD))
+        found, ms = timed(partial(estimate_absolute_pose, one, two, CAMERA, threshold=ABSOLUTE_THRESHOLD))
         T_cw = found.T_cw[0].numpy()
         ours.append(Errors(ms, problems.rot_err_deg(R, T_cw[:3, :3]), float(np.linalg.norm(t - T_cw[:3, 3]))))
     return ours, theirs
@@ -140,7 +132,7 @@ def models(problems: ModuleType, baseline: float, expected: str, count: int = 50
     return f"{100 * seen[expected] / count:.0f} %", f"{poses}, {ambiguous} ambiguous"
 
 
-def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, NDArray]]) -> str:
+def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, NDArray]]) -> list[str]:
     """One row: milliseconds per problem in a loop and in one call."""
     stacked = [torch.from_numpy(np.stack(part)) for part in zip(*cases, strict=True)]
 
@@ -151,12 +143,11 @@ def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, 
     def batch() -> None:
         estimate(*stacked)
 
-    times = [(timed(loop)[0], timed(batch)[0]) for _ in range(3)]
-    one, many = (statistics.median(part) / len(cases) for part in zip(*times, strict=True))
-    return f"| {what} | {one:.1f} | {many:.1f} | {one / many:.1f} |"
+    one, many = (spent / len(cases) for spent in milliseconds(loop, batch, repeats=3))
+    return [what, f"{one:.1f}", f"{many:.1f}", f"{one / many:.1f}"]
 
 
-def throughput(problems: ModuleType) -> list[str]:
+def throughput(problems: ModuleType) -> list[list[str]]:
     def absolute_of(points: Tensor, pixels: Tensor) -> Any:
         return estimate_absolute_pose(points, pixels, CAMERA, ABSOLUTE_THRESHOLD)
 
@@ -173,9 +164,9 @@ def throughput(problems: ModuleType) -> list[str]:
     ]
 
 
-def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> str:
+def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> list[str]:
     """One row: medians and means of ours and the peer's, and their ratios."""
-    cells = [f"{len(ours)}"]
+    cells = [what, f"{len(ours)}"]
     for field, digits in (("rotation", 3), ("translation", 4)):
         mine, peer = ([getattr(errors, field) for errors in group] for group in (ours, theirs))
         ratio = statistics.mean(mine) / statistics.mean(peer)
@@ -183,43 +174,43 @@ def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> str:
     cells.append(f"{max(errors.rotation for errors in ours):.2f}")
     my_ms, peer_ms = (statistics.median(errors.ms for errors in group) for group in (ours, theirs))
     cells.append(f"{my_ms:.1f} / {peer_ms:.1f} ({my_ms / peer_ms:.2f})")
-    return f"| {what} | " + " | ".join(cells) + " |"
+    return cells
 
 
 def report(problems: ModuleType, count: int) -> str:
-    header = "| problems | count | rotation, degrees | translation | worst rotation | ms |\n|---|---|---|---|---|---|"
-    lines = ["Mean errors and median times, torchslam / poselib (ratio). One thread.", "", header]
-    lines += [
-        compared(f"relative pose, {outliers:.0%} outliers", *relative(problems, outliers, count))
-        for outliers in (0.1, 0.4, 0.6)
+    rows = []
+    for what, estimate, fractions in (
+        ("relative", relative, (0.1, 0.4, 0.6)),
+        ("absolute", absolute, (0.1, 0.3, 0.6)),
+    ):
+        rows += [
+            compared(f"{what} pose, {outliers:.0%} outliers", *estimate(problems, outliers, count))
+            for outliers in fractions
+        ]
+    scenes = [
+        [name, *models(problems, baseline, expected)]
+        for name, baseline, expected in (("plane", 0.35, "homography"), ("pure rotation", 0.0, "rotation"))
     ]
-    lines += [
-        compared(f"absolute pose, {outliers:.0%} outliers", *absolute(problems, outliers, count))
-        for outliers in (0.1, 0.3, 0.6)
+    parts = [
+        "Mean errors and median times, torchslam / poselib (ratio). One thread.\n",
+        table("problems | count | rotation, degrees | translation | worst rotation | ms", rows),
+        table("scene, 50 of each, 30 % outliers | right model | poses", scenes),
+        table(
+            f"{BATCH} problems | ms each in a loop | ms each in one call | times faster", throughput(problems)
+        ),
     ]
-    lines += ["", "| scene, 50 of each, 30 % outliers | right model | poses |", "|---|---|---|"]
-    for name, baseline, expected in (("plane", 0.35, "homography"), ("pure rotation", 0.0, "rotation")):
-        lines.append(f"| {name} | " + " | ".join(models(problems, baseline, expected)) + " |")
-    lines += [
-        "",
-        f"| {BATCH} problems | ms each in a loop | ms each in one call | times faster |",
-        "|---|---|---|---|",
-    ]
-    return "\n".join([*lines, *throughput(problems)])
+    return "\n".join(parts)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, HERE / "geometry.md")
     parser.add_argument("--peers", type=Path, default=PEERS)
-    parser.add_argument("--output", type=Path, default=HERE / "geometry.md")
     parser.add_argument("--problems", type=int, default=60, help="how many of each kind")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     text = report(load_problems(arguments.peers), arguments.problems)
     print(text)
-    arguments.output.write_text(f"# Pose estimation compared with poselib\n\n{text}\n")
+    arguments.output.write_text(f"# Pose estimation compared with poselib\n\n{text}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Does a keyframe cost more the more of them the map has?
+"""Does the cost of a keyframe grow with the size of the map?
 
     python -m experiments.benchmarks.mapping [--output FILE]
 
-A camera goes along a wall of points, with keyframes of known pose; the next ones are mapped, adjusted and looked for
-among the places seen before, in maps of different sizes by turns. Prints a table and writes it to FILE.
+A camera moves along a wall of points, with keyframes of known pose. The next keyframes are mapped, adjusted and checked
+for loops, in maps of different sizes, interleaved. Prints a table and writes it to FILE.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Walk:
         self.loop_closer = LoopCloser(CAMERA, Config(), self.atlas)
 
     def look(self, index: int) -> tuple[FrameFeatures, Tensor]:
-        """What the camera sees at a step of its way, and which points of the wall these are."""
+        """The features at a step of the path, and the rows of their points."""
         T_cw = torch.eye(4, dtype=torch.float64)
         T_cw[0, 3] = -index * STEP
         first = int(index * STEP / SPACING)
@@ -87,7 +87,7 @@ class Walk:
         return view, seen
 
     def _add(self, index: int) -> None:
-        """A keyframe of the map as it was made: it sees what it can of the points, new ones are added."""
+        """Add a keyframe of the initial map with its observations and new points."""
         slam_map = self.submap.map
         view, seen = self.look(index)
         assert view.T_cw_groundtruth is not None
@@ -104,7 +104,7 @@ class Walk:
         view, seen = self.look(index)
         assert view.T_cw_groundtruth is not None
         known = self.rows[seen] >= 0
-        ids = slam_map.follow_merges(self.rows[seen[known]])  # of merged points the heirs
+        ids = slam_map.follow_merges(self.rows[seen[known]])  # replacements of merged points
         alive = slam_map.points["is_valid"][ids]
         at, ids = torch.nonzero(known)[alive, 0], ids[alive]
         eye = torch.eye(6, dtype=torch.float64)
@@ -118,11 +118,11 @@ class Walk:
             return answer
 
         keyframe = timed("mapping, bundle", self.mapper.insert, slam_map, view, estimate)
-        timed("loop_closer", self.loop_closer.add, slam_map, keyframe)
+        timed("loop closer", self.loop_closer.add, slam_map, keyframe)
         timed("local map", self.tracker.reset_to_keyframe, self.submap, keyframe)
-        timed("recognition", self.loop_closer.loop_detector.detect, self.submap, keyframe)
+        timed("loop detection", self.loop_closer.loop_detector.detect, self.submap, keyframe)
         keys = slam_map.keys
-        renumbering = timed("cull_and_compact", self.mapper.cull_and_compact, self.submap)
+        renumbering = timed("culling, compaction", self.mapper.cull_and_compact, self.submap)
         if renumbering is not None:
             self.loop_closer.remove(keys[renumbering.keyframes < 0])
             self.rows = torch.where(self.rows >= 0, renumbering.points[self.rows], -1)
@@ -148,7 +148,7 @@ def main() -> None:
     header = ["ms of one keyframe", *(f"{size} keyframes" for size in SIZES), f"{SIZES[-1]} / {SIZES[0]}"]
     text = (
         "# A keyframe in a small map and in a large one\n\nSimulated: a camera goes along a wall. One thread, "
-        f"medians of {NEXT} keyframes, CPU time of the process, the three maps by turns.\n\n"
+        f"medians of {NEXT} keyframes, CPU time of the process, the three maps interleaved.\n\n"
         "    python -m experiments.benchmarks.mapping\n\n"
         f"{table(header, rows)}"
     )

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.solvers import gradient_error, milliseconds
-from experiments.common import parser_of, table
+from experiments.benchmarks.solvers import gradient_error
+from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import rigid, sim3_exp, sim3_inverse, sim3_log, sim3_scale, so3_exp
 from torchslam.optim import PoseGraph, pose_graph_optimize
 
@@ -160,21 +160,15 @@ def main() -> None:
     parser = parser_of(__doc__, HERE / "pose_graph.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    header = [
-        "nodes, edges",
-        "start, error",
-        "error, ours / GTSAM",
-        "cost, ours / GTSAM",
-        "iterations",
-        "time, ms",
-        "ratio",
-        "our backward, ms",
-    ]
+    header = (
+        "nodes, edges | start, error | error, ours / GTSAM | cost, ours / GTSAM | iterations"
+        " | time, ms | ratio | our backward, ms"
+    )
     rows = [row(1000, 1, 7), row(1000, 4, 5), row(3000, 4, 3)]
     text = (
         "# Pose graphs\n\nA circular walk of radius 20 whose odometry is noisy and halves the scale; the last ten "
         "nodes meet the first. Similarities, least squares, float64, one thread, median CPU time of the process, "
-        "GTSAM measured in turns with ours, both to a relative decrease of 1e-8; error: of the camera centers, root "
+        "interleaved with GTSAM, both to a relative decrease of 1e-8; error: of the camera centers, root "
         "mean square.\n\n"
         "    python -m experiments.benchmarks.pose_graph\n\n"
         f"{table(header, rows)}\n"

@@ -1,10 +1,16 @@
-"""The fixed problems for measuring peers, in a folder next to the repository."""
+"""Problems of the benchmarks: the fixed ones, in a folder next to the repository, and matches of two images."""
 
 from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+from torch import Tensor
+
+from torchslam.features import match
+from torchslam.types import Features
 
 PEERS = Path(__file__).parents[3] / "shared" / "peers"
 
@@ -17,3 +23,12 @@ def load_problems(folder: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def match_pixels(first: Features, second: Features, **options: Any) -> tuple[Tensor, Tensor]:
+    """Match the first image of each; return the pixels (M, 2) of the matches in both, float64."""
+    matches = match(first, second, **options)
+    rows = matches.mask[0]
+    pixels_1 = first.keypoints[0][matches.indices_1[0][rows]]
+    pixels_2 = second.keypoints[0][matches.indices_2[0][rows]]
+    return pixels_1.double(), pixels_2.double()

@@ -8,14 +8,12 @@ and their standard deviations over the seeds. Every estimator gets the same matc
 and by ratio, undistorted. The error of a pair is the larger of those of rotation and of the translation's direction,
 infinite where an estimator gives no pose; "auto" gives one where it says `success`, the others almost always. "auto,
 else essential" takes that of the essential matrix where it does not.
-Pairs whose true baseline is short beside what the ground truth is known to have no true direction and are left out.
-Times are CPU time of the thread, so that other work on the machine counts as little as possible, taken in turns with
-the peers.
+Pairs whose baseline is not much longer than the error of the ground truth have no true direction and are excluded.
+Times are CPU time of the thread, so that other work on the machine counts as little as possible; peers are interleaved.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import time
@@ -33,12 +31,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from experiments.benchmarks.problems import match_pixels
+from experiments.common import DATA_DIR, parser_of, table
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
-from torchslam.features import ORB, match
+from torchslam.features import ORB
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
 from torchslam.geometry.relative_pose_search import Model
-from torchslam.types import Features
 
 HERE = Path(__file__).parent
 # Sequences with the least baseline in meters whose direction the ground truth determines to some degrees: several times
@@ -100,15 +99,6 @@ def pairs_of(sequence: Sequence, least_baseline: float, count: int) -> list[Pair
         if len(pixels_1) >= MIN_MATCHES:
             pairs.append(Pair(sequence.name, (first, second), pixels_1, pixels_2, T_21.double(), camera))
     return pairs
-
-
-def match_pixels(first: Features, second: Features) -> tuple[Tensor, Tensor]:
-    """Pixels (M, 2) of the matches in both images."""
-    matches = match(first, second)
-    rows = matches.mask[0]
-    pixels_1 = first.keypoints[0][matches.indices_1[0][rows]]
-    pixels_2 = second.keypoints[0][matches.indices_2[0][rows]]
-    return pixels_1.double(), pixels_2.double()
 
 
 def undistorted(pixels: Tensor, camera: Camera) -> Tensor:
@@ -217,7 +207,7 @@ class Outcome(NamedTuple):
 def measured(
     pairs: list[Pair], estimators: dict[str, Estimator], seeds: int
 ) -> dict[tuple[str, float], Outcome]:
-    """Every estimator at every threshold, in turns."""
+    """Every estimator at every threshold, interleaved."""
     outcomes = {(name, threshold): Outcome([], []) for name in estimators for threshold in THRESHOLDS}
     for seed in range(seeds):
         for outcome in outcomes.values():
@@ -242,35 +232,29 @@ def report(pairs: list[Pair], seeds: int) -> str:
     }
     outcomes = measured(pairs, estimators, seeds)
     names = [f"{name} {len(list(group))}" for name, group in groupby(pair.sequence for pair in pairs)]
-    lines = [
-        f"{len(pairs)} pairs ({', '.join(names)}), {', '.join(map(str, GAPS_S))} s apart; AUC at "
-        f"{', '.join(map(str, ANGLES))} degrees, percent, mean and standard deviation over {seeds} seeds. One thread.",
-        "",
-        "| threshold, px | " + " | ".join(f"{threshold:g}" for threshold in THRESHOLDS) + " |",
-        "|---" * (len(THRESHOLDS) + 1) + "|",
-    ]
+    thresholds = [f"{threshold:g}" for threshold in THRESHOLDS]
+    areas = [[name, *(outcomes[name, each].areas() for each in THRESHOLDS)] for name in estimators]
+    times = []
     for name in estimators:
-        cells = [outcomes[name, threshold].areas() for threshold in THRESHOLDS]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    lines += ["", "| CPU ms per pair: mean, median | " + " | ".join(f"{x:g}" for x in THRESHOLDS) + " |"]
-    lines.append("|---" * (len(THRESHOLDS) + 1) + "|")
-    for name in estimators:
-        times = [outcomes[name, threshold].ms for threshold in THRESHOLDS]
-        cells = [f"{statistics.mean(ms):.1f}, {statistics.median(ms):.1f}" for ms in times]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        spent = [outcomes[name, threshold].ms for threshold in THRESHOLDS]
+        times.append([name, *(f"{statistics.mean(ms):.1f}, {statistics.median(ms):.1f}" for ms in spent)])
     models: tuple[Model, ...] = ("auto", "essential")
     for model in models:
         cells = [f"{batched_ms(pairs, threshold, model):.1f}" for threshold in THRESHOLDS]
-        lines.append(f"| torchslam, {model}, one call per sequence | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        times.append([f"torchslam, {model}, one call per sequence", *cells])
+    parts = [
+        f"{len(pairs)} pairs ({', '.join(names)}), {', '.join(map(str, GAPS_S))} s apart; AUC at "
+        f"{', '.join(map(str, ANGLES))} degrees, percent, mean and standard deviation over {seeds} seeds. One "
+        "thread.\n",
+        table(["threshold, px", *thresholds], areas),
+        table(["CPU ms per pair: mean, median", *thresholds], times),
+    ]
+    return "\n".join(parts)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=HERE.parents[2] / "shared" / "data")
-    parser.add_argument("--output", type=Path, default=HERE / "relative_pose.md")
+    parser = parser_of(__doc__, HERE / "relative_pose.md")
+    parser.add_argument("--data", type=Path, default=DATA_DIR)
     parser.add_argument("--pairs", type=int, default=60, help="of images, per sequence")
     parser.add_argument("--seeds", type=int, default=3)
     arguments = parser.parse_args()
@@ -282,7 +266,7 @@ def main() -> None:
             pairs += pairs_of(open_sequence(arguments.data / name), least_baseline, arguments.pairs)
         text = report(pairs, arguments.seeds)
     print(text)
-    arguments.output.write_text(f"# Relative pose of real pairs\n\n{text}\n")
+    arguments.output.write_text(f"# Relative pose of real pairs\n\n{text}")
 
 
 if __name__ == "__main__":

@@ -7,8 +7,6 @@ FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and w
 
 from __future__ import annotations
 
-import argparse
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +18,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.problems import PEERS, load_problems
+from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.geometry.robust import Kernel
 from torchslam.optim import BundleProblem, bundle_adjust, refine_pose
@@ -35,7 +34,7 @@ class Row(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """How long pycolmap took, in how many iterations, what it found, and the RMSE it reached, px."""
+    """Time, iterations and solution of pycolmap, and its RMSE in px."""
 
     solve_ms: float
     iterations: int
@@ -46,22 +45,6 @@ class Peer(NamedTuple):
 
 def camera() -> Camera:
     return Camera.pinhole(FOCAL, FOCAL, *CENTER, size=SIZE)
-
-
-def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
-    """Median time of each task, taken in turns so that a busy machine slows all of them alike.
-
-    A task may return a number: the milliseconds that count.
-    """
-    times: list[list[float]] = [[] for _ in tasks]
-    for repeat in range(repeats + 2):
-        for task, record in zip(tasks, times, strict=True):
-            begin = time.process_time()
-            counted = task()
-            elapsed = 1e3 * (time.process_time() - begin)
-            if repeat >= 2:
-                record.append(counted if isinstance(counted, float) else elapsed)
-    return [statistics.median(record) for record in times]
 
 
 def central_difference(
@@ -325,24 +308,17 @@ def benchmark_bundle(problems: ModuleType) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, HERE / "solvers.md")
     parser.add_argument("--peers", type=Path, default=PEERS)
-    parser.add_argument("--output", type=Path, default=HERE / "solvers.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     problems = load_problems(arguments.peers)
     rows = benchmark_pose(problems) + benchmark_bundle(problems)
-    lines = [
-        "| what | reached | asked for, or the peer |",
-        "|---|---|---|",
-        *(f"| {' | '.join(row)} |" for row in rows),
-    ]
-    print("\n".join(lines))
+    text = table("what | reached | required, or the peer", rows)
+    print(text)
     arguments.output.write_text(
-        "# Solvers\n\nOne thread, float64, median CPU time of the process, peers measured in turns with ours: "
-        "`python -m experiments.benchmarks.solvers`.\n\n" + "\n".join(lines) + "\n"
+        "# Solvers\n\nOne thread, float64, median CPU time of the process, interleaved with the peers: "
+        f"`python -m experiments.benchmarks.solvers`.\n\n{text}"
     )
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from experiments.common import DATA_DIR, write_between
+from experiments.common import DATA_DIR, parser_of, write_between
 from experiments.recordings import DEFAULT, KEPT_ORB, add_choices, outcomes_of, report
 
 FRONT_ENDS = {"xfeat": ("XFeat", "xfeat.safetensors"), "aliked": ("ALIKED", "aliked-t16.safetensors")}
@@ -14,7 +13,7 @@ ARMS = (DEFAULT, *(name + words for name in FRONT_ENDS for words in MATCHERS))
 
 
 def arms(folder: Path) -> dict[str, tuple[str, ...]]:
-    """The settings of each, by its name; those without weights in the folder are left out, with a word about it."""
+    """The settings of each arm; arms whose weights are not in the folder are skipped with a message."""
     found: dict[str, tuple[str, ...]] = {DEFAULT: KEPT_ORB}
     for name, (part, file) in FRONT_ENDS.items():
         weights = (folder / file).absolute()
@@ -27,7 +26,7 @@ def arms(folder: Path) -> dict[str, tuple[str, ...]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     add_choices(parser, ARMS)
     parser.add_argument("--weights", type=Path, default=DATA_DIR.parent / "weights")
     arguments = parser.parse_args()

@@ -1,22 +1,21 @@
-"""How far off are the keypoints of a front end? By what whole runs leave of their errors. See README.md.
+"""Keypoint noise of a front end, from the residuals of whole runs. See README.md.
 
     python -m experiments.front_ends.noise shelf_bin fr2_desk_20 --front-ends orb xfeat aliked
 
-A keyframe's keypoints against the final map; points that few keyframes see follow their noise, so only those that four
-or more see count, and what they follow is made up for. From the median of the squared errors, which outliers do not
-move, as that of a chi-square distribution of two degrees of freedom.
+The residuals are those of keyframes in the final map. Points with few observations follow the noise, so only points
+with four or more count, and the degrees of freedom are corrected. The noise follows from the median squared error,
+assuming a chi-square distribution with two degrees of freedom, so that outliers do not matter.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 
 import torch
 
-from experiments.common import DATA_DIR, sequences, table
-from experiments.front_ends.run import FRONT_ENDS, NAMES
+from experiments.common import DATA_DIR, parser_of, sequences, table
+from experiments.front_ends.run import FRONT_ENDS, NAMES, overrides
 from torchslam import SLAM, load_config
 from torchslam.geometry import squared_reprojection_errors, transform
 from torchslam.optim.run_graph import ObservationGraph
@@ -40,7 +39,7 @@ def noise_px(graph: ObservationGraph, scales: torch.Tensor) -> tuple[float, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = parser_of(__doc__)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument(
         "--front-ends", nargs="*", default=["orb", "xfeat", "aliked"], choices=list(FRONT_ENDS)
@@ -51,12 +50,12 @@ def main() -> None:
     rows = []
     for name in arguments.names:
         for kind in arguments.front_ends:
-            overrides = [f"features.kind={kind}"]
-            if FRONT_ENDS[kind]:
-                overrides.append(f'features.weights="{arguments.weights / FRONT_ENDS[kind]}"')
+            settings = overrides(kind, arguments.weights)
+            if settings is None:
+                continue
             for sequence in sequences([name]):
                 part = sequence.part(0, min(arguments.limit, len(sequence)))
-                run = SLAM(part.camera, load_config(None, overrides)).run(part)
+                run = SLAM(part.camera, load_config(None, settings)).run(part)
                 if run.main is None:
                     rows.append([name, kind, "no map", "", ""])
                     continue

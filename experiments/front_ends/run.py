@@ -1,32 +1,23 @@
-"""Which front end should one take? See README.md."""
+"""Which front end is best? See README.md."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from experiments.common import (
-    DATA_DIR,
-    add_engine,
-    available,
-    metrics_of_runs,
-    row_of,
-    table,
-    write_between,
-)
+from experiments.common import DATA_DIR, add_engine, available, parser_of, row_of, tabulate_runs
+from torchslam.batch import Columns
 
 NAMES = ["shelf_bin", "fr2_desk_20", "kitti07", "machine_hall"]
 FRONT_ENDS = {"orb": "", "opencv-orb": "", "xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument("--front-ends", nargs="*", default=list(FRONT_ENDS), choices=list(FRONT_ENDS))
     parser.add_argument(
         "--weights", type=Path, default=DATA_DIR.parent / "weights", help="folder of the weights"
     )
-    parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "front_ends")
     arguments = parser.parse_args()
     settings = {
@@ -36,17 +27,12 @@ def main() -> None:
     }
     cases = [(name, kind) for name in available(arguments.names) for kind in settings]
     runs = [row_of(name, kind, overrides=settings[kind]) for name, kind in cases]
-    rows = []
-    for (name, kind), result in zip(cases, metrics_of_runs(runs, arguments), strict=True):
-        rows.append(row(name, kind, result))
-        print(*rows[-1], sep="\t", flush=True)
-    text = table(["sequence", "front end", "posed", "ATE (m)", "features (ms)", "frames/s"], rows)
-    if not arguments.no_readme:
-        write_between(Path(__file__).parent / "README.md", text)
+    header = "sequence | front end | posed | ATE (m) | features (ms) | frames/s"
+    tabulate_runs(runs, arguments, header, lambda number, found: [*cases[number], *cells(found)], __file__)
 
 
 def overrides(kind: str, folder: Path) -> list[str] | None:
-    """The settings of a front end; None, and a word about it, where its weights are not in the folder."""
+    """The settings of a front end; None, with a message, if its weights are not in the folder."""
     if not FRONT_ENDS[kind]:
         return [f"features.kind={kind}"]
     weights = (folder / FRONT_ENDS[kind]).absolute()
@@ -56,14 +42,12 @@ def overrides(kind: str, folder: Path) -> list[str] | None:
     return [f"features.kind={kind}", f'features.weights="{weights}"']
 
 
-def row(name: str, kind: str, result: dict) -> list[str]:
+def cells(found: Columns) -> list[str]:
     return [
-        name,
-        kind,
-        f"{result['posed']} of {result['frames']}",
-        f"{result['ate_m']:.4f}" if "ate_m" in result else result["failure"],
-        f"{result['stage_ms']['features']['median']:.0f}",
-        f"{result['fps']:.1f}",
+        f"{found['posed']} of {found['frames']}",
+        f"{found['ate_m']:.4f}" if "ate_m" in found else found["failure"],
+        f"{found['stage_ms']['features']['median']:.0f}",
+        f"{found['fps']:.1f}",
     ]
 
 

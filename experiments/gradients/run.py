@@ -1,13 +1,12 @@
-"""How right, how fast and how large are the gradients of the ways to differentiate through a pose refinement?
+"""How accurate, fast and large are the gradients of a pose refinement, by mode?
 
     python experiments/gradients/run.py [--quick]
 
-Writes results.md and gradients.png beside this file. Float64, one thread, robust kernel (cauchy) throughout.
+Writes results.md and gradients.png next to this file. Float64, one thread, robust kernel (cauchy) throughout.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import matplotlib
 import torch
 from torch import Tensor
 
+from experiments.common import parser_of, table
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
 from torchslam.optim import Backward, RefinedPose, refine_pose
 
@@ -145,11 +145,6 @@ def cost(points: int, mode: Backward, iterations: int, repeats: int) -> tuple[fl
     return statistics.median(forward[1:]), statistics.median(backward[1:]), sum(kept.values()) / 1024
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def label(mode: Backward, iterations: int) -> str:
     return f"{mode}, {iterations} iterations" if mode == "unroll" else mode
 
@@ -181,9 +176,7 @@ def draw(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer problems and repeats")
     quick = parser.parse_args().quick
     torch.set_num_threads(1)
@@ -216,9 +209,8 @@ def main() -> None:
     text = (
         "Largest relative error over points, pixels, weights, camera and scale; median over problems of 300 points:\n\n"
         + table(["noise, outliers", *names], accuracy)
-        + "\n\nCost of one problem, medians, CPU time of the process:\n\n"
-        + table(["mode", "points", "iterations", "forward [ms]", "backward [ms]", "kept [KiB]"], costs)
-        + "\n"
+        + "\nCost of one problem, medians, CPU time of the process:\n\n"
+        + table("mode | points | iterations | forward [ms] | backward [ms] | kept [KiB]", costs)
     )
     print(text)
     (HERE / "results.md").write_text(text)

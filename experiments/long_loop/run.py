@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import table, write_between
+from experiments.common import parser_of, table, write_between
 from torchslam.config import load_config
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.system.front_end import Simulated
@@ -31,7 +30,7 @@ def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=3000)
     frames = parser.parse_args().frames
     torch.set_num_threads(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import resource
 import sys
 import time
@@ -11,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import DATA_DIR, table
+from experiments.common import DATA_DIR, parser_of, table, write_between
 from torchslam.config import Config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
@@ -53,7 +52,7 @@ def megabytes() -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=5000)
     parser.add_argument("--sequence", default=str(DATA_DIR / "redkitchen"))
     options = parser.parse_args()
@@ -91,10 +90,7 @@ def main() -> None:
         f"ATE {evaluate(run.trajectory, sequence.groundtruth).ate_m:.4f} m.\n"
     )
     header = ["frames", "median (ms)", "mean (ms)", "keyframes", "points", "rows of points", "peak (MB)"]
-    readme = Path(__file__).parent / "README.md"
-    head, _, rest = readme.read_text(encoding="utf-8").partition(START)
-    _, _, tail = rest.partition(END)
-    readme.write_text(f"{head}{START}{table(header, rows)}{summary}{END}{tail}", encoding="utf-8")
+    write_between(Path(__file__).parent / "README.md", table(header, rows) + summary, START, END)
     print(summary)
 
 

@@ -5,7 +5,6 @@ python -m experiments.paper.run [SEQUENCE ...] [--output DIR]
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from experiments.common import DATA_DIR, add_engine, metrics_of_runs, row_of, table, write_between
+from experiments.common import DATA_DIR, add_engine, metrics_of_runs, parser_of, row_of, table, write_between
 from torchslam.batch.result_store import RUNS
 from torchslam.io.results import PLOTS
 
@@ -36,7 +35,7 @@ HEADER = ["sequence", "features", "posed", "start", "keyframes", "points", "ATE 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "names", nargs="*", metavar="SEQUENCE", help="all by default, and then into the README"
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from experiments.common import DATA_DIR
+from experiments.common import DATA_DIR, place_of
 from torchslam.data import open_sequence
 from torchslam.data.formats.image_file import read_gray
 from torchslam.features import ORB
@@ -25,7 +25,7 @@ SEQUENCES = {
 }
 MEASURED = ("redkitchen", "machine_hall", "room")
 LOOKALIKE_IMAGES = 84
-LOOKALIKE_GAP = 20  # images of one walk that follow each other are no question
+LOOKALIKE_GAP = 20  # pairs of one walk that are closer in time are not evaluated
 GAP = 10  # the same for frames of a sequence, as they are thinned out here
 NEAR_M, NEAR_DEG = 0.4, 25.0  # the same place
 FAR_M, FAR_DEG = 1.5, 60.0  # certainly another view; pairs in between count neither way
@@ -48,7 +48,7 @@ def collect() -> Collection:
     found = [orb(read_gray(file, file.name)) for file in files]
     ranges, T_cw = {"lookalike": range(len(found))}, {}
     for name, (path, stride) in SEQUENCES.items():
-        sequence = open_sequence(path if ":" in path else DATA_DIR / path, stride=stride)
+        sequence = open_sequence(place_of(path), stride=stride)
         start = len(found)
         found += [orb(frame.image) for frame in sequence]
         ranges[name] = range(start, len(found))
@@ -62,7 +62,7 @@ def frame_pose(pose: Tensor | None) -> Tensor:
 
 
 def lookalike_truth() -> tuple[Tensor, Tensor]:
-    """Two (84, 84) masks: the pairs of the same place, and all pairs that are a question; later image first."""
+    """Two (84, 84) masks: the pairs of the same place, and all evaluated pairs; later image first."""
     same = torch.zeros(LOOKALIKE_IMAGES, LOOKALIKE_IMAGES, dtype=torch.bool)
     for line in (DATA_DIR / "lookalike" / "pairs.txt").read_text(encoding="utf-8").splitlines():
         if line and not line.startswith("#"):

@@ -8,13 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from experiments.benchmarks.problems import match_pixels
 from experiments.common import table, timed, write_between
 from experiments.places import alternatives
-from experiments.places.geometric_check import inliers_of_pairs
 from experiments.places.images import MEASURED, Collection, collect, lookalike_truth, sequence_truth
 from experiments.places.train import DESCRIPTORS, k_majority, rendered_descriptors, sample
+from torchslam.geometry import Camera, estimate_relative_pose
 from torchslam.loop_closing import KeyframeDatabase
-from torchslam.loop_closing.keyframe_database import rendered_words
+from torchslam.loop_closing.keyframe_database import default_vocabulary
 from torchslam.types import Features
 
 HEADER = ["", "lookalike: AP, recall at precision 1, recall@1"]
@@ -23,6 +24,11 @@ SIZES = (500, 1000, 3000)
 QUERIES = 30
 COUNTS = (10, 12, 15, 20, 25, 30, 40, 60)
 BEST = 3
+SIZE = (512, 384)
+FOCAL = 0.9 * SIZE[0]  # the camera is unknown: a guess
+THRESHOLD = 2.0  # pixels, wide for a guessed camera
+MIN_MATCHES = 10  # fewer are not verified by RANSAC
+MAX_SAMPLES = 1000
 WALK = 40  # images of one walk of lookalikes
 LEAST_EXPECTED = 0.02  # the median score with the previous image is 0.05 to 0.16, by sequence
 
@@ -69,7 +75,7 @@ def relative_scores(keys: Tensor, scores: Tensor, reference: Tensor) -> Tensor:
 def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:
     """The candidates, by name."""
     rendered = sample(rendered_descriptors(), DESCRIPTORS)
-    words = rendered_words(rendered.device)
+    words = default_vocabulary(rendered.device)
     # The words of a single image of redkitchen.
     one = alternatives.first_words(features, len(lookalike_truth()[0]))
     return [
@@ -89,10 +95,10 @@ def ways(features: Features) -> list[tuple[str, Callable[[], Tensor]]]:
 
 def quality(scores: Tensor, collection: Collection) -> list[str]:
     """The cells of a row, from scores (N, N) of all images with all."""
-    same, asked = lookalike_truth()
+    same, is_pair = lookalike_truth()
     part = scores[: len(same), : len(same)]
-    precision, recall = average_precision(part[asked], same[asked])
-    hit = recall_at(part.masked_fill(~asked, -1.0), same, 1)
+    precision, recall = average_precision(part[is_pair], same[is_pair])
+    hit = recall_at(part.masked_fill(~is_pair, -1.0), same, 1)
     cells = [f"{precision:.2f}, {recall:.2f}, {hit:.2f}"]
     for name in MEASURED:
         where = collection.ranges[name]
@@ -134,37 +140,49 @@ def costs(features: Features) -> str:
         descriptors, mask = features.descriptors[image] ^ noise, features.mask[image]
         adding.append(timed(lambda k=key, d=descriptors, m=mask: memory.add(k, d, m))[1])  # type: ignore[misc]
         if len(memory) in SIZES:
-            asked = [features[image : image + 1] for image in range(1, 10 * QUERIES, 10)]
-            asking = [timed(lambda q=q: memory.query(q.descriptors[0], q.mask[0]))[1] for q in asked]  # type: ignore[misc]
+            queries = [features[image : image + 1] for image in range(1, 10 * QUERIES, 10)]
+            query_ms = [timed(lambda q=q: memory.query(q.descriptors[0], q.mask[0]))[1] for q in queries]  # type: ignore[misc]
             megabytes = sum(x.element_size() * x.nelement() for x in (memory._codes, memory._used)) / 1e6
-            cells = (sorted(adding)[len(adding) // 2], min(asking), sorted(asking)[QUERIES // 2])
+            cells = (sorted(adding)[len(adding) // 2], min(query_ms), sorted(query_ms)[QUERIES // 2])
             rows.append([str(len(memory)), *(f"{cell:.1f}" for cell in cells), f"{megabytes:.0f}"])
     return table(["keyframes", "add (ms)", "query, quickest (ms)", "query, median (ms)", "memory (MB)"], rows)
+
+
+def inliers_of_pairs(features: Features) -> Tensor:
+    """(84, 84) int64: inliers of the relative pose of each evaluated pair, 0 without a pose."""
+    _, is_pair = lookalike_truth()
+    inliers = torch.zeros(is_pair.shape, dtype=torch.int64)
+    center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+    params = torch.tensor((FOCAL, FOCAL, *center), dtype=torch.float64)
+    camera = Camera("pinhole", params, SIZE)
+    for later, earlier in is_pair.nonzero().tolist():
+        first, second = features[later : later + 1], features[earlier : earlier + 1]
+        pixels_1, pixels_2 = match_pixels(first, second)
+        if len(pixels_1) < MIN_MATCHES:
+            continue
+        pose = estimate_relative_pose(
+            pixels_1[None], pixels_2[None], camera, camera, THRESHOLD, max_samples=MAX_SAMPLES
+        )
+        inliers[later, earlier] = int(pose.inliers.sum())
+    return inliers
 
 
 def checks(features: Features, scores: Tensor) -> str:
     """A table of lookalike pairs by the number of inliers of their relative pose."""
     inliers = inliers_of_pairs(features)
-    same, asked = lookalike_truth()
-    candidates = scores.masked_fill(~asked, -1.0).topk(BEST, dim=1).indices
-    best = asked & torch.zeros_like(asked).scatter(1, candidates, True)
+    same, is_pair = lookalike_truth()
+    candidates = scores.masked_fill(~is_pair, -1.0).topk(BEST, dim=1).indices
+    best = is_pair & torch.zeros_like(is_pair).scatter(1, candidates, True)
     # Each walk has 40 images. Pairs beyond those marked by two images more may still see the same stretch.
     number = torch.arange(len(same))
     away = ((number[:, None] - number + WALK // 2) % WALK - WALK // 2).abs()
     elsewhere = away > 4
-    parts = (asked & same, asked & ~same, asked & ~same & elsewhere, best & same, best & ~same)
+    parts = (is_pair & same, is_pair & ~same, is_pair & ~same & elsewhere, best & same, best & ~same)
     rows = [["all", *(str(int(part.sum())) for part in parts)]]
     for count in COUNTS:
         cells = (str(int((part & (inliers >= count)).sum())) for part in parts)
         rows.append([f"{count} inliers", *cells])
-    header = [
-        "at least",
-        "true",
-        "false",
-        "false, further away",
-        "true, of the 3 best",
-        "false, of the 3 best",
-    ]
+    header = "at least | true | false | false, further away | true, of the 3 best | false, of the 3 best"
     return table(header, rows)
 
 

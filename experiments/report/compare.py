@@ -1,4 +1,4 @@
-"""What a report has against the ones before it: figures that got worse by more than a tenth."""
+"""Compare a report with earlier ones: metrics that got worse by more than a tenth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ WORSE = 1.1
 TIMES = ("cpu_s", "ms_median", "ms")  # the 95th percentile is of too few frames to compare
 ERRORS = ("ate", "error")
 NOTHING = 1e-9
-"""Below this an error is rounding: a tenth of it means nothing."""
+"""An error below this is rounding and is not compared."""
 
 
 def compare(record: Record, history: Sequence[Record]) -> list[str]:
-    """A line for every figure that is worse by a tenth than the last one that was not itself worse.
+    """A line for every metric that is worse by a tenth than the last one that was not itself worse.
 
-    Errors and posed frames are compared with those of any machine, times with those of the same one, and only where
-    it was quiet both times. A figure that got worse stays the matter of every later report until one is accepted.
+    Errors and posed frames are compared across machines, times only on the same machine when it was idle both times.
+    A regression is reported again until it is accepted.
     """
     found = []
     for kind in ("sequences", "benchmarks"):
@@ -52,7 +52,7 @@ def same_bytes(record: Record, history: Sequence[Record]) -> dict[str, bool]:
 def _before(
     record: Record, history: Sequence[Record], kind: str, name: str, is_timed: bool = False
 ) -> Iterator[Record]:
-    """Those records that a figure is compared with, newest first."""
+    """The records that a metric is compared with, newest first."""
     for earlier in reversed(history):
         is_bad = any(words.startswith(f"{name}: ") for words in earlier.get("worse", ()))
         if name not in earlier[kind] or (is_bad and not earlier.get("accepted")):
@@ -69,12 +69,12 @@ def _accuracy(new: Record, old: Record) -> Iterator[str]:
         if new["posed"] * WORSE < old["posed"] * new["frames"] / old["frames"]:
             yield f"posed {new['posed']} of {new['frames']}, was {old['posed']} of {old['frames']}"
         if old["posed"] == 0 < new["posed"]:
-            yield f"posed {new['posed']} frames where no map is to be had, was 0"
+            yield f"posed {new['posed']} frames of a sequence without a map, was 0"
     for figure in ERRORS:
         if figure not in old:
             continue
         if figure not in new:
-            yield f"{figure} cannot be told, was {old[figure]:.6g}"
+            yield f"{figure} is undefined, was {old[figure]:.6g}"
         elif new[figure] > WORSE * old[figure] + NOTHING:
             yield f"{figure} {new[figure]:.6g}, was {old[figure]:.6g} ({_times_as_much(new[figure], old[figure])})"
 

@@ -28,8 +28,8 @@ INTRODUCTION = """\
 
 `make report` runs every available sequence with the default configuration, and the quick benchmarks, appends one
 line to `docs/figures/history.jsonl` (commit, machine, versions, figures, hash of the bytes of each trajectory), and
-draws this page anew. It fails where a figure is worse by more than a tenth than the last one: errors and posed frames
-on any machine, times on the same one, when it was quiet both times. `--accept REASON` accepts what got worse.
+regenerates this page. It fails if a figure is more than a tenth worse than the last one: errors and posed frames on any
+machine, times only if the same machine was idle both times. `--accept REASON` accepts figures that got worse.
 """
 
 
@@ -64,11 +64,11 @@ def _draw_one(axes: Axes, name: str, records: list[Record]) -> None:
         for record, each in zip(records, figures, strict=True)
     ]
     if not all(map(math.isnan, seconds)):
-        beside = axes.twinx()
-        beside.plot(seconds, ".--", color=ACCENT, linewidth=0.8, markersize=3)
-        beside.set_ylim(0, 1.25 * max(value for value in seconds if not math.isnan(value)))
-        beside.set_ylabel("CPU, s", color=ACCENT)
-        beside.grid(False)
+        right = axes.twinx()
+        right.plot(seconds, ".--", color=ACCENT, linewidth=0.8, markersize=3)
+        right.set_ylim(0, 1.25 * max(value for value in seconds if not math.isnan(value)))
+        right.set_ylabel("CPU, s", color=ACCENT)
+        right.grid(False)
 
 
 def page(history: list[Record]) -> str:
@@ -78,24 +78,16 @@ def page(history: list[Record]) -> str:
         return "\n".join([*lines, "There is no report yet.", ""])
     lines += ["![ATE and CPU time of every sequence, report by report](images/history.png)", ""]
     lines += [
-        "The newest figures of each; times are of the processor, and in brackets where the machine was not quiet.",
+        "The newest figures of each sequence and benchmark. Times are CPU times, in parentheses if the machine was "
+        "busy.",
         "",
     ]
     newest: dict[str, Record] = {}
     for record in history:
         newest |= dict.fromkeys(record["sequences"], record)
-    header = [
-        "sequence",
-        "posed",
-        "ATE",
-        "of the extent",
-        "keyframes",
-        "CPU, s",
-        "median, ms",
-        "95 %, ms",
-        "commit",
-        "bytes",
-    ]
+    header = (
+        "sequence | posed | ATE | of the extent | keyframes | CPU, s | median, ms | 95 %, ms | commit | bytes"
+    )
     lines.append(table(header, [_row(name, record) for name, record in newest.items()]))
     measured: dict[str, Record] = {}
     for record in history:

@@ -26,7 +26,7 @@ Record = dict[str, Any]
 
 
 def beginning() -> Record:
-    """What is known before anything was run. Raises SystemExit outside of a git checkout."""
+    """The record before any run. Raises SystemExit outside of a git checkout."""
     return {
         "time": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         **commit(),
@@ -49,7 +49,7 @@ def commit() -> Record:
 
 
 def machine() -> str:
-    """What its times are of: processor, how many of them, system."""
+    """Processor, number of processors and system, which times depend on."""
     processor = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -73,7 +73,7 @@ def versions() -> dict[str, str]:
 
 
 def is_quiet(record: Record) -> bool:
-    """Whether its times can be compared with those of another record of the same machine."""
+    """Whether the times of a record can be compared with others of the same machine."""
     return record["load"] is not None and record["load"] <= QUIET
 
 

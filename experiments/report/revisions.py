@@ -8,7 +8,6 @@ Both revisions run in turn on this machine, one process and one thread each, wit
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.benchmarks.slam.run import RECORDINGS, Recording
-from experiments.common import DATA_DIR, table
+from experiments.common import DATA_DIR, parser_of, table
 from experiments.report.record import ROOT
 
 WORKING_TREE = "."
@@ -41,9 +40,7 @@ print(json.dumps({"posed": len(poses), "frames": len(sequence), "ate": ate, "ms"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("before", metavar="REV_A", help="a git revision, or . for the working tree")
     parser.add_argument("after", metavar="REV_B", help="likewise")
     parser.add_argument("names", nargs="*", default=[recording.name for recording in RECORDINGS])
@@ -62,17 +59,7 @@ def main() -> None:
                     compared(recording.name, [pair[0] for pair in pairs], [pair[1] for pair in pairs])
                 )
                 print(*rows[-1], sep="\t", flush=True)
-    header = [
-        "sequence",
-        "posed A, B",
-        "ATE A, m",
-        "ATE B, m",
-        "B / A",
-        "ms a frame A",
-        "B",
-        "B / A",
-        "poses",
-    ]
+    header = "sequence | posed A, B | ATE A, m | ATE B, m | B / A | ms a frame A | B | B / A | poses"
     print("\n" + table(header, rows))
 
 

@@ -9,7 +9,6 @@ Appends a line to docs/figures/history.jsonl and draws docs/history.md. Exit sta
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from experiments.common import parser_of
 from experiments.report.compare import compare, missing, same_bytes
 from experiments.report.draw import DOCS, write
 from experiments.report.quick import BENCHMARKS
@@ -28,9 +28,7 @@ GOT_WORSE = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("names", nargs="*", default=list(NAMES), help=f"default: {', '.join(NAMES)}")
     parser.add_argument(
         "--accept", metavar="REASON", help="why figures that got worse are right; in the history"

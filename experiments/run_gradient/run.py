@@ -11,11 +11,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
 import torch
 from torch import Tensor
 
-from experiments.common import sequences, table, write_between
+from experiments.common import parser_of, sequences, table, write_between
 from torchslam.config import load_config
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.trajectories import interpolate_poses
@@ -24,16 +23,13 @@ from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
 from torchslam.system.slam import SLAM
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
 MEASURES = ("adjust from a disturbed start", "adjust", "adjust and differentiate")
 
 
 def graph_of(sequence: Sequence) -> ObservationGraph:
-    """The graph of a run over the sequence, from an earlier time if there is one."""
+    """The graph of a run over the sequence, cached."""
     file = RESULTS / f"{sequence.name}.safetensors"
     if not file.exists():
         print(f"running {sequence.name}", flush=True)
@@ -50,7 +46,7 @@ def truth_of(graph: ObservationGraph, sequence: Sequence) -> tuple[Tensor, Tenso
 
 
 def disturbed(graph: ObservationGraph) -> ObservationGraph:
-    """A start that is off by about half a degree, by 1 % of the median depth, and by 2 % of every point's place."""
+    """Perturb a graph by about half a degree, 1 % of the median depth, and 2 % of every point's position."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -72,7 +68,7 @@ def with_leaves(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Tens
 def measure(name: str, sequence: Sequence) -> dict[str, float]:
     """Seconds of one thread, and the memory beyond that of the graph in MiB, of one of `MEASURES`.
 
-    To be called once per process, so that nothing that was freed before is used again unseen.
+    Call this once per process, since freed memory is reused without raising the peak.
     """
     graph = graph_of(sequence)
     T_cw, known = truth_of(graph, sequence)
@@ -97,7 +93,7 @@ def measure(name: str, sequence: Sequence) -> dict[str, float]:
 
 
 def _forget_peak() -> None:
-    """Let the peak of this process's memory begin anew (Linux)."""
+    """Reset the peak memory of this process (Linux)."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
@@ -116,22 +112,32 @@ def measured(name: str, sequence: str, repetitions: int) -> dict[str, float]:
     return {key: statistics.median(result[key] for result in results) for key in results[0]}
 
 
+Direction = tuple[str, Tensor, Tensor, float]
+"""A name, the directions of pixels (O, 2) and camera parameters, and the step of the differences in px."""
+
+
+def differentiate(
+    graph: ObservationGraph, T_cw: Tensor, known: Tensor
+) -> tuple[GraphSolution, Tensor, Tensor, Tensor]:
+    """Solve the graph; return the solution, its ATE, and the gradients of that to pixels and camera parameters."""
+    leaves, pixels, params = with_leaves(graph)
+    solution = solve_graph(leaves)
+    loss = ate(solution.T_cw[known], T_cw[known])
+    loss.backward()
+    assert pixels.grad is not None
+    assert params.grad is not None
+    return solution, loss, pixels.grad, params.grad
+
+
 def check(
-    graph: ObservationGraph, T_cw: Tensor, known: Tensor, pixels: Tensor, params: Tensor
-) -> list[list[str]]:
-    """Rows of directional derivatives: by the gradients of pixels and camera parameters, by central differences."""
-    generator = torch.Generator().manual_seed(1)
-    noise = torch.randn(graph.pixels.shape, generator=generator, dtype=graph.pixels.dtype)
-    one_frame = noise * (graph.frame_index == len(graph.T_cw) // 2)[:, None]
-    focal, center = torch.zeros_like(params), torch.zeros_like(params)
-    focal[:2], center[2] = 1.0, 1.0
-    still, fixed = torch.zeros_like(noise), torch.zeros_like(params)
-    directions = [
-        ("fx and fy, by 1 px", still, focal, 1e-2),
-        ("cx, by 1 px", still, center, 1e-2),
-        ("all keypoints, at random by 1 px", noise, fixed, 1e-4),
-        ("the keypoints of one frame, at random by 1 px", one_frame, fixed, 1e-2),
-    ]
+    graph: ObservationGraph,
+    T_cw: Tensor,
+    known: Tensor,
+    pixels: Tensor,
+    params: Tensor,
+    along: list[Direction],
+) -> str:
+    """A table of derivatives along directions: by the gradients of pixels and parameters, by central differences."""
 
     def error_m(step_pixels: Tensor, step_params: Tensor) -> float:
         moved = replace(
@@ -143,7 +149,7 @@ def check(
         return float(ate(solution.T_cw[known], T_cw[known]))
 
     rows = []
-    for name, along_pixels, along_params, step in directions:
+    for name, along_pixels, along_params, step in along:
         analytic = float((pixels * along_pixels).sum() + (params * along_params).sum())
         ahead, behind = (error_m(sign * step * along_pixels, sign * step * along_params) for sign in (1, -1))
         numeric = (ahead - behind) / (2 * step)
@@ -151,11 +157,30 @@ def check(
             [name, f"{1e3 * analytic:.6f}", f"{1e3 * numeric:.6f}", f"{abs(analytic / numeric - 1):.1e}"]
         )
         print(*rows[-1], sep="\t", flush=True)
-    return rows
+    return table("direction | gradient (mm/px) | central differences (mm/px) | relative error", rows)
+
+
+def directions(graph: ObservationGraph) -> list[Direction]:
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(graph.pixels.shape, generator=generator, dtype=graph.pixels.dtype)
+    one_frame = noise * (graph.frame_index == len(graph.T_cw) // 2)[:, None]
+    fixed = torch.zeros_like(graph.camera.params)
+    focal, center = fixed.clone(), fixed.clone()
+    focal[:2], center[2] = 1.0, 1.0
+    still = torch.zeros_like(noise)
+    return [
+        ("fx and fy, by 1 px", still, focal, 1e-2),
+        ("cx, by 1 px", still, center, 1e-2),
+        ("all keypoints, at random by 1 px", noise, fixed, 1e-4),
+        ("the keypoints of one frame, at random by 1 px", one_frame, fixed, 1e-2),
+    ]
 
 
 def draw(graph: ObservationGraph, solution: GraphSolution, pixels: Tensor, file: Path) -> None:
-    """Where the keypoints lie that matter most: the map from above, and how the gradient is shared out."""
+    """Plot the map from above, colored by the gradient, and the distribution of the gradient over keypoints."""
+    import matplotlib.pyplot as plt
+
+    plt.switch_backend("Agg")
     strength = pixels.norm(dim=-1)
     by_point = torch.zeros(len(graph.points_w), dtype=strength.dtype).index_add(
         0, graph.point_index, strength
@@ -215,7 +240,7 @@ def cost_rows(name: str, repetitions: int) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("name", nargs="?", default="redkitchen")
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
@@ -227,26 +252,16 @@ def main() -> None:
             return
         graph = graph_of(sequence)
         T_cw, known = truth_of(graph, sequence)
-        leaves, pixels, params = with_leaves(graph)
-        solution = solve_graph(leaves)
-        loss = ate(solution.T_cw[known], T_cw[known])
-        loss.backward()
-        assert pixels.grad is not None
-        assert params.grad is not None
-        draw(graph, solution, pixels.grad, HERE / "pictures" / f"{arguments.name}.png")
+        solution, loss, pixels, params = differentiate(graph, T_cw, known)
+        draw(graph, solution, pixels, HERE / "pictures" / f"{arguments.name}.png")
         counts = (
             f"{len(graph.T_cw)} frames, {int(graph.is_keyframe.sum())} of them keyframes, "
             f"{len(graph.points_w)} points, {len(graph.pixels)} observations; ATE {loss.item():.4f} m.\n\n"
         )
-        cost = table(
-            ["", "iterations", "seconds", "relative", "memory (MiB)", "relative"],
-            cost_rows(arguments.name, arguments.repetitions),
-        )
+        rows = cost_rows(arguments.name, arguments.repetitions)
+        cost = table(" | iterations | seconds | relative | memory (MiB) | relative", rows)
         print(counts + cost, flush=True)
-        checks = table(
-            ["direction", "gradient (mm/px)", "central differences (mm/px)", "relative error"],
-            check(graph, T_cw, known, pixels.grad, params.grad),
-        )
+        checks = check(graph, T_cw, known, pixels, params, directions(graph))
         write_between(HERE / "README.md", counts + cost + "\n" + checks)
 
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from experiments.common import DATA_DIR, add_engine, cached_run, check, run_cases, table, write_between
+from experiments.common import (
+    PosedSequence,
+    add_engine,
+    cached_run,
+    check,
+    parser_of,
+    place_of,
+    run_cases,
+    table,
+    write_between,
+)
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
 from torchslam.calibration import CalibrationResult, CalibrationRound, calibrate, estimate_intrinsics
@@ -24,24 +32,13 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.system.front_end import Simulated, true_poses
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
-from torchslam.types import Trajectory
 
 HERE = Path(__file__).parent
 WRONG = 1.2  # how far off a given focal length is that a run should warn of
-HEADER = [
-    "sequence",
-    "found: f (px), k1, k2",
-    "of COLMAP, else given",
-    "f off",
-    "in standard errors",
-    "determined",
-    "runs",
-    "frames used",
-    "posed",
-    "ATE (m)",
-    "ATE, given camera (m)",
-    "CPU (s)",
-]
+HEADER = (
+    "sequence | found: f (px), k1, k2 | of COLMAP, else given | f off | in standard errors | determined | runs"
+    " | frames used | posed | ATE (m) | ATE, given camera (m) | CPU (s)"
+)
 
 
 @dataclass(frozen=True)
@@ -76,22 +73,6 @@ CASES = {
 }
 
 
-class PosesOnly(Sequence):
-    """The true path of a sequence under another camera, its images blank: for simulated features."""
-
-    def __init__(self, sequence: Sequence, camera: Camera) -> None:
-        T_cw = true_poses(sequence)
-        truth = Trajectory(sequence.timestamps, se3_inverse(T_cw))
-        super().__init__(sequence.name, "path", camera, sequence.timestamps, truth)
-
-    def image(self, index: int) -> Tensor:
-        width, height = self.camera.size
-        return torch.zeros(1, 1, height, width)
-
-    def image_name(self, index: int) -> str:
-        return f"pose {index}"
-
-
 def wide_angle() -> Camera:
     """A camera with the distortion of a wide-angle lens, for the simulated cases."""
     return Camera.radial_tangential(460.0, 460.0, 319.5, 239.5, -0.28, 0.07, 0.0, 0.0, size=(640, 480))
@@ -105,12 +86,14 @@ def scaled(camera: Camera, factor: float) -> Camera:
 def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config]:
     """The sequence as if nothing were known of its camera; with the given one, if there is."""
     config = load_config(None, case.overrides)
-    path = case.name if case.name.startswith("synthetic:") else DATA_DIR / case.name
+    path = place_of(case.name)
     unknown = open_sequence(path, "auto", limit=case.frames)
     if case.simulated:
-        known: Sequence | None = PosesOnly(open_sequence(path, limit=case.frames), wide_angle())
+        known: Sequence | None = open_sequence(path, limit=case.frames)
         assert known is not None
-        known = Simulated(config, wide_angle(), true_poses(known)).of(known)
+        T_cw = true_poses(known)
+        known = PosedSequence(known.name, wide_angle(), se3_inverse(T_cw), known.timestamps)
+        known = Simulated(config, wide_angle(), T_cw).of(known)
         return known.with_camera(unknown.camera), known, config
     known = open_sequence(path, limit=case.frames) if Path(path).suffix != ".mp4" else None
     return unknown, known, config
@@ -120,7 +103,7 @@ def found(label: str, case: Case) -> list[str]:
     """Find the camera of a case, run with it and with the given one, and return the row of the table."""
     unknown, known, config = open_case(case)
     start = time.process_time()
-    result = calibrate(unknown, config, on_progress=lambda done: tell(label, done))
+    result = calibrate(unknown, config, on_progress=lambda done: print_round(label, done))
     seconds = time.process_time() - start
     run = SLAM(result.camera, config).run(unknown)
     given = None if known is None else SLAM(known.camera, config).run(known)
@@ -145,14 +128,14 @@ def found(label: str, case: Case) -> list[str]:
     return row
 
 
-def tell(label: str, done: CalibrationRound) -> None:
-    """A line per round."""
+def print_round(label: str, done: CalibrationRound) -> None:
+    """Print a line per round."""
     estimate = done.estimate
-    asks = "no map"
+    result = "no map"
     if estimate is not None:
         focal = f"{float(estimate.camera.focal):.1f} px, error {estimate.focal_std:.2%}"
-        asks = f"{focal}, {estimate.num_radial} radial terms"
-    print(f"{label}: {done.frames} frames with {float(done.camera.focal):.1f} px -> {asks}", flush=True)
+        result = f"{focal}, {estimate.num_radial} radial terms"
+    print(f"{label}: {done.frames} frames with {float(done.camera.focal):.1f} px -> {result}", flush=True)
 
 
 def describe(result: CalibrationResult) -> str:
@@ -185,7 +168,7 @@ def warned(label: str, case: Case) -> None:
 
 
 def attempt(case: Columns) -> Columns:
-    """Find the camera of a case unless that was done before; returns its row as `cells`. No Exception leaves it.
+    """Find the camera of a case unless that was done before; returns its row as `cells`. Never raises.
 
     case: its `label`; `output`: folder of the results
     """
@@ -198,7 +181,7 @@ def attempt(case: Columns) -> Columns:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("labels", nargs="*", choices=[[], *CASES], help="cases to run; all by default")
     parser.add_argument(
         "--warnings", action="store_true", help="what runs with a wrong focal length say, instead"

@@ -1,15 +1,14 @@
-"""How well does the system do on real sequences? See README.md."""
+"""How accurate is the system on real sequences? See README.md."""
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 
-from experiments.common import add_engine, available, metrics_of_runs, row_of, table, write_between
+from experiments.common import add_engine, available, parser_of, row_of, tabulate_runs
+from torchslam.batch import Columns
 
 NAMES = ["redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20", "standstill", "synthetic:room"]
-ASKED = {
+REQUIRED = {
     "redkitchen": "95 %, 0.15 m",
     "kitti07": "95 %, 3 m",
     "machine_hall": "95 %, 0.05 m",
@@ -29,29 +28,23 @@ ORB_SLAM3 = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", default=NAMES)
-    parser.add_argument("--config", default=None)
+    parser.add_argument("--config", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
-    parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "sequences")
     arguments = parser.parse_args()
     names = available(arguments.names)
     config = None if arguments.config is None else str(arguments.config.absolute())
     runs = [row_of(name, config=config, overrides=arguments.set) for name in names]
-    rows = []
-    for name, result in zip(names, metrics_of_runs(runs, arguments), strict=True):
-        rows.append(row(name, result))
-        print(json.dumps({"sequence": name} | result), flush=True)
-    header = ["sequence", "posed", "ATE (m)", "ATE / path", "keyframes", "points"]
-    header += ["CPU (ms a frame)", "asked for", "ORB-SLAM3 (m, posed)"]
-    text = table(header, rows)
-    print(text)
-    if not arguments.no_readme:
-        write_between(Path(__file__).parent / "README.md", text)
+    header = (
+        "sequence | posed | ATE (m) | ATE / path | keyframes | points | CPU (ms a frame) | required"
+        " | ORB-SLAM3 (m, posed)"
+    )
+    tabulate_runs(runs, arguments, header, lambda number, found: cells(names[number], found), __file__)
 
 
-def row(name: str, result: dict) -> list[str]:
+def cells(name: str, result: Columns) -> list[str]:
     has_path = "ate_m" in result
     return [
         name,
@@ -61,7 +54,7 @@ def row(name: str, result: dict) -> list[str]:
         str(result["keyframes"]),
         str(result["points"]),
         f"{1000 * result['cpu_s'] / result['frames']:.0f}",
-        ASKED.get(name, ""),
+        REQUIRED.get(name, ""),
         ORB_SLAM3.get(name, ""),
     ]
 

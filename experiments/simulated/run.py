@@ -2,43 +2,37 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
-from experiments.common import add_engine, available, metrics_of_runs, row_of, table, write_between
+from experiments.common import add_engine, available, parser_of, row_of, tabulate_runs
+from torchslam.batch import Columns
 
 NOISY = ["simulated.noise_px=0.5", "simulated.outlier_ratio=0.1"]
-CASES = [
-    ("redkitchen", "exact", []),
-    ("kitti07", "exact", []),
-    ("synthetic:room", "exact", []),
-    ("redkitchen", "0.5 px, 10 % outliers", NOISY),
-    ("kitti07", "0.5 px, 10 % outliers", NOISY),
-    ("synthetic:room", "0.5 px, 10 % outliers", NOISY),
-]
+NAMES = ("redkitchen", "kitti07", "synthetic:room")
+FEATURES = {"exact": [], "0.5 px, 10 % outliers": NOISY}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     add_engine(parser, "simulated")
     options = parser.parse_args()
-    known = available(dict.fromkeys(name for name, _, _ in CASES))
-    cases = [case for case in CASES if case[0] in known]
+    known = available(NAMES)
+    cases = [(name, label) for label in FEATURES for name in known]
     runs = [
-        row_of(name, label, overrides=["features.kind=simulated", *overrides])
-        for name, label, overrides in cases
+        row_of(name, label, overrides=["features.kind=simulated", *FEATURES[label]]) for name, label in cases
     ]
-    rows = []
-    for (name, label, _), result in zip(cases, metrics_of_runs(runs, options), strict=True):
-        since_start = result["frames"] - (result["initialized_at"] or 0)
-        share = result["ate_m"] / result["path_length_m"]
-        rows.append(
-            [name, label, f"{result['posed']} of {result['frames']}", f"{result['lost']} of {since_start}",
-             f"{result['ate_m']:.2g}", f"{result['path_length_m']:.1f}", f"{share:.1e}"]
-        )  # fmt: skip
-        print(*rows[-1], sep="\t", flush=True)
-    header = ["trajectory", "features", "posed", "lost after the start", "ATE (m)", "path (m)", "ATE / path"]
-    write_between(Path(__file__).parent / "README.md", table(header, rows))
+
+    def cells(number: int, found: Columns) -> list[str]:
+        since_start = found["frames"] - (found["initialized_at"] or 0)
+        return [
+            *cases[number],
+            f"{found['posed']} of {found['frames']}",
+            f"{found['lost']} of {since_start}",
+            f"{found['ate_m']:.2g}",
+            f"{found['path_length_m']:.1f}",
+            f"{found['ate_m'] / found['path_length_m']:.1e}",
+        ]
+
+    header = "trajectory | features | posed | lost after the start | ATE (m) | path (m) | ATE / path"
+    tabulate_runs(runs, options, header, cells, __file__)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A sequence made of frames of other sequences, in any order, with something done to their images."""
+"""A sequence of frames of other sequences, in any order, with edited images."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def shots(source: Sequence, indices: Iterable[int], edit: Edit | None = None) ->
 
 
 def strangers(source: Sequence, indices: Iterable[int], edit: Edit | None = None) -> list[Shot]:
-    """Frames that show something else, or nothing."""
+    """Frames that do not show the scene."""
     return [Shot(source, index, edit, belongs=False) for index in indices]
 
 
 class Edited(Sequence):
-    """Shots one after the other.
+    """A sequence of shots.
 
     belongs: (N,) bool, the frames that can be posed
     """

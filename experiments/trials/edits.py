@@ -10,10 +10,7 @@ from experiments.trials.edited import Edit
 from torchslam.geometry import Camera, so3_exp
 
 WHITE = 255
-EXPOSURE_FRAMES, EXPOSURE = (
-    40,
-    0.25,
-)  # how long each exposure lasts, and the share of light in every second one
+EXPOSURE_FRAMES, EXPOSURE = 40, 0.25  # duration of an exposure, and the light in every second one
 CAPTION = "CAM 01 2026-11-21 REC"
 LOGO_CELLS, LOGO_SEED = (12, 20), 5  # rows and columns of the random squares
 LOGO_AT, LOGO_SIZE = 8, (64, 32)  # pixels from the upper left corner; width and height
@@ -24,7 +21,7 @@ SPOTS, SPOT_SEED, SPOT_SIGMA, SPOT_GRAY = 40, 3, 6, 60
 
 
 def black(gray: np.ndarray, _: int) -> np.ndarray:
-    """No light."""
+    """A black image."""
     return np.zeros_like(gray)
 
 
@@ -35,7 +32,7 @@ def exposure_step(gray: np.ndarray, frame: int) -> np.ndarray:
 
 
 def brighter(gain: float) -> Edit:
-    """Too long an exposure: so many times the light, and what is brighter than white is white."""
+    """Overexposure: the light times a gain, saturated at white."""
 
     def edit(gray: np.ndarray, _: int) -> np.ndarray:
         return np.rint(gain * gray.astype(np.float64)).clip(0, WHITE).astype(np.uint8)
@@ -44,7 +41,7 @@ def brighter(gain: float) -> Edit:
 
 
 def noise(sigma: float) -> Edit:
-    """Gaussian, new in every frame."""
+    """Gaussian noise, different in every frame."""
 
     def edit(gray: np.ndarray, frame: int) -> np.ndarray:
         added = gray + np.random.default_rng(frame).normal(0, sigma, gray.shape)
@@ -54,7 +51,7 @@ def noise(sigma: float) -> Edit:
 
 
 def pale(contrast: float) -> Edit:
-    """Fog, or a bad lens: so much of the contrast is left, around middle gray, and the noise of a gray value."""
+    """Fog, or a bad lens: reduced contrast around middle gray, and noise of one gray value."""
     noisy, middle = noise(1.0), WHITE / 2
 
     def edit(gray: np.ndarray, frame: int) -> np.ndarray:
@@ -74,7 +71,7 @@ def jpeg(quality: int) -> Edit:
 
 
 def motion_blur(length: int) -> Edit:
-    """Along a line of some pixels, whose direction turns from frame to frame."""
+    """Motion blur along a line whose direction rotates from frame to frame."""
     line = np.zeros((length, length), np.float32)
     line[length // 2] = 1 / length
     middle = (length - 1) / 2
@@ -88,7 +85,7 @@ def motion_blur(length: int) -> Edit:
 
 
 def rolling(amplitude: float) -> Edit:
-    """Rows are read one after the other while the camera shakes: shifted sideways by a sine of some pixels."""
+    """Rolling shutter of a shaking camera: rows are shifted sideways by a sine."""
 
     def edit(gray: np.ndarray, frame: int) -> np.ndarray:
         height, width = gray.shape
@@ -100,7 +97,7 @@ def rolling(amplitude: float) -> Edit:
 
 
 def overlay(size: tuple[int, int]) -> Edit:
-    """What a recorder writes into images of (width, height): a large logo and a caption in letters with a shadow."""
+    """A recorder overlay for images of (width, height): a large logo and a caption with a shadow."""
     width, height = size
     mark = logo((width // 4, height // 8))
 
@@ -143,7 +140,7 @@ def occluder(texture: np.ndarray, share: float, speed: int) -> Edit:
 
 
 def lens_dirt(size: tuple[int, int]) -> Edit:
-    """Soft gray spots that stay where they are, in images of (width, height)."""
+    """Soft static gray spots, for images of (width, height)."""
     width, height = size
     rng = np.random.default_rng(SPOT_SEED)
     cover: np.ndarray = np.zeros((height, width), np.float32)
@@ -165,7 +162,7 @@ def vignette(gray: np.ndarray, _: int) -> np.ndarray:
 def turned(camera: Camera, angle: float) -> Edit:
     """The view of a camera that has turned by `angle`, radians, about its y axis: its T_cw is R_y(angle) T_cw.
 
-    What was out of the image is black.
+    Pixels from outside of the image are black.
     """
 
     def edit(gray: np.ndarray, _: int) -> np.ndarray:

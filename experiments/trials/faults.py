@@ -1,4 +1,4 @@
-"""Faults of cameras, recorders and those who hold them, put into a sequence of which the truth is known."""
+"""Faults of cameras, recorders and operators, applied to a sequence with ground truth."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
 
 KIDNAPPED = 40  # frames
-LENT = 5  # the frame of another sequence that lends its image
+LENT = 5  # the frame of the other sequence that is used
 
 Fault = Callable[[Sequence, Sequence], Edited]
-"""From a sequence and one of another place, which lends its images."""
+"""From a sequence and one of another place to an edited one."""
 
 
 def everywhere(make: Callable[[Sequence, Sequence], Edit]) -> Fault:
@@ -28,7 +28,7 @@ def everywhere(make: Callable[[Sequence, Sequence], Edit]) -> Fault:
 
 
 def covered(share: float, speed: int) -> Fault:
-    """Something of another place passes in front of the camera."""
+    """An occluder from another place passes in front of the camera."""
 
     def make(whole: Sequence, other: Sequence) -> Edit:
         lent = np.rint(255 * other.image(LENT)[0, 0].numpy()).astype(np.uint8)
@@ -43,7 +43,7 @@ def none(whole: Sequence, other: Sequence) -> Edited:
 
 
 def every(stride: int) -> Fault:
-    """Frames are lost on the way."""
+    """Frames are dropped."""
 
     def fault(whole: Sequence, other: Sequence) -> Edited:
         return Edited(whole.name, whole.camera, shots(whole, range(0, len(whole), stride)))
@@ -52,7 +52,7 @@ def every(stride: int) -> Fault:
 
 
 def kidnapped(whole: Sequence, other: Sequence) -> Edited:
-    """Somewhere else for a while, then on from where it was."""
+    """Frames of another place in the middle."""
     middle = len(whole) // 2
     before, after = shots(whole, range(middle)), shots(whole, range(middle, len(whole)))
     return Edited(whole.name, whole.camera, before + strangers(other, range(KIDNAPPED)) + after)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from fnmatch import fnmatch
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from experiments.common import add_engine, cached_run, check, run_cases, table, write_between
+from experiments.common import add_engine, cached_run, check, parser_of, run_cases, table, write_between
 from experiments.trials.gradient import report
 from experiments.trials.outcome import HEADER, Outcome, cells, perform
 from experiments.trials.trials import TRIALS, Trial
@@ -82,14 +81,18 @@ def follow_up(trial: Trial, outcome: Outcome, run: Run, file: Path) -> None:
     """Write the report of the gradient."""
     assert outcome.loop_closures, "no loop was closed"
     file.write_text((HERE / GRADIENT).read_text(encoding="utf-8"), encoding="utf-8")
-    report(run, trial.sequence(), file, [(closure.frame, closure.place) for closure in outcome.loop_closures])
+    report(
+        run,
+        trial.sequence(),
+        file,
+        [(closure.frame, closure.matched_frame) for closure in outcome.loop_closures],
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", help="trials; * and ? stand for any: 'loss/*', '*/shelf_bin'")
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
-    parser.add_argument("--no-readme", action="store_true", help="print only")
     add_engine(parser, "trials")
     arguments = parser.parse_args()
     output = arguments.output.absolute()

@@ -1,4 +1,4 @@
-"""What is tried: sequences as they are, starts, losses, loops and likenesses, faults, a saved map, gradients."""
+"""The trials: unchanged sequences, starts, losses, loops and lookalikes, faults, a saved map, gradients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from experiments.common import DATA_DIR
+from experiments.common import DATA_DIR, place_of
 from experiments.trials import edits
 from experiments.trials.edited import Edited, Shot, shots, strangers
 from experiments.trials.faults import FAULTS, Fault
@@ -51,8 +51,8 @@ class Trial:
 
     settings: of the configuration
     map_of:   makes another sequence, of which the map is made first, saved and loaded to localize in
-    cut_at:   share of the frames after which the run is killed and gone on with from its last checkpoint
-    unit:     of the ATE; without one it is told as a share of the extent of the true path
+    cut_at:   fraction of the frames after which the run is killed and resumed from its last checkpoint
+    unit:     of the ATE; without one it is a fraction of the extent of the true path
     is_differentiated: whether the gradient of the run is checked afterwards
     """
 
@@ -66,11 +66,11 @@ class Trial:
 
 def opened(name: str) -> Sequence:
     """Raises SequenceError if it is not available."""
-    return open_sequence(name if name.startswith("synthetic:") else DATA_DIR / name)
+    return open_sequence(place_of(name))
 
 
 def frames(name: str, *ranges: tuple[int, int]) -> Edited:
-    """Some ranges of a sequence's frames, one after the other; all of them where none is given."""
+    """Ranges of a sequence's frames, concatenated; all frames if none is given."""
     whole = opened(name)
     parts = ranges or ((0, len(whole)),)
     return Edited(name, whole.camera, [shot for part in parts for shot in shots(whole, range(*part))])
@@ -82,7 +82,7 @@ def every_second(name: str, first: int) -> Edited:
 
 
 def drone() -> Edited:
-    """A user's video, with those of COLMAP's poses that there are."""
+    """A user's video with COLMAP's poses where available."""
     video = open_sequence(DATA_DIR / "drone.mp4", camera=DRONE_CAMERA)
     truth = read_trajectory(DATA_DIR / "drone_colmap.txt")
     rows, distances = nearest(video.timestamps, truth.timestamps)

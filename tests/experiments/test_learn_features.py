@@ -9,7 +9,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from experiments.learned_weights.features.clips import FRAMES, STEP_S, clip_from, position_error
+from experiments.learned_weights.features.evaluation import (
+    APART_S,
+    FRAMES,
+    STEP_S,
+    Pair,
+    PairErrors,
+    clip_from,
+    pair_errors,
+    position_error,
+)
 from experiments.learned_weights.features.front_end import (
     NUM_INPUTS,
     RADIUS,
@@ -18,7 +27,6 @@ from experiments.learned_weights.features.front_end import (
     SubPixel,
     patches,
 )
-from experiments.learned_weights.features.pairs import APART_S, Pair, PairErrors, pair_errors
 from experiments.learned_weights.features.report import Result, bootstrap, medians, ratios
 from experiments.learned_weights.features.run import Part, spread
 from tests.learning.test_clip_slam import BentEyes

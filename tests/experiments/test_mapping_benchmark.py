@@ -16,10 +16,10 @@ def test_the_next_keyframes_see_old_and_new_points() -> None:
         for _ in range(2):
             assert set(walk.next()) == {
                 "mapping, bundle",
-                "loop_closer",
+                "loop closer",
                 "local map",
-                "recognition",
-                "cull_and_compact",
+                "loop detection",
+                "culling, compaction",
             }
         assert slam_map.num_keyframes == 14
         seen = slam_map.observations(torch.tensor([13]))

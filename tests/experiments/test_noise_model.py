@@ -14,8 +14,7 @@ from torch import Tensor
 from experiments.learned_weights.noise.cues import NAMES, describe, structure_tensors
 from experiments.learned_weights.noise.graphs import Example, keyframes_of
 from experiments.learned_weights.noise.model import Informed, NoiseModel, constant, load, powers, save
-from experiments.learned_weights.noise.report import HAND, SHAPE, geometric_mean, run_table
-from experiments.learned_weights.noise.runs import Outcome
+from experiments.learned_weights.noise.report import HAND, SHAPE, Outcome, geometric_mean, run_table
 from experiments.learned_weights.noise.training import (
     Residuals,
     Settings,

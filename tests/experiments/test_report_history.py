@@ -66,8 +66,8 @@ def test_an_undefined_error_and_a_map_of_a_static_camera_are_regressions() -> No
     new["benchmarks"]["bundle"]["error"] = 0.6
     said = compare(new, [record()])
     assert [words.partition(",")[0] for words in said] == [
-        "shelf: ate cannot be told",
-        "still: posed 3 frames where no map is to be had",
+        "shelf: ate is undefined",
+        "still: posed 3 frames of a sequence without a map",
         "bundle: error 0.6",
     ]
 

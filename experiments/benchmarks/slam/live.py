@@ -5,7 +5,6 @@ python -m experiments.benchmarks.slam.live redkitchen
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from experiments.common import DATA_DIR
+from experiments.common import DATA_DIR, parser_of
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.readers.live import LiveSequence
@@ -54,7 +53,7 @@ class Player:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("name")
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--config", type=Path)

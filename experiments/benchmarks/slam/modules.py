@@ -5,11 +5,11 @@ python -m experiments.benchmarks.slam.modules [SEQUENCE]
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from types import FrameType
 
+from experiments.common import parser_of
 from torchslam import SLAM, open_sequence
 from torchslam.types import Frame, State, StepResult
 
@@ -32,7 +32,7 @@ def modules_of_step(slam: SLAM, frame: Frame) -> tuple[set[str], StepResult]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("sequence", nargs="?", default="synthetic:room")
     parser.add_argument("--frames", type=int, default=60)
     options = parser.parse_args()

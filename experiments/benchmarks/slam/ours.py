@@ -5,7 +5,6 @@ python -m experiments.benchmarks.slam.ours SEQUENCE TRAJECTORY --processes 2 --l
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from experiments.common import parser_of
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.trajectories import write_trajectory
@@ -23,7 +23,7 @@ from torchslam.types import StepResult
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("sequence", type=Path)
     parser.add_argument("trajectory", type=Path)
     parser.add_argument("--processes", type=int)

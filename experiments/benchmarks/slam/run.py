@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.benchmarks.problems import PEERS
-from experiments.common import DATA_DIR, table, write_between
+from experiments.common import DATA_DIR, parser_of, table, write_between
 from torchslam.data import open_sequence
 from torchslam.data.trajectories import read_trajectory
 from torchslam.errors import TrajectoryError
@@ -56,10 +55,9 @@ class Metrics:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", default=[recording.name for recording in RECORDINGS])
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--no-readme", action="store_true", help="print only")
     arguments = parser.parse_args()
     peer = find_peer()
     rows = []

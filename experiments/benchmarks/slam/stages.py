@@ -5,10 +5,9 @@ python -m experiments.benchmarks.slam.stages results/demo
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from experiments.common import table
+from experiments.common import parser_of, table
 from torchslam.io.report import stage_times
 from torchslam.io.results import FRAMES, read_frames
 
@@ -16,7 +15,7 @@ HEADER = ["stage", "frames", "ms where it ran", "ms a frame", "ms a keyframe", "
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("results", type=Path, help="folder that `torchslam run` wrote")
     results = read_frames(parser.parse_args().results / FRAMES)
     stages, keyframes = stage_times(results), sum(result.is_keyframe for result in results)

@@ -1,4 +1,4 @@
-"""What the measurements come to: medians, and ratios with intervals."""
+"""Tables of the measurements: medians, and ratios with intervals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from experiments.common import table
-from experiments.learned_weights.features.pairs import PairErrors
+from experiments.learned_weights.features.evaluation import PairErrors
 
 BLOCK = 5  # neighboring pairs that are drawn together: they see much of the same
 DRAWS = 4000
@@ -18,7 +18,7 @@ ERRORS = ("rotation error", "direction error", "rotation between halves", "direc
 
 @dataclass(frozen=True)
 class Result:
-    """What a front end is worth on one part of a sequence.
+    """The errors of a front end on one part of a sequence.
 
     pairs:     errors of pairs
     positions: (C,) ATE of clips as a share of the path, NaN where too few frames are posed
@@ -85,7 +85,7 @@ def ratios(before: dict[str, Result], after: dict[str, Result]) -> str:
 
 
 def ratio(logs: list[Tensor], block: int) -> str:
-    """The geometric mean over what both could pose, and its interval, in words."""
+    """Format the geometric mean over what both posed, and its interval."""
     kept = [part[~part.isnan()] for part in logs]
     if not sum(len(part) for part in kept):
         return ""
@@ -95,7 +95,7 @@ def ratio(logs: list[Tensor], block: int) -> str:
 
 
 def bootstrap(logs: list[Tensor], block: int) -> tuple[float, float]:
-    """95 % interval of the exponential of the mean of several parts' values, drawn anew within each part.
+    """95 % interval of the exponential of the mean of several parts' values, resampled within each part.
 
     Runs of `block` neighbors are drawn as one.
     """

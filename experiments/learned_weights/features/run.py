@@ -5,7 +5,6 @@ python -m experiments.learned_weights.features.run --weights xfeat.safetensors
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,18 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from experiments.common import sequences, write_between
-from experiments.learned_weights.features.clips import FRAMES, STEP_S, clip_from, position_error
+from experiments.common import parser_of, sequences, write_between
+from experiments.learned_weights.features.evaluation import (
+    APART_S,
+    FRAMES,
+    STEP_S,
+    Pair,
+    PairErrors,
+    clip_from,
+    pair_errors,
+    position_error,
+)
 from experiments.learned_weights.features.front_end import Remembering, SubPixel
-from experiments.learned_weights.features.pairs import APART_S, Pair, PairErrors, pair_errors
 from experiments.learned_weights.features.report import Result, Results, medians, ratios
 from experiments.learned_weights.features.tracks import Tracks
 from experiments.learned_weights.features.training import Settings, train
@@ -93,14 +100,13 @@ def parts_of(shares: dict[str, tuple[float, float]], pairs: int, clips: int) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument(
         "--weights", type=Path, default=WEIGHTS, help="XFeat's parameters, a safetensors file"
     )
     parser.add_argument("--steps", type=int, default=Settings.steps, help="training steps")
     parser.add_argument("--pairs", type=int, default=60, help="at most, of a part to evaluate on")
     parser.add_argument("--clips", type=int, default=10, help="at most, of a part to evaluate on")
-    parser.add_argument("--no-readme", action="store_true", help="print the tables only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

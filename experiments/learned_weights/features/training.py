@@ -21,7 +21,7 @@ MIN_TRACKS = 6
 
 @dataclass(frozen=True)
 class Settings:
-    """steps: of the optimizer; problems: of a step; tracks: of a problem, drawn anew every time
+    """steps: of the optimizer; problems: of a step; tracks: of a problem, resampled in every step
 
     Of few tracks a pose says more about each: the error is the sum of all their errors.
     """
@@ -106,7 +106,7 @@ def pose_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
 
 
 def train(front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0) -> list[float]:
-    """Lower the loss of what is drawn anew in every step; the loss of each."""
+    """Train on new samples in every step; return the loss of each."""
     optimizer = torch.optim.Adam(front_end.network.parameters(), settings.learning_rate)
     training = Training(front_end.network, optimizer, settings.steps, seed)
     for _ in training:

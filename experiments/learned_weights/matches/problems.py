@@ -267,14 +267,7 @@ def _localization(
 ) -> Problems | None:
     """The problem of one query frame, still without RANSAC; None where it has too few matches."""
     features_base, features_query = frames.features(base), frames.features(query)
-    known = Features(
-        features_base.keypoints,
-        features_base.scores,
-        features_base.scales,
-        features_base.angles,
-        features_base.descriptors,
-        landmarks.mask[None],
-    )
+    known = replace(features_base, mask=landmarks.mask[None])
     matches = match(known, features_query, ratio=None, max_distance=MAX_DISTANCE)
     row = torch.nonzero(matches.mask[0])[:MAX_MATCHES, 0]
     if len(row) < MIN_MATCHES:

@@ -1,8 +1,8 @@
 """Reference poses: those of a bundle adjustment over all frames of a sequence, in the meters of its ground truth.
 
-What sensors say is good to centimeters, and that is as large as the errors of the problems; adjusted poses explain the
-images to fractions of a pixel. That such a reference favours methods like the one that made it is known (Brachmann et
-al., "On the limits of pseudo ground truth in visual camera re-localization", 2021): the given poses are kept beside.
+Sensor poses are accurate to centimeters, which is the size of the measured errors; adjusted poses explain the images to
+fractions of a pixel. Such a reference favors methods similar to the one that made it (Brachmann et al., "On the limits
+of pseudo ground truth in visual camera re-localization", 2021), so the given poses are kept as well.
 """
 
 from __future__ import annotations

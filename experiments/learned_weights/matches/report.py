@@ -1,4 +1,4 @@
-"""What came out, in tables: medians by part, gains with their spread over seeds and intervals over problems."""
+"""Tables of the results: medians by part, gains with their spread over seeds and intervals over problems."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _log_gains(relatives: list[dict[str, Tensor]]) -> Tensor:
 
 
 def _interval(parts: list[PartResult], seed: int = 0) -> tuple[float, float]:
-    """95 % of the mean gain over seeds, by drawing blocks of problems anew, within each part."""
+    """95 % interval of the mean gain over seeds, by a bootstrap over blocks of problems within each part."""
     generator = torch.Generator().manual_seed(seed)
     relatives = [part.relative() for part in parts]
     members = []
@@ -103,6 +103,6 @@ def error_table(parts: dict[str, PartResult]) -> str:
 
 
 def _cell(errors: Tensor) -> str:
-    """Median errors (S, P, 2) in words, the mean over seeds."""
+    """Format median errors (S, P, 2), averaged over seeds."""
     meters, radians = errors.median(1).values.mean(0).tolist()
     return f"{100 * meters:.2f} cm, {math.degrees(radians):.3f}°"

@@ -5,14 +5,13 @@ python -m experiments.learned_weights.matches.run
 
 from __future__ import annotations
 
-import argparse
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from experiments.common import sequences, write_between
+from experiments.common import parser_of, sequences, write_between
 from experiments.learned_weights.matches.evaluation import (
     Learned,
     Method,
@@ -95,9 +94,8 @@ def evaluate(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("--steps", type=int, default=Settings.steps, help="training steps")
-    parser.add_argument("--no-readme", action="store_true", help="print the tables only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     training, networks = problems_of(TRAINING), []

@@ -17,7 +17,7 @@ _CHUNK = 64
 
 @dataclass(frozen=True)
 class Settings:
-    """steps and batch (problems of a step) of the training; matches: kept of a problem, drawn anew every time."""
+    """steps and batch (problems of a step) of the training; matches: kept of a problem, resampled in every step."""
 
     steps: int = 800
     batch: int = 32

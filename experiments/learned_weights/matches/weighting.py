@@ -99,7 +99,7 @@ def refine_learned(network: MatchWeights, problems: Problems) -> list[RefinedPos
 
 
 class MatchWeights(nn.Module):
-    """Weights in rounds: what a match looks like at the pose of the one round is what the next one goes by."""
+    """Weights in rounds: the inputs of a round are computed at the pose of the round before."""
 
     def __init__(self, width: int = 32, seed: int = 0) -> None:
         super().__init__()

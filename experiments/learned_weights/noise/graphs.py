@@ -98,7 +98,7 @@ def truth_of(graph: ObservationGraph, sequence: Sequence) -> tuple[Tensor, Tenso
 
 
 def example_of(sequence: Sequence, config: Config) -> Example:
-    """Run a sequence by the hand-set rule, and describe what it saw."""
+    """Run a sequence by the hand-set rule; return its graph and cues."""
     graph = SLAM(sequence.camera, config).run(sequence).graph
     seen = _cues(sequence, config, graph)
     columns = {name: getattr(graph, name) for name in ObservationGraph.columns()}

@@ -19,7 +19,7 @@ HIDDEN = 8
 class NoiseModel(nn.Module):
     """Log of the information in units of scale^-2, and how it is shared out between directions.
 
-    values (..., C) are standardised by the mean and the deviation of those trained on; then a line and a hidden layer.
+    values (..., C) are standardized by the mean and the deviation of those trained on; then a line and a hidden layer.
     kind: "constant": one number for all; "isotropic": a number each; "directed": the power of the structure tensor
           besides, so that the information is larger along the gradient
     level_of_image: what the information times scale squared is in the geometric mean of every image; zero: as it is
@@ -45,7 +45,7 @@ class NoiseModel(nn.Module):
         self.register_buffer("mean", torch.zeros(len(NAMES), dtype=torch.float64))
         self.register_buffer("deviation", torch.ones(len(NAMES), dtype=torch.float64))
 
-    def standardise(self, values: Tensor) -> None:
+    def standardize(self, values: Tensor) -> None:
         """Take mean and deviation from values (n, C)."""
         self.mean.copy_(values.mean(0))
         self.deviation.copy_(values.std(0))
@@ -120,8 +120,8 @@ class Informed(nn.Module):
         self.orb, self.model = ORB(num_keypoints), load(weights)
 
     @torch.no_grad()
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
-        features = self.orb(images, wanted)
+    def forward(self, images: Tensor, mask: Tensor | None = None) -> Features:
+        features = self.orb(images, mask)
         cues = describe(self.orb, images, features)
         squared, mask = features.scales.double().square(), features.mask
         of = torch.arange(len(mask), device=mask.device)[:, None].expand_as(mask)

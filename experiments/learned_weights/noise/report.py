@@ -1,15 +1,20 @@
-"""The table of whole runs: ratios to the hand-set rule, with intervals over sequences."""
+"""Whole runs by a rule for the noise, and the table of them: ratios to the hand-set rule, with intervals."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import fmean, stdev
 
 from experiments.common import table
-from experiments.learned_weights.noise.runs import Outcome
+from experiments.learned_weights.noise.graphs import opened
+from torchslam import SLAM, evaluate, load_config
 
 HAND, STATED, LIKELIHOOD, SHAPE, TRAJECTORY = "hand-set", "stated", "likelihood", "shape", "trajectory"
+FRONT_END = "experiments.learned_weights.noise.model:Informed"
 RULES = (HAND, STATED, LIKELIHOOD, SHAPE, TRAJECTORY)
 """hand-set: one noise per pyramid level, not stated. stated: the same noise, stated as information at half the size.
 likelihood: learned on the other sequences. shape: likewise, but every image has the level of "stated" and the noise is
@@ -19,6 +24,33 @@ MIN_POSED = 0.95
 
 STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5 % quantile of Student's t, one to nine degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """ate_m: of all posed frames; posed, frames: their number and that of the sequence's frames."""
+
+    ate_m: float
+    posed: int
+    frames: int
+
+
+def outcome_of(name: str, seed: int, weights: Path | None, file: Path) -> Outcome:
+    """Run a sequence by the noise model in a file, or by the hand-set rule; the outcome is kept in `file`."""
+    if file.exists():
+        return Outcome(**json.loads(file.read_text()))
+    overrides = [f"seed={seed}"]
+    if weights is not None:
+        overrides += [f"features.kind={FRONT_END}", f'features.weights="{weights}"']
+    sequence = opened(name)
+    assert sequence.groundtruth is not None
+    run = SLAM(sequence.camera, load_config(None, overrides)).run(sequence)
+    error = evaluate(run.trajectory, sequence.groundtruth).ate_m
+    outcome = Outcome(error, len(run.trajectory), len(sequence))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(asdict(outcome)))
+    return outcome
+
 
 Runs = dict[str, dict[str, dict[int, Outcome]]]
 """Outcomes by sequence, rule and seed."""

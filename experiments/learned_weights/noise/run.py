@@ -5,16 +5,23 @@ python -m experiments.learned_weights.noise.run
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
 
-from experiments.common import DATA_DIR, write_between
+from experiments.common import DATA_DIR, parser_of, write_between
 from experiments.learned_weights.noise.graphs import Example, example_of, opened
 from experiments.learned_weights.noise.model import NoiseModel, constant, load, save
-from experiments.learned_weights.noise.report import HAND, LIKELIHOOD, RULES, SHAPE, STATED, run_table
-from experiments.learned_weights.noise.runs import Outcome, outcome_of
+from experiments.learned_weights.noise.report import (
+    HAND,
+    LIKELIHOOD,
+    RULES,
+    SHAPE,
+    STATED,
+    Outcome,
+    outcome_of,
+    run_table,
+)
 from experiments.learned_weights.noise.training import Settings, at_level, fit_likelihood, fit_trajectories
 from torchslam import load_config
 from torchslam.geometry.gating import GATE_FACTOR
@@ -72,10 +79,9 @@ class Experiment:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("--output", type=Path, default=Path("results") / "noise_model", metavar="DIR")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
-    parser.add_argument("--no-readme", action="store_true", help="print only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     missing = [name for name in SEQUENCES if not (DATA_DIR / name).exists() and name != "drone"]

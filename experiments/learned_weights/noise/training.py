@@ -43,7 +43,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Of n observations: errors (n, 2) in scales, made up for what the points took of them; their cues; shares (n,) by
+    """Of n observations: errors (n, 2) in scales, corrected for the fitted points; their cues; shares (n,) by
     which they count in a mean."""
 
     errors: Tensor
@@ -124,7 +124,7 @@ def fit_likelihood(examples: Sequence[Example], kind: str, settings: Settings) -
     model = NoiseModel(kind, settings.seed)
     with torch.no_grad():
         model.level.fill_(math.log(USUAL))
-    model.standardise(torch.cat([example.values for example in examples]))
+    model.standardize(torch.cat([example.values for example in examples]))
     for _ in range(settings.rounds):
         with torch.no_grad():
             pairs = [(example, solved(weighed(example, model))) for example in examples]

@@ -1,20 +1,24 @@
-"""Pairs of views: how well matched keypoints determine the relative pose."""
+"""Errors of a front end: of the relative poses of pairs of views, and of the poses of clips."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from torchslam import Camera, Features, estimate_relative_pose, match
+from experiments.benchmarks.problems import match_pixels
+from torchslam import Camera, ClipSLAM, Features, clip_loss, estimate_relative_pose
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import RelativePose, se3_inverse
 from torchslam.learning.dataset import Clip, frames_in
-from torchslam.learning.losses import motion_difference
+from torchslam.learning.losses import motion_difference, relative_ate
 
 APART_S = 0.3
 THRESHOLD_PX = 1.5
+FRAMES = 8
+STEP_S = 0.15  # between the frames of a clip
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class PairErrors:
     """Of P pairs, (P,) each; NaN, for inliers 0, where no motion fits.
 
     rotation, direction: radians, of the motion against the true one; direction is that of the translation
-    rotation_halves, direction_halves: radians, between the motions that one half of the matches and the other tell.
+    rotation_halves, direction_halves: radians, between the motions estimated from two halves of the matches.
                          Nothing true is needed for these, so nothing wrong in it counts.
     inliers:             within THRESHOLD_PX
     """
@@ -71,11 +75,9 @@ def pair_errors(features: Features, pair: Pair) -> PairErrors:
 
 
 def matched_pixels(features: Features) -> tuple[Tensor, Tensor]:
-    """(M, 2) pixels in both images of the keypoints that match."""
-    one, two = features[:1], features[1:]
-    matches = match(one, two, max_distance=64 if one.descriptors.dtype == torch.uint8 else 0.25)
-    rows_1, rows_2 = (rows[0][matches.mask[0]] for rows in (matches.indices_1, matches.indices_2))
-    return one.keypoints[0, rows_1].double(), two.keypoints[0, rows_2].double()
+    """(M, 2) pixels of the matches in both images."""
+    limit = 64 if features.descriptors.dtype == torch.uint8 else 0.25
+    return match_pixels(features[:1], features[1:], max_distance=limit)
 
 
 def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
@@ -87,3 +89,15 @@ def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePos
 
 def _failed(motion: RelativePose) -> float:
     return 0.0 if motion.success[0] else float("nan")
+
+
+def clip_from(sequence: Sequence, start: int, device: torch.device) -> Clip:
+    """The clip that begins at a frame, its images on the device."""
+    return Clip.of(sequence, start, FRAMES, frames_in(STEP_S, sequence), supervised=True).to(device)
+
+
+@torch.no_grad()
+def position_error(clip_slam: ClipSLAM, clip: Clip) -> float:
+    """ATE as a share of the path, NaN where there are no poses to compare."""
+    poses = clip_slam(clip.images, clip.camera)
+    return float(clip_loss(poses, clip.T_cw, relative_ate, on_failure=math.nan).loss)
