@@ -66,7 +66,7 @@ def test_the_pose_graph_distributes_the_drift_along_the_loop() -> None:
     found = loop(submap)
     S_cw = essential_graph_solution(found)
     torch.testing.assert_close(S_cw[0], submap.map.T_cw[0])
-    # the loop is closed: the end lies to the place as it was recognised to, but for what the other ties pull
+    # the loop is closed: the end lies to the place as it was detected, but for what the other ties pull
     wanted = submap.map.T_cw[END] @ sim3_inverse(found.relation.S_21) @ se3_inverse(submap.map.T_cw[0])
     closed = S_cw[END] @ sim3_inverse(S_cw[0])
     before = submap.map.T_cw[END] @ se3_inverse(submap.map.T_cw[0])

@@ -1,4 +1,4 @@
-"""Places that are known are recognised, those that only look alike are not."""
+"""Known places are detected, places that only look alike are not."""
 
 from __future__ import annotations
 
